@@ -12,17 +12,8 @@ from diffsim_ti.torch_bridge.barrier_contact import DifferentiableBarrierContact
 from diffsim_ti.torch_bridge.implicit_differentiation import ImplicitDifferentiation, conjugate_gradient
 from diffsim_ti.torch_bridge.step_sizes import bounded, refuse_steps
 
-__all__ = [
-    "TorchMaterial",
-    "DifferentiableMaterial",
-    "SpatiallyVaryingMaterial",
-    "DifferentiableBarrierContact",
-    "ImplicitDifferentiation",
-    "conjugate_gradient",
-    "CheckpointedRollout",
-    "smooth_step",
-    "log_barrier",
-]
+__all__ = ["TorchMaterial", "DifferentiableMaterial", "SpatiallyVaryingMaterial", "DifferentiableBarrierContact"]
+__all__ += ["ImplicitDifferentiation", "conjugate_gradient", "CheckpointedRollout", "smooth_step", "log_barrier"]
 
 
 TINY = 1e-30  # instead of Adam's eps
@@ -125,9 +116,11 @@ class TorchMaterial(torch.nn.Module):
         return self.material(*(x.detach().double().cpu().numpy() for x in self.tensors(mesh).values()))
 
 
-def _one_of(name: str, *given):
-    """The single value that is not None among spellings of a name."""
+def _one_of(name: str, *given, default=None):
+    """The single value that is not None among spellings of a name, or the default."""
     values = [value for value in given if value is not None]
+    if not values and default is not None:
+        return default
     if len(values) != 1:
         raise ValueError(f"{name}: give exactly one of its spellings, got {len(values)}")
     return values[0]
@@ -217,14 +210,8 @@ class SpatiallyVaryingMaterial(TorchMaterial):
     ):
         super().__init__()
         self.material = law
-        E = (
-            1e5
-            if base_youngs is None and base_E is None
-            else float(_one_of("base_youngs, base_E", base_youngs, base_E))
-        )
-        nu = 0.4
-        if base_poisson is not None or base_nu is not None:
-            nu = float(_one_of("base_poisson, base_nu", base_poisson, base_nu))
+        E = float(_one_of("base_youngs, base_E", base_youngs, base_E, default=1e5))
+        nu = float(_one_of("base_poisson, base_nu", base_poisson, base_nu, default=0.4))
         law(E, nu)
         self.nu_range = min(NU_RANGE[0], nu - 1e-6), max(NU_RANGE[1], nu + 1e-6)  # nu is stored in float32
         if (num_elements is None) == (grid_resolution is None):
@@ -259,9 +246,8 @@ class SpatiallyVaryingMaterial(TorchMaterial):
             values = self.control.reshape(-1)[torch.from_numpy(corners).to(self.control.device)]
             return bounded((torch.from_numpy(weights).to(self.control) * values).sum(1), *self.E_range)
         if len(self.log_E) != mesh.num_tetrahedra:
-            raise ValueError(
-                f"num_elements: the mesh has {mesh.num_tetrahedra} tetrahedra, the material {len(self.log_E)}"
-            )
+            given = len(self.log_E)
+            raise ValueError(f"num_elements: the mesh has {mesh.num_tetrahedra} tetrahedra, the material {given}")
         return self.E
 
     def tensors(self, mesh) -> dict[str, torch.Tensor]:
@@ -310,9 +296,8 @@ class CheckpointedRollout:
         from torch.utils.checkpoint import checkpoint
 
         if num_steps < 0 or checkpoint_every < 1:
-            raise ValueError(
-                f"num_steps must be >= 0 and checkpoint_every >= 1, got {num_steps} and {checkpoint_every}"
-            )
+            given = f"{num_steps} and {checkpoint_every}"
+            raise ValueError(f"num_steps must be >= 0 and checkpoint_every >= 1, got {given}")
         single = isinstance(state0, torch.Tensor)
 
         def segment(count, *state):

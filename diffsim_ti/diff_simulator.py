@@ -119,20 +119,16 @@ class DifferentiableSimulator:
         remedy = "each step and rollout starts afresh; take rollout_frames(Rollout(solver, steps), ...) for a whole run"
         refuse_state(material.core(mesh).law("f64"), "DifferentiableSimulator", remedy)
         self._terms = list(terms or [])
-        self._contact = self._choose_contact(contact)
-        self._substeps, self._rollouts, self._scenes = solver.substeps, {}, {}
-        self._ratio: float | None = None
-        self._last: Rollout | None = None
-        self._rest: torch.Tensor | None = None
-        self.reset()
-
-    def _choose_contact(self, contact) -> DifferentiableBarrierContact | None:
         if contact is None:
-            lowest, width = float(self.mesh.vertices[:, 1].min()), 0.01
-            return DifferentiableBarrierContact(1e4, width, ground_height=0.0 if lowest >= width else lowest - width)
+            lowest, width = float(mesh.vertices[:, 1].min()), 0.01
+            ground = 0.0 if lowest >= width else lowest - width
+            contact = DifferentiableBarrierContact(1e4, width, ground_height=ground)
         if contact is not False and not isinstance(contact, DifferentiableBarrierContact):
             raise ValueError(f"contact must be None, False or a DifferentiableBarrierContact, got {contact!r}")
-        return contact or None
+        self._contact: DifferentiableBarrierContact | None = contact or None
+        self._substeps, self._rollouts, self._scenes = solver.substeps, {}, {}
+        self._ratio = self._last = self._rest = None
+        self.reset()
 
     def __getstate__(self) -> dict:
         """For pickle and copy.deepcopy: the state leaves its graph; what Taichi holds is built anew."""
@@ -272,14 +268,8 @@ class DifferentiableSimulator:
             if with_forces:
                 terms.append(ExternalForce(np.zeros((self.mesh.num_vertices, 3))))
             precision = next(name for name, dtype in DTYPES.items() if dtype == self.dtype)
-            self._scenes[with_forces] = Scene(
-                self.mesh,
-                self.material.core(self.mesh),
-                numbers["density"],
-                terms,
-                self.fixed_vertices,
-                precision=precision,
-            )
+            law, density = self.material.core(self.mesh), numbers["density"]
+            self._scenes[with_forces] = Scene(self.mesh, law, density, terms, self.fixed_vertices, precision=precision)
         return self._scenes[with_forces]
 
     def _rollout(self, steps: int, with_forces: bool, checkpoint_every, save_every) -> Rollout:

@@ -45,18 +45,8 @@ def render_series(
     Obstacles, supports, loads and other marks are those that the series holds.
     Raises ValueError for bad arguments or an empty series, RuntimeError if MP4's encoder is not installed.
     """
-    view = View(
-        colour,
-        fps,
-        size,
-        azimuth=azimuth,
-        elevation=elevation,
-        ground=ground,
-        wireframe=wireframe,
-        backend=backend,
-        say=say,
-        arrows=tuple(arrows),
-    )
+    more = dict(wireframe=wireframe, backend=backend, say=say, arrows=tuple(arrows))
+    view = View(colour, fps, size, azimuth=azimuth, elevation=elevation, ground=ground, **more)
     writer, saved = writer_for(output, view), SavedSeries(series)
     writer.open(saved.setting)
     with writer:

@@ -195,20 +195,9 @@ class Optimization:
         """Write the state file; of several ranks the first one does."""
         if not ranks.is_first():
             return
-        save_state(
-            self.path,
-            self.mesh,
-            dict(
-                iteration=self.iteration,
-                losses=self.losses,
-                seconds=self.seconds,
-                best_loss=self.best_loss,
-                best=self._best,
-                module=self.module.state_dict(),
-                optimizer=self.optimizer.state_dict(),
-                random=torch.get_rng_state(),
-            ),
-        )
+        state = {name: getattr(self, name) for name in ("iteration", "losses", "seconds", "best_loss")}
+        state |= dict(best=self._best, module=self.module.state_dict(), optimizer=self.optimizer.state_dict())
+        save_state(self.path, self.mesh, state | dict(random=torch.get_rng_state()))
 
     def restore_best(self) -> None:
         """Bring back the parameters of the lowest loss."""

@@ -65,10 +65,9 @@ class OptimizationPicture:
         path = Path(path or self.path)
         path.parent.mkdir(parents=True, exist_ok=True)
         draft = path.with_name(f".{os.getpid()}_{path.name}")
+        bodies = self.mesh, self.found, self.target, self.start
         try:
-            save_optimization(
-                draft, self.losses, self.parameters, self.mesh, self.found, self.target, self.start, **self.look
-            )
+            save_optimization(draft, self.losses, self.parameters, *bodies, **self.look)
             os.replace(draft, path)
         finally:
             draft.unlink(missing_ok=True)
@@ -129,9 +128,8 @@ def optimization_figure(
     for panel, (name, values) in zip(panels[1:], parameters.items()):
         values = _finite(name, values)
         if values.ndim not in (1, 2) or len(values) != len(losses):
-            raise ValueError(
-                f"{name}: must have one row for each of the {len(losses)} losses, got shape {values.shape}"
-            )
+            rule = f"must have one row for each of the {len(losses)} losses"
+            raise ValueError(f"{name}: {rule}, got shape {values.shape}")
         _curves(panel, evaluations, values, name, (truth or {}).get(name))
     _overlay(panels[-1], mesh, shown, _finite("target", target), plane)
     for panel in panels[:-1]:
@@ -180,15 +178,8 @@ def _overlay(panel, mesh, shown, target, plane: str) -> None:
         edges = target[np.unique(np.sort(pairs, 1), axis=0)][..., axes]
         panel.add_collection(LineCollection(edges, color=TARGET, linewidth=0.7, label="target"))
     else:
-        large = len(target) <= 30
-        panel.plot(
-            *target[:, axes].T,
-            "x" if large else ".",
-            color=TARGET,
-            markersize=8 if large else 2,
-            markeredgewidth=2,
-            label="target",
-        )
+        sign, size = ("x", 8) if len(target) <= 30 else (".", 2)
+        panel.plot(*target[:, axes].T, sign, color=TARGET, markersize=size, markeredgewidth=2, label="target")
     panel.set(xlabel=f"{plane[0]} [m]", ylabel=f"{plane[1]} [m]")
     panel.autoscale_view()
     panel.margins(0.08)

@@ -44,17 +44,8 @@ def draw(
         scale, length = longest(marks), arrow_length(mesh)
         shown = np.concatenate([shown, *(ends(mark, scale, length).reshape(-1, 3) for mark in marks)])
         box = np.stack([shown.min(0), shown.max(0)])
-    with Drawing(
-        mesh,
-        size,
-        ground=ground,
-        colouring=colouring,
-        box=box,
-        azimuth=azimuth,
-        elevation=elevation,
-        backend=backend,
-        **view,
-    ) as drawing:
+    own = dict(colouring=colouring, box=box, azimuth=azimuth, elevation=elevation, backend=backend)
+    with Drawing(mesh, size, ground=ground, **own, **view) as drawing:
         return drawing.image(positions, values, title, drawn=marks) / 255
 
 

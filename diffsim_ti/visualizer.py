@@ -57,7 +57,6 @@ class SimulationVisualizer:
         if not self.has_window:
             from diffsim_ti.picture import save_picture
 
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             save_picture(self.path, self.mesh, self.positions, ground=self.ground, marks=self.marks, **self.look)
             print(f"no display: picture written to {self.path}")
             return

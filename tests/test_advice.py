@@ -180,11 +180,7 @@ FOLLOWED = {
         stiff,
         lambda: (stiff(allow_unstable=True), stiff(substeps=int(advised(stiff)))),
     ),
-    ("terms/growth.py", "names of sets"): (
-        lambda: ds.Growth([0.1], "soft", per="set"),
-        lambda: ds.Growth([0.1, 0.2], tetrahedra=["left", "right"], per="set"),
-    ),
-    ("terms/muscle.py", "names of sets"): (
+    ("terms/of_tetrahedra.py", "names of sets"): (
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0], tetrahedra="left", per="set"),
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0, 1.0], tetrahedra=["left", "right"], per="set"),
     ),
@@ -235,8 +231,8 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("monitor/guard.py", "was stiffer than the substep"): "test_contact.py, test_contact_faces.py",
     ("monitor/stability.py", "in this precision"): "test_step_limit.py",
     ("common/origin.py", "of the barrier's width"): "test_far_from_origin.py",
-    ("rollout/doubts.py", "gradients through contacts"): "test_contact_gradients.py",
-    ("rollout/doubts.py", "the adjoint grew"): "test_gradient_faults.py; a chaotic run has no better gradient",
+    ("rollout/sweep.py", "gradients through contacts"): "test_contact_gradients.py",
+    ("rollout/sweep.py", "the adjoint grew"): "test_gradient_faults.py; a chaotic run has no better gradient",
     ("rollout/taped.py", "already ran in this tape"): "test_tape.py",
     ("runtime/argument_buffer.py", "install taichi"): ANOTHER_MACHINE,
     ("runtime/device.py", "needs Taichi on CUDA"): ANOTHER_MACHINE,
@@ -255,7 +251,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("study/trials.py", "nothing tried meets"): "test_study.py; a budget is no promise",
     ("terms/growth.py", "takes growth of shape"): "test_growth_over_time.py",
     ("terms/muscle.py", "takes activations of shape"): "test_muscles.py",
-    ("terms/terms_of_scene.py", "give them a name="): "test_scene.py",
+    ("scene/scene.py", "give them a name="): "test_scene.py",
     ("torch_bridge/step_sizes.py", "parameter_groups(relative=...)"): "test_step_sizes.py",
     ("torch_bridge/step_sizes.py", "parameter_groups(relative=0.05)"): "test_step_sizes.py",
     ("torch_bridge/tensors.py", "sees no card"): ANOTHER_MACHINE,

@@ -52,10 +52,10 @@ def cube_file(cube, tmp_path_factory):
     return path
 
 
-def falling(mesh, height=0.02, E=2e4, solver=SemiImplicitSolver, kind=forward.ForwardRun, dt=None, **options):
+def falling(mesh, height=0.02, E=2e4, solver=SemiImplicitSolver, kind=forward.ForwardRun, dt=None, **how):
     body, law = mesh.translated([0, height, 0]), StableNeoHookean(E, 0.3)
-    ground = cli.make_ground(body, law, 1000.0, -9.81, np.sqrt(2 * 9.81 * height))
-    return kind(Scene(body, law, 1000.0, [Gravity(), ground], **options), solver, 1 / 30, dt)
+    ground = options.make_ground(body, law, 1000.0, -9.81, np.sqrt(2 * 9.81 * height))
+    return kind(Scene(body, law, 1000.0, [Gravity(), ground], **how), solver, 1 / 30, dt)
 
 
 # ---- series -----------------------------------------------------------------------------------------------------------
@@ -333,7 +333,7 @@ def test_interrupt_exits_130(cube_file, capsys, monkeypatch):
     def stop(*_):
         raise forward.Interrupted("interrupted at t = 0.1 s")
 
-    monkeypatch.setattr(cli, "load_body", stop)
+    monkeypatch.setattr(options, "load_body", stop)
     with pytest.raises(SystemExit) as ended:
         cli.main(["info", str(cube_file)])
     assert ended.value.code == 130 and "interrupted at t = 0.1 s" in capsys.readouterr().err
@@ -367,19 +367,19 @@ def test_help_names_every_command():
 def test_up_turns_the_body(tmp_path, up, axis):
     mesh = TetrahedralMesh.create_box(2, (1.0, 2.0, 3.0))
     mesh.save(tmp_path / "box.vtu")
-    body = cli.load_body(tmp_path / "box.vtu", up=cli.Up(up))
+    body = options.load_body(tmp_path / "box.vtu", up=options.Up(up))
     sign = -1 if up[0] == "-" else 1
     assert body.vertices[:, 1] == pytest.approx(sign * mesh.vertices[:, axis])
     assert body.volume == pytest.approx(6)
 
 
 def test_fixed_by_set_or_side(cube):
-    assert np.array_equal(cli.fixed_vertices(cube, ["ymin"]), cube.vertex_sets["ymin"])
+    assert np.array_equal(options.fixed_vertices(cube, ["ymin"]), cube.vertex_sets["ymin"])
     bare = TetrahedralMesh(cube.vertices, cube.tetrahedra)
-    both = cli.fixed_vertices(bare, ["ymin", "xmax"])
+    both = options.fixed_vertices(bare, ["ymin", "xmax"])
     assert np.array_equal(both, np.union1d(cube.vertex_sets["ymin"], cube.vertex_sets["xmax"]))
     with pytest.raises(ValueError, match="middle"):
-        cli.fixed_vertices(bare, ["middle"])
+        options.fixed_vertices(bare, ["middle"])
 
 
 # ---- pictures ---------------------------------------------------------------------------------------------------------

@@ -143,5 +143,5 @@ def test_a_forgotten_multiplier_would_be_found(monkeypatch):
     """The mutation that the dot products of held volumes are there for."""
     rollout = rollout_of(EXPLICIT[0], pumped(pitted), outputs=ds.ChamberPressure("oil"))
     rollout.forward()
-    monkeypatch.setattr(HeldAdjoint, "end", lambda self: None)
+    monkeypatch.setattr(HeldAdjoint, "end", lambda self, run: None)
     assert ds.dot_product_test(rollout) > 1e-6

@@ -92,6 +92,15 @@ def test_a_simulator_takes_the_loads_of_each_step(kind):
         sim.reset()
 
 
+def test_a_simulator_takes_the_forces_of_each_step_beside_other_loads():
+    """A single ExternalForce is read as it is given, whatever else has rows of steps."""
+    forces = np.random.default_rng(3).normal(size=(3, lidded().num_vertices, 3))
+    solver = ds.SemiImplicitSolver(scene([ds.ExternalForce(forces), ds.Pressure(10.0, "lid")]), dt=1e-3)
+    simulator = ds.Simulator(solver)
+    simulator.run(3)
+    np.testing.assert_array_equal(simulator.positions, ds.Rollout(solver, 3).forward().positions[-1])
+
+
 def test_a_simulator_beyond_the_loads_says_so():
     sim = ds.Simulator(ds.VelocityVerletSolver(scene([ds.Pressure([1.0, 2.0], "lid")]), dt=1e-3))
     sim.run(2)

@@ -10,8 +10,6 @@ from diffsim_ti.batch.side_by_side import growths_placed, placed
 from diffsim_ti.inputs import Derived
 
 OF_STEPS = "forces", "motion", "path"
-CLEARED = ("u", "v", "w", "corner", "rate_corner", "coefficients", "gradients", "volumes", "sums", "felt", "anchor")
-CLEARED += OF_STEPS
 
 
 class BatchAdjoint:
@@ -21,33 +19,30 @@ class BatchAdjoint:
         self.ws = weakref.proxy(workspace)
         ws, a = workspace, workspace.arrays
         self.features, self.own = a.features(density, shape), workspace.own
-        layout, n, m = ws.layout, a.num_vertices, a.num_places
-        self.u, self.v, self.w = (layout.vectors(1, n) for _ in range(3))
-        self.corner = ws.room_for_corners()
+        layout, n, m, moving = ws.layout, a.num_vertices, a.num_places, self.features.moving
         self.reads_rates = "H_dot" in a.law.reads or any(x.reads_rates for x in self.features.interactions)
-        self.rate_corner = ws.room_for_corners() if self.reads_rates else runtime.array(layout.vector, 1)
-        self.z = layout.numbers(1, ws.law_rows) if ws.law_rows else None
-        self.coefficients = layout.numbers(a.num_coefficients * m)
-        self.gradients = layout.numbers(9 * a.points * m * shape)
-        self.volumes = layout.numbers(a.points * m * shape)
-        self.sums = layout.numbers(self.features.sums().total, n)
-        moving = self.features.moving
-        self.felt = layout.vectors(2 * moving * self._steps, n if moving else 1)
+        # those of interactions, of vectors
+        self.further = {
+            name: layout.vectors(*own) for x in a.interactions for name, own in x.adjoints(a.values, shape).items()
+        }
+        arrays = {name: layout.vectors(1, n) for name in ("u", "v", "w")} | self.further
+        arrays["corner"] = ws.room_for_corners()
+        arrays["rate_corner"] = ws.room_for_corners() if self.reads_rates else runtime.array(layout.vector, 1)
+        if ws.law_rows:
+            arrays["z"] = layout.numbers(1, ws.law_rows)
+        arrays["coefficients"] = layout.numbers(a.num_coefficients * m)
+        arrays["gradients"] = layout.numbers(9 * a.points * m * shape)
+        arrays["volumes"] = layout.numbers(a.points * m * shape)
+        arrays["sums"] = layout.numbers(self.features.sums().total, n)
+        arrays["felt"] = layout.vectors(2 * moving * self._steps, n if moving else 1)
         for name in (*OF_STEPS, "anchor"):
-            setattr(self, name, runtime.array(layout.vector, *getattr(ws.numbers, name).shape))
-        self.further, self.made_for = self._further(shape), self._shapes()
-        vars(self).update(self.further)
+            arrays[name] = runtime.array(layout.vector, *getattr(ws.numbers, name).shape)
+        if self.features.growing:
+            arrays["growths"] = runtime.array(layout.number, *ws.numbers.growths.shape)
+        self._arrays, self.made_for = arrays, self._shapes()
+        vars(self).update(arrays)
         frames = ws.room_for_frames(ws.frames.frames_u.shape[0])
         self.frames_u, self.frames_v = frames.frames_u, frames.frames_v
-
-    def _further(self, shape: bool) -> dict:
-        """Adjoints of what some scenes alone have: interactions, and growth."""
-        ws, layout, out = self.ws, self.ws.layout, {}
-        for x in ws.arrays.interactions:
-            out |= {name: layout.vectors(*own) for name, own in x.adjoints(ws.arrays.values, shape).items()}
-        if self.features.growing:
-            out["growths"] = runtime.array(layout.number, *ws.numbers.growths.shape)
-        return out
 
     @property
     def _steps(self) -> int:
@@ -69,10 +64,7 @@ class BatchAdjoint:
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (scenes, frames, n, 3), and clear the rest."""
         layout = self.ws.layout
-        for name in CLEARED:
-            runtime.fill(getattr(self, name), 0)
-        for array in (*self.further.values(), *([] if self.z is None else [self.z])):
-            runtime.fill(array, 0)
+        runtime.clear(self._arrays.values())
         for target, state, adjoint in ((self.frames_u, self.u, positions_adj), (self.frames_v, self.v, velocities_adj)):
             runtime.fill(target, layout.pack_vectors(adjoint))
             if last_frame_is_input:
@@ -86,14 +78,16 @@ class BatchAdjoint:
         for numbers in self.ws.launches(stop, last, num_passes, save_every, backwards=True):
             ws = self.ws
             launch = ws.bound(ws.kernels(self.features).step_vjp, state=(ws.record, ws.frames, ws.met), adjoint=self)
-            launch(**numbers, base=base, num_passes=num_passes, halt=halt, kick=0, steps=self._steps, num_parts=1)
+            launch(**numbers, base=base, halt=halt, kick=0, steps=self._steps, num_parts=1)
 
     def finish(self) -> None:
         """Complete the adjoint of the start."""
         ws = self.ws
         if not ws.layout.in_lanes:
             gather = ws.bound(ws.kernels(self.features).finish_vjp, adjoint=self)
-            gather(num_rows=ws.arrays.num_vertices * ws.num_scenes, num_scenes=ws.num_scenes)
+            gather(
+                **ws.layout.counts(ws.arrays.num_places, ws.arrays.num_vertices), num_vertices=ws.arrays.num_vertices
+            )
             return
         u, corner = runtime.fetch(self.u), runtime.fetch(self.corner)
         runtime.fill(self.u, u + corner[None])
@@ -127,7 +121,7 @@ class BatchAdjoint:
         return out
 
     def _collect_further(self, out: Derived) -> None:
-        a, found = self.ws.arrays, {name: self._vectors(x) for name, x in self.further.items() if name != "growths"}
+        a, found = self.ws.arrays, {name: self._vectors(x) for name, x in self.further.items()}
         for x in a.interactions:
             x.collect(found, out, self.features.shape)
         if self.features.growing:
@@ -192,7 +186,7 @@ class BatchTangent:
         ws = self.ws
         launch = ws.bound(ws.kernels(self.features).step_jvp, state=(ws.record, ws.frames, ws.met), tangent=self)
         for numbers in ws.launches(first, last, num_passes, save_every):
-            launch(**numbers, base=first)
+            launch(**numbers, base=first, rate_dot=0.0)  # each scene has its own
 
     def save_frame(self, frame: int) -> None:
         """Copy the current change to a frame."""

@@ -10,7 +10,8 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.loads.explicit import GivenForces
-from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced, variable
+from diffsim_ti.runtime import LANES, Bundle, assign, at, let, traced, variable
+from diffsim_ti.solvers.explicit import kick_drift
 from diffsim_ti.state.features import Features
 
 A = ti.template()
@@ -31,6 +32,13 @@ class Numbers:
         return at(self._array, self._first + k)
 
 
+@traced
+def each(formula, *vectors, **numbers) -> list:
+    """A formula of components, or lists of what several make of them."""
+    found = [formula(*components, **numbers) for components in zip(*vectors)]
+    return list(zip(*found)) if type(found[0]) is tuple else found
+
+
 @dataclass(frozen=True)
 class FreeVertices:
     """Functions of vertex i of block b; s: the slot of its state."""
@@ -41,15 +49,11 @@ class FreeVertices:
 
     @property
     def fp(self):
-        return PRECISIONS[self.law.precision]
+        return self.law.fp
 
     @cached_property
     def lanes(self):
         return ti.types.vector(LANES, self.fp)
-
-    @cached_property
-    def given(self) -> GivenForces:
-        return GivenForces(self.features, self.law.precision)
 
     @property
     def some_special(self) -> bool:
@@ -106,10 +110,9 @@ class FreeVertices:
 
     # ---- forces given on vertices --------------------------------------------------------------------------------------
 
-    @traced
-    def force_at(self, rows, row, place, share):
-        """share of the force in a row."""
-        return [let(share * x) for x in self.read(rows, row, place)]
+    @cached_property
+    def given_forces(self) -> GivenForces:
+        return GivenForces(self.features, self.law.precision)
 
     @traced
     def slot(self, i, b, scene, plan) -> tuple:
@@ -119,42 +122,20 @@ class FreeVertices:
         return let(3 * (let(b * plan.num_loaded) + width * ti.max(k, 0))), loaded
 
     @traced
-    def kicks(self, i, b, now, scene, plan) -> list:
-        """(row, place, how far in the step, weight) of both kicks, where forces change within steps."""
-        (place, loaded), out = self.slot(i, b, scene, plan), []
-        for step, weight in ((now.force0, now.share0), (now.force1, now.share1)):
-            share = let(ti.select(step == now.row, now.begin, ti.cast(1, self.fp)))
-            out.append((step if self.features.forces_per_step else 0, place, share, let(weight * loaded)))
-        return out
-
-    @traced
-    def load_terms(self, i, b, now, scene, plan) -> list:
-        """(row, place, weight) of the rows of forces that vertex i takes; a weight of zero where it takes none."""
-        F = self.features
-        if F.forces_keyed:
-            out = []
-            for row, place, share, weight in self.kicks(i, b, now, scene, plan):
-                out += [(row, place, let(weight * (1 - share))), (row, let(place + 3), let(weight * share))]
-            return out
-        place, loaded = self.slot(i, b, scene, plan)
-        if F.forces_per_step:
-            return [(now.force0, place, let(now.share0 * loaded)), (now.force1, place, let(now.share1 * loaded))]
-        return [(0, place, loaded)]
-
-    @traced
     def load(self, i, b, now, scene, forces, plan) -> list:
-        """The force of a pass, with the operations of GivenForces in their order."""
-        if self.features.forces_keyed:
-            parts = [self.keyed_force(forces, *kick) for kick in self.kicks(i, b, now, scene, plan)]
-        else:
-            parts = [self.force_at(forces, *part) for part in self.load_terms(i, b, now, scene, plan)]
-        return parts[0] if len(parts) == 1 else [let(x + y) for x, y in zip(*parts)]
+        """The force of a pass."""
+        place, loaded = self.slot(i, b, scene, plan)
+        return self.given_forces.mean(lambda row, end: self.read(forces, row, let(place + 3 * end)), now, loaded)
 
     @traced
-    def keyed_force(self, forces, row, place, share, weight) -> list:
-        """weight times a force of a step that changes from its beginning to its end."""
-        begin, end = self.read(forces, row, place), self.read(forces, row, let(place + 3))
-        return [let(weight * (x + share * (y - x))) for x, y in zip(begin, end)]
+    def add_load(self, i, b, now, scene, forces_adj, f_adj, plan) -> None:
+        """Its transpose."""
+        place, loaded = self.slot(i, b, scene, plan)
+
+        def add(row, end, numbers):
+            self.add(forces_adj, numbers, row, let(place + 3 * end))
+
+        self.given_forces.mean_vjp(add, f_adj, now, loaded)
 
     # ---- forward -------------------------------------------------------------------------------------------------------
 
@@ -170,10 +151,8 @@ class FreeVertices:
         if F.gravity >= 0:
             moves = self.moves(inverse)
             a = [let(x + moves * g) for x, g in zip(a, self.gravity(b, scene.parameters, plan))]
-        v_mid = [let(x + now.pre * y) for x, y in zip(v, a)]
-        v_plus = [let(x + now.post * y) for x, y in zip(v_mid, a)]
-        u_next = [let(x + now.alpha * y) for x, y in zip(u, v_plus)]
-        v_next = [let(now.decay * x) for x in v_plus]
+        v_mid, v_plus = each(kick_drift.kick, v, a, now=now)
+        u_next, v_next = each(kick_drift.drift, u, v_plus, now=now)
         return Bundle(first=first, u=u, f=f, v_mid=v_mid, u_next=u_next, v_next=v_next)
 
     @ti.func
@@ -189,9 +168,7 @@ class FreeVertices:
                     if self.hits(i, b, moved, now, scene, plan) > 0:
                         calm = 0
         if calm == 1:
-            if now.frame >= 0:
-                self.write(state.frames_u, moved.u, now.frame, moved.first)
-                self.write(state.frames_v, moved.v_mid, now.frame, moved.first)
+            self.note_frame(now, state, moved.u, moved.v_mid, moved.first)
             if plan.stride > 0:
                 self.write(state.f, moved.f, s, moved.first)
             self.write(state.u, moved.u_next, s + plan.stride, moved.first)
@@ -254,20 +231,17 @@ class FreeVertices:
         if F.forces:
             df = [let(x + y) for x, y in zip(df, self.load(i, b, now, scene, tangent.forces, plan))]
         inverse, f = self.inverse_mass(i, b, scene, plan), self.read(state.f, s, first)
-        by_mass = let(inverse * at(tangent.mass, n))
-        da = [let(inverse * (x - by_mass * y)) for x, y in zip(df, f)]
+        dm = let(at(tangent.mass, n))
+        da = each(kick_drift.acceleration_jvp, f, df, dm=dm, inverse=inverse)
         if F.gravity >= 0:
             moves = self.moves(inverse)
             da = [let(x + moves * g) for x, g in zip(da, self.gravity(b, tangent.parameters, plan))]
-        dv_mid = [let(x + now.pre * y) for x, y in zip(dv, da)]
-        dv_plus = [let(x + now.post * y) for x, y in zip(dv_mid, da)]
-        du_next = [let(x + now.alpha * y) for x, y in zip(du, dv_plus)]
-        dv_next = [let(now.decay * y) for y in dv_plus]
+        dv_mid, dv_plus = each(kick_drift.kick, dv, da, now=now)
+        du_next, dv_next = each(kick_drift.drift, du, dv_plus, now=now)
         if F.drag >= 0:
             rate = let(at(tangent.parameters, b * plan.num_parameters + F.drag))
             v_plus = [let(x / now.decay) for x in self.read(state.v, let(s + 1), first)]
-            du_next = [let(x + now.alpha_by_rate * rate * y) for x, y in zip(du_next, v_plus)]
-            dv_next = [let(x + now.decay_by_rate * rate * y) for x, y in zip(dv_next, v_plus)]
+            du_next, dv_next = each(kick_drift.drift_by_rate, du_next, dv_next, v_plus, rate=rate, now=now)
         self.note_frame(now, tangent, du, dv_mid, first)
         self.write(tangent.u, du_next, 0, first)
         self.write(tangent.v, dv_next, 0, first)
@@ -303,14 +277,14 @@ class FreeVertices:
         q = self.read(adjoint.v, 0, first)
         if "H_dot" in self.law.reads or any(x.reads_rates for x in F.interactions):
             q = [let(x + y) for x, y in zip(q, self.read(adjoint.rate_corner, first))]
-        v_plus_adj = [let(now.alpha * x + now.decay * y) for x, y in zip(p, q)]
+        v_plus_adj = each(kick_drift.drift_vjp, p, q, now=now)
         if F.drag >= 0:
             v_plus = [let(x / now.decay) for x in self.read(state.v, let(s + 1), first)]
             by_rate = now.alpha_by_rate * self.dot(p, v_plus) + now.decay_by_rate * self.dot(q, v_plus)
             self.add_number(adjoint.sums, let(by_rate), F.drag, n)
         p, v_mid_adj = ([variable(x) for x in y] for y in (p, v_plus_adj))
         self.add_frame(now, p, v_mid_adj, adjoint, first)
-        a_adj = [let(now.post * x + now.pre_adj * y) for x, y in zip(v_plus_adj, v_mid_adj)]
+        a_adj = each(kick_drift.kick_vjp, v_plus_adj, v_mid_adj, now=now)
         inverse = self.inverse_mass(i, b, scene, plan)
         f_adj = [let(inverse * x) for x in a_adj]
         if F.density:
@@ -321,8 +295,7 @@ class FreeVertices:
             for d in range(3):
                 self.add_number(adjoint.sums, let(moves * a_adj[d]), F.gravity + d, n)
         if F.forces:
-            for row, place, weight in self.load_terms(i, b, now, scene, plan):
-                self.add(adjoint.forces, [let(weight * x) for x in f_adj], row, place)
+            self.add_load(i, b, now, scene, adjoint.forces, f_adj, plan)
         self.write(adjoint.u, p, 0, first)
         self.write(adjoint.v, v_mid_adj, 0, first)
         self.write(adjoint.w, f_adj, 0, first)

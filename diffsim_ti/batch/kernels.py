@@ -187,7 +187,7 @@ class BatchKernels(BlockViews):
     @cached_property
     def step_vjp(self) -> Kernel:
         """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
-        numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
+        numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
         adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.items.adjoint) | self.growing
         arrays = dict(state=self.with_state(STATE), adjoint=adjoint)
         return self._kernel("step_vjp", self.passes_vjp, arrays, **numbers)

@@ -10,7 +10,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.runtime import LANES, PRECISIONS
+from diffsim_ti.runtime import LANES, PRECISIONS, number_type, vector_type
 
 SPREAD = 1024  # items of a loop at least, for Taichi keeps fewer on one thread
 APART = 16  # numbers between what threads note, so that they do not wait for each other's cache lines
@@ -110,13 +110,7 @@ class Innermost:
     in_lanes = False
     KINDS = dict(numbers="scalars", numbers2="scalars2", vectors="vectors", vectors2="vectors2")
 
-    @property
-    def number(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, PRECISIONS[self.precision])
+    number, vector = number_type, vector_type
 
     @property
     def width(self) -> int:

@@ -154,21 +154,8 @@ class ItemsOfScenes(Items):
         array = array.array if isinstance(array, Uniform) else array
         return [let(at(array, place(rows, item, k))) for k in wanted]
 
-    def row(self, array, slot, first: int, count: int, rows: int, item):
-        return [let(at(array, slot, self.place(rows, item, k))) for k in range(first, first + count)]
-
-    def put_row(self, array, slot, first: int, rows: int, item, numbers):
-        for k, number in enumerate(numbers, first):
-            assign(at(array, slot, self.place(rows, item, k)), number)
-
-    def put(self, array, rows: int, item, first, numbers):
-        for k, number in enumerate(numbers, first):
-            assign(at(array, self.place(rows, item, k)), number)
-
-    def add(self, array, rows: int, item, numbers, first: int = 0):
-        for k, number in enumerate(numbers, first):
-            target = at(array, self.place(rows, item, k))
-            assign(target, target + number)
+    def entries(self, array, slots: tuple, first: int, count: int, rows: int, item):
+        return (at(array, *slots, self.place(rows, item, k)) for k in range(first, first + count))
 
 
 @dataclass(frozen=True)

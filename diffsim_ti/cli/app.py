@@ -1,4 +1,4 @@
-"""The command line: `diffsim-ti` or `python -m diffsim_ti`. One function per command; heavy imports inside them."""
+"""The command line: `diffsim-ti` or `python -m diffsim_ti`. One function per command."""
 
 import sys
 import time
@@ -9,52 +9,31 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from diffsim_ti import runtime
+from diffsim_ti.cli import options as opt
+from diffsim_ti.cli import study, view
 from diffsim_ti.cli.identify import identify
-from diffsim_ti.cli.options import (
-    SUFFIXES,
-    Arrows,
-    Backend,
-    Density,
-    FixOrientation,
-    Folder,
-    MaterialName,
-    MeshFile,
-    Order,
-    Poisson,
-    Precision,
-    Size,
-    Threads,
-    Up,
-    UpAxis,
-    Volume,
-    Youngs,
-    check_length,
-    check_time_it_takes,
-    fall_scene,
-    fixed_vertices,
-    forces_named,
-    load_body,
-    make_ground,
-    make_material,
-    print_summary,
-    solver_class,
-)
-from diffsim_ti.cli.study import register as register_study
-from diffsim_ti.cli.view import register
+from diffsim_ti.cli.sweep import sweep
 from diffsim_ti.common import interrupts
+from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.monitor.stability import element_limit
+from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
-from diffsim_ti.writers.adaptive_run import Interrupted
+from diffsim_ti.solvers import SemiImplicitSolver, stable_dt
+from diffsim_ti.terms import Drag, Gravity
+from diffsim_ti.verify import check_gradients as check
+from diffsim_ti.writers import View, writer_for
+from diffsim_ti.writers.adaptive_run import ForwardRun, Interrupted, file_in, run_and_write
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
-register_study(app)  # chart, stability, recommend
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
-register(app)
-app.command()(identify)
+for command in (study.chart, study.stability, study.growth, study.recommend, sweep, view.render, view.view, identify):
+    app.command()(command)
 
 
 @app.callback()
-def options(
+def everywhere(
     traceback: Annotated[bool, typer.Option("--traceback", help="show the traceback of an error")] = False,
 ) -> None:
     """Soft bodies on tetrahedra, simulated with Taichi. Errors are one line on stderr, with exit code 2."""
@@ -105,25 +84,25 @@ def _ran(arguments: list[str]) -> tuple[str, int]:
 
 @app.command()
 def simulate(
-    mesh: MeshFile,
+    mesh: opt.MeshFile,
     output: Annotated[
         list[Path] | None,
         typer.Option(
             "--output",
             "-o",
             help="folder for a series and a picture of the end (default output/simulate), or a file by its suffix: "
-            f"{SUFFIXES}; may be repeated",
+            f"{opt.SUFFIXES}; may be repeated",
         ),
     ] = None,
-    material: MaterialName = "StableNeoHookean",
-    youngs_modulus: Youngs = 1e5,
-    poissons_ratio: Poisson = 0.4,
-    density: Density = 1000.0,
-    volume: Volume = "tetrahedra",
-    order: Order = 1,
-    size: Size = None,
-    up: UpAxis = Up.y,
-    fix_orientation: FixOrientation = False,
+    material: opt.MaterialName = "StableNeoHookean",
+    youngs_modulus: opt.Youngs = 1e5,
+    poissons_ratio: opt.Poisson = 0.4,
+    density: opt.Density = 1000.0,
+    volume: opt.Volume = "tetrahedra",
+    order: opt.Order = 1,
+    size: opt.Size = None,
+    up: opt.UpAxis = opt.Up.y,
+    fix_orientation: opt.FixOrientation = False,
     duration: Annotated[float, typer.Option(help="simulated time [s]")] = 1.0,
     fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
     dt: Annotated[
@@ -133,9 +112,7 @@ def simulate(
     gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
     velocity: Annotated[tuple[float, float, float], typer.Option(help="at the start [m/s]")] = (0.0, 0.0, 0.0),
-    fixed: Annotated[
-        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
-    ] = None,
+    fixed: opt.Fixed = None,
     ground: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
     height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a tenth of the size")] = None,
     ground_stiffness_per_area: Annotated[
@@ -147,67 +124,48 @@ def simulate(
     ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
     ground_friction: Annotated[float, typer.Option(help="Coulomb's coefficient of the floor")] = 0.0,
     azimuth: Annotated[float, typer.Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
-    arrows: Arrows = None,
-    backend: Backend = "cpu",
-    precision: Precision = "f32",
-    threads: Threads = None,
+    arrows: opt.Arrows = None,
+    backend: opt.Backend = "cpu",
+    precision: opt.Precision = "f32",
+    threads: opt.Threads = None,
 ) -> None:
     """Simulate a body, by default its fall onto a floor; write a series and a picture of the end, or films, arrays ..."""
-    from diffsim_ti import runtime
-    from diffsim_ti.writers import View, writer_for
-    from diffsim_ti.writers.adaptive_run import ForwardRun, file_in, run_and_write
-
     begin = time.perf_counter()
-    check_length(duration, fps, dt)
+    opt.check_length(duration, fps, dt)
     view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end", arrows=tuple(arrows or ()))
     asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
     writers = [writer_for(path, view) for path in dict.fromkeys(asked)]
-    kind = solver_class(solver)
-    law = make_material(material, youngs_modulus, poissons_ratio)
-    body = load_body(mesh, size, up, fix_orientation, order)
+    kind = opt.solver_class(solver)
+    law = opt.make_material(material, youngs_modulus, poissons_ratio)
+    body = opt.load_body(mesh, size, up, fix_orientation, order)
     runtime.init(backend, precision, threads)
-    scene, _ = fall_scene(
-        body,
-        law,
-        density,
-        gravity,
-        drag,
-        velocity,
-        fixed,
-        ground,
-        height,
-        ground_stiffness,
-        ground_width,
-        volume=volume,
-        stiffness_per_area=ground_stiffness_per_area,
-        friction=ground_friction,
+    floor = dict(stiffness=ground_stiffness, stiffness_per_area=ground_stiffness_per_area)
+    floor |= dict(width=ground_width, friction=ground_friction)
+    scene, _ = opt.fall_scene(
+        body, law, density, gravity, drag, velocity, fixed, ground, height, volume=volume, **floor
     )
     frames = max(1, round(duration * fps))
-    run = ForwardRun(scene, kind, duration / frames, dt, forces_named(arrows or (), scene))
-    check_time_it_takes(run, duration)
+    run = ForwardRun(scene, kind, duration / frames, dt, opt.forces_named(arrows or (), scene))
+    opt.check_time_it_takes(run, duration)
     setup = time.perf_counter() - begin
     writing, files, _ = run_and_write(run, frames, writers)
-    print_summary(run, setup, writing, files)
+    opt.print_summary(run, setup, writing, files)
 
 
 @app.command()
 def info(
-    mesh: MeshFile,
-    youngs_modulus: Youngs = 1e5,
-    poissons_ratio: Poisson = 0.4,
-    density: Density = 1000.0,
-    material: MaterialName = "StableNeoHookean",
-    size: Size = None,
-    fix_orientation: FixOrientation = False,
+    mesh: opt.MeshFile,
+    youngs_modulus: opt.Youngs = 1e5,
+    poissons_ratio: opt.Poisson = 0.4,
+    density: opt.Density = 1000.0,
+    material: opt.MaterialName = "StableNeoHookean",
+    size: opt.Size = None,
+    fix_orientation: opt.FixOrientation = False,
     tight: Annotated[bool, typer.Option("--tight", help="also the tight limit, by Lanczos")] = False,
 ) -> None:
     """Say what is in a mesh file: sizes, quality, groups, and the stable explicit step for given moduli."""
-    from diffsim_ti.monitor.stability import element_limit
-    from diffsim_ti.scene import Scene
-    from diffsim_ti.solvers import stable_dt
-
-    body = load_body(mesh, size, Up.y, fix_orientation)
-    scene = Scene(body, make_material(material, youngs_modulus, poissons_ratio), density)
+    body = opt.load_body(mesh, size, opt.Up.y, fix_orientation)
+    scene = Scene(body, opt.make_material(material, youngs_modulus, poissons_ratio), density)
     print(body.describe())
     print(f"mass: {scene.inputs.derive(scene.inputs.values).mass.sum():.6g} kg")
     print(f"stable step for {scene.material!r}, density {density:g} kg/m^3, at rest:")
@@ -218,51 +176,35 @@ def info(
 
 @app.command("check-gradients")
 def check_gradients(
-    mesh: MeshFile,
-    youngs_modulus: Youngs = 1e5,
-    poissons_ratio: Poisson = 0.4,
-    density: Density = 1000.0,
-    material: MaterialName = "StableNeoHookean",
-    order: Order = 1,
-    size: Size = None,
-    up: UpAxis = Up.y,
+    mesh: opt.MeshFile,
+    youngs_modulus: opt.Youngs = 1e5,
+    poissons_ratio: opt.Poisson = 0.4,
+    density: opt.Density = 1000.0,
+    material: opt.MaterialName = "StableNeoHookean",
+    order: opt.Order = 1,
+    size: opt.Size = None,
+    up: opt.UpAxis = opt.Up.y,
     steps: Annotated[int, typer.Option(help="length of the rollout")] = 50,
     dt: Annotated[float | None, typer.Option(help="[s]; default half the stable step")] = None,
     solver: Annotated[str, typer.Option(help="semi-implicit or verlet")] = "semi-implicit",
-    fixed: Annotated[
-        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
-    ] = None,
+    fixed: opt.Fixed = None,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.5,
-    backend: Backend = "cpu",
-    precision: Precision = "f64",
+    backend: opt.Backend = "cpu",
+    precision: opt.Precision = "f64",
 ) -> None:
     """Check every gradient of a short fall onto a floor against differences.
 
-
     The body starts half a barrier width above the floor, moving, so that contact takes part. Exit code 0 if all are right.
     """
-    from diffsim_ti import runtime
-    from diffsim_ti.rollout import Rollout
-    from diffsim_ti.scene import Scene
-    from diffsim_ti.solvers import stable_dt
-    from diffsim_ti.terms import Drag, Gravity
-    from diffsim_ti.verify import check_gradients as check
-
     runtime.init(backend, precision)
-    law, body = make_material(material, youngs_modulus, poissons_ratio), load_body(mesh, size, up, order=order)
-    ground = make_ground(body, law, density, -9.81, 0.5, width=0.02 * np.ptp(body.bounding_box, 0).max())
+    law, body = opt.make_material(material, youngs_modulus, poissons_ratio), opt.load_body(mesh, size, up, order=order)
+    ground = opt.make_ground(body, law, density, -9.81, 0.5, width=0.02 * np.ptp(body.bounding_box, 0).max())
     lift = 0.5 * float(ground.values["barrier_width"]) - body.bounding_box[0, 1]
     body = body.translated([0, lift, 0])
     velocities = 0.1 * np.random.default_rng(0).standard_normal(body.vertices.shape) + [0, -0.5, 0]
-    scene = Scene(
-        body,
-        law,
-        density,
-        [Gravity(), Drag(drag), ground],
-        fixed_vertices(body, fixed or []),
-        initial_velocities=velocities,
-    )
-    kind = solver_class(solver, implicit=False)
+    terms, held = [Gravity(), Drag(drag), ground], opt.fixed_vertices(body, fixed or [])
+    scene = Scene(body, law, density, terms, held, initial_velocities=velocities)
+    kind = opt.solver_class(solver, implicit=False)
     dt = 0.5 * stable_dt(scene).dt if dt is None else dt
     report = check(Rollout(kind(scene, dt=dt), steps, gradients="all"))
     if not report.passed:
@@ -271,23 +213,17 @@ def check_gradients(
 
 @app.command()
 def demo(
-    output: Folder = Path("output/demo"),
-    backend: Backend = "cpu",
+    output: opt.Folder = Path("output/demo"),
+    backend: opt.Backend = "cpu",
     quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
 ) -> None:
     """Drop a twisted jelly column, write pictures and a series, and take the gradient of its fall by Young's modulus."""
-    from diffsim_ti import runtime
-    from diffsim_ti.materials import StableNeoHookean
     from diffsim_ti.picture import save_picture
-    from diffsim_ti.scene import Scene
-    from diffsim_ti.solvers import SemiImplicitSolver
-    from diffsim_ti.terms import Gravity
-    from diffsim_ti.writers.adaptive_run import ForwardRun, run_and_write
 
     begin = time.perf_counter()
     runtime.init(backend)
     body, law = twisted_column(3 if quick else 9), StableNeoHookean(3e4, 0.4)
-    ground = make_ground(body, law, 1000.0, -9.81, np.sqrt(2 * 9.81 * 0.15))
+    ground = opt.make_ground(body, law, 1000.0, -9.81, np.sqrt(2 * 9.81 * 0.15))
     scene = Scene(body, law, 1000.0, [Gravity(), ground])
     frames = 6 if quick else 36
     run = ForwardRun(scene, SemiImplicitSolver, 1 / 30)
@@ -299,26 +235,17 @@ def demo(
     box, top = np.stack([points.min(0), points.max(0)]), max(np.percentile(f.fields["von_mises"], 99.5) for f in kept)
     for k, frame in enumerate(kept):
         files.append(str(output / f"column_{k}.png"))
+        stress, look = frame.fields["von_mises"], dict(ground=0.0, limits=(0.0, float(top)), box=box)
         save_picture(
-            files[-1],
-            body,
-            frame.positions,
-            frame.fields["von_mises"],
-            "von Mises stress [Pa]",
-            0.0,
-            f"t = {frame.time:.2f} s",
-            (0.0, float(top)),
-            box=box,
+            files[-1], body, frame.positions, stress, "von Mises stress [Pa]", title=f"t = {frame.time:.2f} s", **look
         )
-    print_summary(run, setup, writing + time.perf_counter() - begin, files)
+    opt.print_summary(run, setup, writing + time.perf_counter() - begin, files)
     state = dict(initial_positions=kept[1].positions, initial_velocities=kept[1].velocities)
     print_gradient(scene.replace(**state, precision="f64"))
 
 
 def twisted_column(cells: int) -> TetrahedralMesh:
     """A square column 0.6 m high, wrung by 150 degrees and tilted, its lowest point 0.15 m above y = 0."""
-    from diffsim_ti.mesh import TetrahedralMesh
-
     mesh = TetrahedralMesh.create_box((cells + 1, 3 * cells + 1, cells + 1), (0.2, 0.6, 0.2), origin=(-0.1, 0.0, -0.1))
     x, y, z = mesh.vertices.T
     angle = np.radians(150) * y / 0.6
@@ -329,9 +256,6 @@ def twisted_column(cells: int) -> TetrahedralMesh:
 
 def print_gradient(scene: Scene, seconds: float = 0.05, change: float = 1e-3) -> None:
     """Gradient by E of the mean height after `seconds`, in float64, beside a central difference."""
-    from diffsim_ti.rollout import Rollout
-    from diffsim_ti.solvers import SemiImplicitSolver, stable_dt
-
     dt = 0.4 * stable_dt(scene).dt  # as fine as gradients through the contact want it
     steps = int(np.ceil(seconds / dt))
     rollout = Rollout(SemiImplicitSolver(scene, dt=seconds / steps), steps, gradients="youngs_modulus")

@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+import diffsim_ti as ds
 from diffsim_ti.cli.options import Density, MaterialName, MeshFile, Size, Up, fixed_vertices, load_body, make_material
 
 COLUMNS = ("time", "marker", "x", "y", "z")
@@ -91,7 +92,6 @@ def identify(
     output: Annotated[Path, typer.Option("--output", "-o", help="picture")] = Path("output/identify.png"),
 ) -> None:
     """Find numbers of a body, with 95 % intervals, from tracks of markers on it or a force curve; draw data and fit."""
-    import diffsim_ti as ds
     from diffsim_ti.identification.picture import save_picture
 
     guesses, body = numbers_of(unknown), load_body(mesh, size)
@@ -107,10 +107,10 @@ def identify(
     terms = [ds.Gravity((0.0, gravity, 0.0))] if gravity and not curve else []
     terms += [ds.Drag(guesses.get("drag", drag))] if (drag or "drag" in guesses) and not curve else []
     if curve:
-        rollout, measured, ways = _pulled(ds, body, law, density, fixed or [], pull, along, read_curve(data), noise)
+        rollout, measured, ways = _pulled(body, law, density, fixed or [], pull, along, read_curve(data), noise)
     else:
         scene = ds.Scene(body, law, density, terms, fixed_vertices(body, fixed or []), precision="f64")
-        (rollout, measured), ways = _tracked(ds, scene, *read_tracks(data), noise), None
+        (rollout, measured), ways = _tracked(scene, *read_tracks(data), noise), None
     found = ds.identify(rollout, measured, guesses, progress=True, starts=starts, check_mesh=check_mesh)
     print(found)
     more = {} if ways is None else dict(at=ways, at_label="displacement [m]")
@@ -118,7 +118,7 @@ def identify(
     print(f"picture written to {output}")
 
 
-def _tracked(ds, scene, times: np.ndarray, places: np.ndarray, noise: float):
+def _tracked(scene, times: np.ndarray, places: np.ndarray, noise: float):
     """The rollout that markers were seen in, and what was seen."""
     frame = float(np.median(np.diff(times)))
     substeps = int(np.ceil(frame / (0.4 * ds.stable_dt(scene))))  # stable up to six times the stiffness guessed
@@ -129,7 +129,7 @@ def _tracked(ds, scene, times: np.ndarray, places: np.ndarray, noise: float):
     return rollout, ds.Measurement(markers.name, places[1:], noise, times=np.minimum(times[1:], rollout.times[-1]))
 
 
-def _pulled(ds, body, law, density, fixed: list[str], pull: str, along: Up, curve, noise: float):
+def _pulled(body, law, density, fixed: list[str], pull: str, along: Up, curve, noise: float):
     """The equilibria in which a force was read, what was read, and the displacements of all frames [m]."""
     ways, forces = (np.concatenate([[start], x]) for start, x in zip((0.0, np.nan), curve))
     axis, sign = "xyz".index(along.value[-1]), -1.0 if along.value.startswith("-") else 1.0

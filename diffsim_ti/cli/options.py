@@ -1,26 +1,26 @@
 """What the commands share: types of options, the scene that options describe, the summary at the end."""
 
 import math
+import runpy
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import typer
 from numpy.typing import ArrayLike
 
+from diffsim_ti.materials import MATERIALS
 from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.outputs import ContactForce, Output, Reaction
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.terms import Drag, Ground, Term
+from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, Solver, VelocityVerletSolver
+from diffsim_ti.terms import Drag, Gravity, Ground, Term
+from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 from diffsim_ti.writers import WRITERS
-
-if TYPE_CHECKING:
-    from diffsim_ti.outputs import Output
-    from diffsim_ti.writers.adaptive_run import ForwardRun
-
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 Up = Enum("Up", {name: name for name in ("x", "y", "z", "-x", "-y", "-z")}, type=str)
 SIDES = {f"{axis}{end}": (d, end) for d, axis in enumerate("xyz") for end in ("min", "max")}
@@ -48,6 +48,8 @@ Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
 Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
 SUFFIXES = f"{', '.join(WRITERS)} (run_%04d.png: every frame, run.png: the end)"
+Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")]
+Workers = Annotated[int, typer.Option(help="processes that share the work")]
 Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is written")]
 
 
@@ -72,12 +74,10 @@ def check_length(duration: float, fps: float, dt: float | None) -> None:
         )
 
 
-def check_time_it_takes(run: "ForwardRun", duration: float) -> None:
+def check_time_it_takes(run: ForwardRun, duration: float) -> None:
     """Raise ValueError for a run whose explicit steps would take more than a month."""
     steps = duration / run.first_substep
-    seconds = steps * (
-        2e-6 + 2e-8 * run.scene.mesh.num_tetrahedra
-    )  # two microseconds and 20 ns a tetrahedron: quick ones
+    seconds = steps * (2e-6 + 2e-8 * run.scene.mesh.num_tetrahedra)  # of quick steps
     if seconds > MOST_DAYS * 86400:
         raise ValueError(
             f"--duration {duration:g} s takes about {steps:.3g} steps of {run.first_substep:.3g} s, more than "
@@ -93,8 +93,6 @@ def load_body(
 ) -> TetrahedralMesh:
     """The mesh of a file, y up and of the size asked for; vertices of no tetrahedron are left out. order 2: of ten-node
     tetrahedra, made from linear ones where the file has these."""
-    from diffsim_ti.mesh import TetrahedralMesh
-
     if order not in (1, 2):
         raise ValueError(f"--order must be 1 or 2, got {order}")
     try:
@@ -114,10 +112,24 @@ def load_body(
     return mesh.quadratic() if order > mesh.order else mesh
 
 
+def own_scene(
+    path: Path, material: str, youngs_modulus: float, poissons_ratio: float, density: float, fixed: Sequence[str] | None
+) -> Scene:
+    """A scene from a Python file that defines `scene` or `scene()`, or from a mesh under its own weight."""
+    if not path.exists():
+        raise ValueError(f"{path}: no such file; give a mesh, or a Python file that defines scene()")
+    if path.suffix == ".py":
+        made = runpy.run_path(str(path)).get("scene")
+        made = made() if callable(made) else made
+        if not isinstance(made, Scene):
+            raise ValueError(f"{path} must define `scene`, a diffsim_ti.Scene or a function that returns one")
+        return made
+    body, law = load_body(path), make_material(material, youngs_modulus, poissons_ratio)
+    return Scene(body, law, density, Gravity(), fixed_vertices(body, fixed or []))
+
+
 def make_material(name: str, youngs_modulus: float, poissons_ratio: float) -> Material:
     """A material by its class's name."""
-    from diffsim_ti.materials import MATERIALS
-
     for kind in MATERIALS:
         if kind.__name__.lower() == name.lower().replace("-", "").replace("_", ""):
             return kind(youngs_modulus=youngs_modulus, poissons_ratio=poissons_ratio)
@@ -126,8 +138,6 @@ def make_material(name: str, youngs_modulus: float, poissons_ratio: float) -> Ma
 
 def solver_class(name: str, implicit: bool = True) -> type[Solver]:
     """A solver's class by the name that --solver takes."""
-    from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
-
     solvers = {"semi-implicit": SemiImplicitSolver, "verlet": VelocityVerletSolver}
     if implicit:
         solvers |= {"implicit-euler": ImplicitEulerSolver, "bdf2": BDF2Solver}
@@ -162,9 +172,6 @@ def make_ground(
 ) -> Ground:
     """The floor y = 0 for a body that meets it at `speed` [m/s]: width 1 % of the size, stiffness per area [N/m^3] from the
     impact, unless that of each vertex is given [N/m]."""
-    from diffsim_ti.terms import Ground
-    from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
-
     width = 0.01 * np.ptp(mesh.bounding_box, 0).max() if width is None else width
     if stiffness is None and stiffness_per_area is None:
         stiffness_per_area = stiffness_of_impact(mesh, material, density, gravity, speed, width)
@@ -181,27 +188,20 @@ def fall_scene(
     fixed: Sequence[str] | None = (),
     floor: bool = True,
     height: float | None = None,
-    stiffness: float | None = None,
-    width: float | None = None,
     extra: Sequence[Term] = (),
     volume: str = "tetrahedra",
-    stiffness_per_area: float | None = None,
-    friction: float = 0.0,
+    **ground,
 ) -> tuple[Scene, TetrahedralMesh]:
     """(scene, body): a body let go above the floor y = 0, its lowest point at `height` [m], default a tenth of its size.
 
-    fixed: as `fixed_vertices` takes them; stiffness, stiffness_per_area, width, friction: the floor's, see `make_ground`;
-    extra: more terms; volume: as `Scene` takes it.
+    fixed: as `fixed_vertices` takes them; extra: more terms; volume: as `Scene` takes it; ground: what `make_ground` takes.
     """
-    from diffsim_ti.scene import Scene
-    from diffsim_ti.terms import Drag, Gravity
-
     terms = ([Gravity(gravity)] if gravity else []) + ([Drag(drag)] if drag else [])
     if floor:
         low, height = body.bounding_box[0, 1], 0.1 * np.ptp(body.bounding_box, 0).max() if height is None else height
         body = body.translated([0, height - low, 0])
         speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
-        terms.append(make_ground(body, law, density, gravity, speed, stiffness, width, stiffness_per_area, friction))
+        terms.append(make_ground(body, law, density, gravity, speed, **ground))
     fixed = fixed_vertices(body, list(fixed or []))
     return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity, volume=volume), body
 
@@ -209,23 +209,20 @@ def fall_scene(
 FORCES = ("reaction", "contact", "friction")
 
 
-def forces_named(names: Sequence[str], scene: Scene) -> "list[Output]":
+def forces_named(names: Sequence[str], scene: Scene) -> list[Output]:
     """Outputs of --arrows: what holds the body, what its obstacle does, and what of that is friction."""
-    from diffsim_ti.outputs import ContactForce, Reaction
-
     out = []
     for name in dict.fromkeys(names):
         if name not in FORCES:
             raise ValueError(f"--arrows: must be {', '.join(FORCES[:-1])} or {FORCES[-1]}, got {name!r}")
         if name != "reaction" and not scene.obstacles:
             raise ValueError(f"--arrows {name}: there is no obstacle; leave --no-ground out")
-        part = dict(part="friction") if name == "friction" else {}
-        own = dict(name=name, per_vertex=True) | part
+        own = dict(name=name, per_vertex=True) | (dict(part="friction") if name == "friction" else {})
         out.append(Reaction(**own) if name == "reaction" else ContactForce(scene.obstacles[0], **own))
     return out
 
 
-def works_on(scene: "Scene", explicit: bool) -> list[str]:
+def works_on(scene: Scene, explicit: bool) -> list[str]:
     """What may do work on a body, or take energy from it, in words."""
     rough = any(getattr(term, "has_friction", False) for term in scene.terms)
     touched = explicit and any(term.acts_on_surface for term in scene.terms)
@@ -244,7 +241,7 @@ def works_on(scene: "Scene", explicit: bool) -> list[str]:
 # ---- what is said at the end ------------------------------------------------------------------------------------------
 
 
-def print_summary(run: "ForwardRun", setup: float, writing: float, files: list[str]) -> None:
+def print_summary(run: ForwardRun, setup: float, writing: float, files: list[str]) -> None:
     """A table of what was simulated, how fast, how well, and where it was written."""
     from rich.console import Console
     from rich.table import Table

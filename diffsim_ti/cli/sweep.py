@@ -10,15 +10,14 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from diffsim_ti.cli.options import Backend, Density, Folder, MaterialName, Poisson, Precision, Youngs, solver_class
-from diffsim_ti.cli.own_scene import Fixed, Workers, own_scene
+from diffsim_ti import runtime
+from diffsim_ti.cli import options as opt
+from diffsim_ti.solvers import StaticSolver
 
 
 @lru_cache(4)
 def _of_file(path: str, precision: str) -> dict:
     """Its names, in this process."""
-    from diffsim_ti import runtime
-
     runtime.arch_name()  # starts Taichi where the parent of this process has it
     runtime.set_precision(precision)
     return runpy.run_path(path)
@@ -84,33 +83,31 @@ def axis(text: str) -> tuple[str, list[float]]:
 def sweep(
     scene: Annotated[Path, typer.Argument(help="a mesh, or a Python file that defines scene or rollout, which is run")],
     over: Annotated[list[str], typer.Option(help="E=1e4..1e6:20:log, speed=0..2:5 or nu=.3,.4; more than one: a grid")],
-    output: Folder = Path("output/sweep"),
+    output: opt.Folder = Path("output/sweep"),
     duration: Annotated[float, typer.Option(help="of a scene [s]")] = 0.2,
     frames: Annotated[int, typer.Option(help="of a scene")] = 20,
     solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler, bdf2 or static")] = "verlet",
-    workers: Workers = 1,
-    precision: Precision = "f32",
-    material: MaterialName = "StableNeoHookean",
-    youngs_modulus: Youngs = 1e5,
-    poissons_ratio: Poisson = 0.4,
-    density: Density = 1000.0,
-    fixed: Fixed = None,
-    backend: Backend = "cpu",
+    workers: opt.Workers = 1,
+    precision: opt.Precision = "f32",
+    material: opt.MaterialName = "StableNeoHookean",
+    youngs_modulus: opt.Youngs = 1e5,
+    poissons_ratio: opt.Poisson = 0.4,
+    density: opt.Density = 1000.0,
+    fixed: opt.Fixed = None,
+    backend: opt.Backend = "cpu",
 ) -> None:
     """Run a scene over a grid of its numbers; write a table and a picture of what comes of it.
 
     Numbers are arguments of the file's function scene(...) or rollout(...), or else inputs. A function results(frames) in
     the file says what is noted of each run.
     """
-    from diffsim_ti import runtime
-    from diffsim_ti.solvers import StaticSolver
     from diffsim_ti.study.executors import workers_of
     from diffsim_ti.study.sweep import Settings, largest_motion
     from diffsim_ti.study.sweep import sweep as run
     from diffsim_ti.study.sweep_picture import write_sweep
 
     axes = dict(axis(text) for text in over)
-    kind = StaticSolver if solver == "static" else solver_class(solver)
+    kind = StaticSolver if solver == "static" else opt.solver_class(solver)
     if not duration > 0 or not np.isfinite(duration):
         raise ValueError(f"--duration must be > 0 and finite [s], got {duration:g}")
     if frames < 1:
@@ -124,7 +121,7 @@ def sweep(
         if "results" in _of_file(str(scene), precision):
             results = ResultsOfFile(str(scene), precision)
     else:
-        make = own_scene(scene, material, youngs_modulus, poissons_ratio, density, fixed)
+        make = opt.own_scene(scene, material, youngs_modulus, poissons_ratio, density, fixed)
     with workers_of(workers) as executor:
         done = run(make, axes, results, executor, Settings(kind, duration, frames))
     refused = [row for row in done.rows if row["said"]]

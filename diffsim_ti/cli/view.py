@@ -5,34 +5,16 @@ from typing import Annotated
 
 import typer
 
-from diffsim_ti.cli.options import (
-    SUFFIXES,
-    Arrows,
-    Density,
-    FixOrientation,
-    MaterialName,
-    Poisson,
-    Size,
-    Up,
-    UpAxis,
-    Youngs,
-    fall_scene,
-    forces_named,
-    load_body,
-    make_material,
-    solver_class,
-)
-
-
-def register(app: typer.Typer) -> None:
-    """Add this module's commands to the command line."""
-    app.command()(render)
-    app.command()(view)
+from diffsim_ti import runtime
+from diffsim_ti.cli import options as opt
+from diffsim_ti.terms import ExternalForce
+from diffsim_ti.writers import View, writer_for
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 
 def render(
     series: Annotated[Path, typer.Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
-    output: Annotated[Path, typer.Option("--output", "-o", help=f"file, by its suffix: {SUFFIXES}")] = Path(
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"file, by its suffix: {opt.SUFFIXES}")] = Path(
         "output/film.mp4"
     ),
     colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
@@ -53,20 +35,8 @@ def render(
     """Draw a saved series as a film, coloured by a field, without a display."""
     from diffsim_ti.film import render_series
 
-    count = render_series(
-        series,
-        output,
-        colour,
-        fps,
-        size,
-        ground,
-        azimuth,
-        elevation,
-        backend,
-        print,
-        wireframe=wireframe,
-        arrows=arrows or (),
-    )
+    eye = dict(azimuth=azimuth, elevation=elevation, wireframe=wireframe, arrows=arrows or ())
+    count = render_series(series, output, colour, fps, size, ground, backend=backend, say=print, **eye)
     print(f"{count} frame{'s' * (count != 1)}: {output}")
 
 
@@ -76,34 +46,28 @@ def view(
     ],
     colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
     ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]; default the run's own")] = None,
-    material: MaterialName = "StableNeoHookean",
-    youngs_modulus: Youngs = 1e5,
-    poissons_ratio: Poisson = 0.4,
-    density: Density = 1000.0,
-    size: Size = None,
-    up: UpAxis = Up.y,
-    fix_orientation: FixOrientation = False,
+    material: opt.MaterialName = "StableNeoHookean",
+    youngs_modulus: opt.Youngs = 1e5,
+    poissons_ratio: opt.Poisson = 0.4,
+    density: opt.Density = 1000.0,
+    size: opt.Size = None,
+    up: opt.UpAxis = opt.Up.y,
+    fix_orientation: opt.FixOrientation = False,
     fps: Annotated[float, typer.Option(help="of a live run: frames per simulated second")] = 60.0,
     solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler or bdf2")] = "verlet",
     gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
-    fixed: Annotated[
-        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
-    ] = None,
+    fixed: opt.Fixed = None,
     floor: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
     friction: Annotated[float, typer.Option(help="Coulomb's coefficient of the floor")] = 0.0,
-    arrows: Arrows = None,
+    arrows: opt.Arrows = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help=f"file that the key S writes, by its suffix: {SUFFIXES}")
+        Path | None, typer.Option("--output", "-o", help=f"file that the key S writes, by its suffix: {opt.SUFFIXES}")
     ] = None,
 ) -> None:
     """Look at a saved series in a window, or at a mesh as it falls: play, step, scrub, turn, colour by a field, pull."""
-    from diffsim_ti import runtime
-    from diffsim_ti.terms import ExternalForce
     from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
     from diffsim_ti.visual.viewer import NO_DISPLAY, Viewer, has_display
-    from diffsim_ti.writers import View, writer_for
-    from diffsim_ti.writers.adaptive_run import ForwardRun
 
     if not has_display():
         raise RuntimeError(NO_DISPLAY)
@@ -114,17 +78,12 @@ def view(
         if not fps > 0:
             raise ValueError(f"--fps must be > 0, got {fps:g}")
         runtime.init()
-        scene, _ = fall_scene(
-            load_body(source, size, up, fix_orientation),
-            make_material(material, youngs_modulus, poissons_ratio),
-            density,
-            gravity,
-            drag,
-            fixed=fixed,
-            floor=floor,
-            friction=friction,
-            extra=[ExternalForce([0.0, 0.0, 0.0])],
+        body = opt.load_body(source, size, up, fix_orientation)
+        law, pull = opt.make_material(material, youngs_modulus, poissons_ratio), ExternalForce([0.0, 0.0, 0.0])
+        more = dict(fixed=fixed, floor=floor, friction=friction, extra=[pull])
+        scene, _ = opt.fall_scene(body, law, density, gravity, drag, **more)
+        frames = LiveFrames(
+            ForwardRun(scene, opt.solver_class(solver), 1 / fps, outputs=opt.forces_named(arrows or (), scene))
         )
-        frames = LiveFrames(ForwardRun(scene, solver_class(solver), 1 / fps, outputs=forces_named(arrows or (), scene)))
     look = {} if ground is None else dict(ground=ground)
     Viewer(frames, colour, playing=source.suffix != ".pvd", output=saving, arrows=arrows or (), **look).run()

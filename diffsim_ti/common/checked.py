@@ -14,14 +14,14 @@ def shown(value) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def number(name: str, value, low: float = 0.0, unit: str = "", included: bool = False) -> float:
-    """A finite number above `low`, or at least it."""
-    rule = f"{name} must be {'>=' if included else '>'} {low:g}{f' [{unit}]' if unit else ''}, got {shown(value)}"
+def number(name: str, value, low: float = 0.0, unit: str = "") -> float:
+    """A finite number above `low`."""
+    rule = f"{name} must be > {low:g}{f' [{unit}]' if unit else ''}, got {shown(value)}"
     try:
         out = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(rule) from None
-    if isinstance(value, bool | str) or not math.isfinite(out) or not (out >= low if included else out > low):
+    if isinstance(value, bool | str) or not math.isfinite(out) or not out > low:
         raise ValueError(rule)
     return out
 

@@ -21,14 +21,8 @@ def progress(title: str, total: int) -> Iterator[Callable[..., None]]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[note]}"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    )
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn()
+    bar = Progress(*columns, console=console, transient=True)
     task, start, said = bar.add_task(title, total=total, note=""), time.perf_counter(), [time.perf_counter()]
 
     def update(done: int, note: str = "") -> None:

@@ -14,17 +14,5 @@ from diffsim_ti.differentiation.functions import (
 )
 from diffsim_ti.differentiation.graph import Graph, Number
 
-__all__ = [
-    "Graph",
-    "Number",
-    "exp",
-    "expm1",
-    "expm1_minus_x",
-    "log",
-    "log1p",
-    "maximum",
-    "minimum",
-    "sqrt",
-    "where",
-    "x_minus_log1p",
-]
+__all__ = ["Graph", "Number", "exp", "expm1", "expm1_minus_x", "log", "log1p", "maximum", "minimum", "sqrt", "where"]
+__all__ += ["x_minus_log1p"]

@@ -9,18 +9,5 @@ from diffsim_ti.identification.priors import Normal, Smooth
 from diffsim_ti.identification.result import Identification, Information, MeshCheck
 from diffsim_ti.identification.unknowns import Unknown
 
-__all__ = [
-    "identify",
-    "Unknown",
-    "Measurement",
-    "ModalTest",
-    "Normal",
-    "Smooth",
-    "Identification",
-    "Information",
-    "MeshCheck",
-    "expected",
-    "compare",
-    "identifiability",
-    "Identifiability",
-]
+__all__ = ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "Information"]
+__all__ += ["MeshCheck", "expected", "compare", "identifiability", "Identifiability"]

@@ -44,8 +44,7 @@ def expected(
     """Intervals to expect of an experiment, from one run and a tangent for each unknown: the Cramer-Rao bound.
 
     Arguments (data, unknowns, noise, prior) as in `identify`; unknowns start at the numbers that are assumed. Of the
-    data only shape, noise and NaN count;
-    a name, or a list of names, of outputs stands for complete data.
+    data only shape, noise and NaN count; a name, or a list of names, of outputs stands for complete data.
     Atkinson, Donev, Tobias, Optimum Experimental Designs, 2007, ch. 17.
     """
     several = not is_experiment(rollout)
@@ -55,9 +54,7 @@ def expected(
     problem = Problem(rollouts, filled, unknowns)
     priors = Priors(prior, problem.unknowns, rollouts[0].scene.mesh)
     t = np.zeros(problem.size)
-    found = Information.of(
-        problem.labels, problem.jacobian(problem.run(t)), (priors.R.T * priors.weights(t)) @ priors.R
-    )
+    found = Information.of(problem.labels, problem.jacobian(problem.run(t)), priors.hessian(t))
     return Expectation(problem.numbers(t), **described(problem, t, found))
 
 
@@ -75,15 +72,14 @@ def compare(
     """Expectations of several measurements of one experiment, the best first: least volume of the confidence region.
 
     unknowns, noise, prior: as there. choices: {name: data as in `expected`}, such as Measurement("positions", zeros,
-    noise, at=markers). One run and one
-    tangent per unknown serve all of them. For several loads, call `expected` with each one's rollout.
+    noise, at=markers). One run and a tangent per unknown serve all. For several loads, call `expected` with each rollout.
     D-optimality: Atkinson, Donev, Tobias, Optimum Experimental Designs, 2007, ch. 10.
     """
     lists = {name: measurements(_complete(data, rollout), noise) for name, data in choices.items()}
     problem = Problem([rollout], [[m for given in lists.values() for m in given]], unknowns)
     priors = Priors(prior, problem.unknowns, rollout.scene.mesh)
     t, out, begin = np.zeros(problem.size), {}, 0
-    J, hessian = problem.jacobian(problem.run(t)), (priors.R.T * priors.weights(t)) @ priors.R
+    J, hessian = problem.jacobian(problem.run(t)), priors.hessian(t)
     for name, given in lists.items():
         end = begin + sum(len(m.deviation) for m in given)
         found, begin = Information.of(problem.labels, J[begin:end], hessian), end

@@ -53,9 +53,8 @@ def identify(
     of all that.
     unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
     max_iterations: steps, after which it stops as it is. tolerance: stop when a step promises less than this share of
-    a standard error per unknown. covariance: default up to 20
-    unknowns; costs a tangent run each. callback(report of the iteration, frames of each experiment),
-    first of the start as iteration 0: return True to stop. progress: a bar on stderr.
+    a standard error per unknown. covariance: default up to 20 unknowns; costs a tangent run each. callback(report of the
+    iteration, frames of each experiment), first of the start as iteration 0: return True to stop. progress: a bar on stderr.
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
     method: "Levenberg-Marquardt", which takes the fewest simulations; "L-BFGS-B" (SciPy's) needs gradients alone, so serves
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as
@@ -82,10 +81,8 @@ def identify(
     80000 Pa
     """
     if not callable(method) and method not in METHODS:
-        known = ", ".join(METHODS)
-        raise ValueError(
-            f"identify: method must be {known} or a function that makes a torch optimiser, got {shown(method)}"
-        )
+        known = f"{', '.join(METHODS)} or a function that makes a torch optimiser"
+        raise ValueError(f"identify: method must be {known}, got {shown(method)}")
     go_on = partial(torch_descent, method) if callable(method) else METHODS[method]
     several = not is_experiment(rollout)
     rollouts = list(rollout) if several else [rollout]
@@ -136,17 +133,18 @@ def _is_far(search: Search, times: float) -> bool:
     return degrees > 0 and float(chdtrc(degrees, square)) < 0.01
 
 
-def _result(
-    searches: list[tuple[Search, str, bool]], best: int, with_covariance: bool, check_mesh: bool | None
-) -> Identification:
+def _result(searches: list[tuple[Search, str, bool]], best: int, with_covariance: bool, check_mesh) -> Identification:
     search, stopped, converged = searches[best]
-    problem, t = search.problem, search.point.t
-    residual = search.point.residual
+    problem, t, residual = search.problem, search.point.t, search.point.residual
+    starts = []
+    for one, why, _ in searches:
+        ends = dict(start=problem.all_numbers(one.start), numbers=problem.all_numbers(one.point.t))
+        starts.append(ends | dict(cost=one.cost, chi_square=one.chi_square, stopped=why))
     settled, more, simulations = float(problem.size), {}, problem.simulations
     mesh = MeshCheck(reason="more unknowns than a covariance is made for")
     if with_covariance:
-        J, R = problem.jacobian(search.point) if search.J is None else search.J, search.priors.R
-        found = Information.of(problem.labels, J, (R.T * search.priors.weights(t)) @ R)
+        J = problem.jacobian(search.point) if search.J is None else search.J
+        found = Information.of(problem.labels, J, search.priors.hessian(t))
         simulations = problem.simulations
         mesh = mesh_check(search, J, found, check_mesh)
         more = described(problem, t, found, 0.0 if mesh.shifts is None else mesh.shifts)
@@ -156,7 +154,7 @@ def _result(
         problem.labels,
         problem.all_numbers(t),
         residual,
-        float(residual @ residual),
+        search.chi_square,
         max(len(residual) - settled, 0.0),
         simulations,
         stopped,
@@ -164,16 +162,7 @@ def _result(
         search.report,
         [{k: x for k, x in problem.inputs(e, t).items() if k != "time_offset"} for e in range(len(problem.rollouts))],
         search.state,
-        [
-            dict(
-                start=problem.all_numbers(one.start),
-                numbers=problem.all_numbers(one.point.t),
-                cost=one.cost,
-                chi_square=float(one.point.residual @ one.point.residual),
-                stopped=why,
-            )
-            for one, why, _ in searches
-        ],
+        starts,
         mesh,
         **more,
     )

@@ -22,8 +22,7 @@ class LevenbergMarquardt:
     def linearize(self) -> None:
         """Gradient (half of the cost's) and the products that stand for half its Hessian, at the point."""
         search, priors = self.search, self.search.priors
-        at, weights = search.point, priors.weights(search.point.t)
-        self.prior_hessian = (priors.R.T * weights) @ priors.R
+        at, self.prior_hessian = search.point, priors.hessian(search.point.t)
         if self.dense:
             J = search.J = search.problem.jacobian(at)
             self.gradient = J.T @ at.residual + priors.gradient(at.t)

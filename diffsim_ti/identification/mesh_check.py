@@ -12,10 +12,8 @@ from diffsim_ti.identification.search import FAILURES, Search
 from diffsim_ti.rollout.finer import on_ten_nodes, rollout_on_ten_nodes
 
 RUNS, USUAL = 12, 5  # on the finer mesh: at most, and usually
-SETTLED = (
-    0.1,
-    0.02,
-)  # a step that is this share of the standard errors, or of the way from the first estimates, is the last
+# a step that is this share of the standard errors, or of the way from the first estimates, is the last
+SETTLED = 0.1, 0.02
 LONGEST = 2.0  # change of a free variable in one step
 DEAREST, ALWAYS = 3.0, 1e8  # times the work of the fit, or so much (seconds), up to which it is done unasked
 SHORTER = 4.0  # times as many explicit steps are stable
@@ -54,7 +52,7 @@ def _refitted(search: Search, fine: Problem, J: np.ndarray, found: Information) 
     point = fine.run(first)
     while True:
         t, r = point.t, point.residual
-        H = J.T @ J + (priors.R.T * priors.weights(t)) @ priors.R
+        H = J.T @ J + priors.hessian(t)
         step = -np.linalg.solve(H + 1e-3 * np.eye(len(t)), J.T @ r + priors.gradient(t))
         size, way = np.abs(step / s).max(), np.abs((t - first) / s).max()
         if size <= max(SETTLED[0], SETTLED[1] * way):
@@ -65,14 +63,8 @@ def _refitted(search: Search, fine: Problem, J: np.ndarray, found: Information) 
         point = fine.run(t + step)
         J = J + np.outer(point.residual - r - J @ step, step / (step @ step))
     shifts = t - first
-    return MeshCheck(
-        estimates=fine.numbers(t),
-        numbers=fine.all_numbers(t),
-        shifts=shifts,
-        in_errors=shifts / s,
-        chi_square=float(r @ r),
-        simulations=fine.simulations,
-    )
+    numbers = dict(estimates=fine.numbers(t), numbers=fine.all_numbers(t), shifts=shifts, in_errors=shifts / s)
+    return MeshCheck(**numbers, chi_square=float(r @ r), simulations=fine.simulations)
 
 
 def _finer(search: Search) -> Problem:

@@ -1,12 +1,11 @@
 """What is known beside the data, in units of the free variables: a number about right, neighbours alike."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from diffsim_ti.identification.unknowns import Free
+from diffsim_ti.identification.unknowns import Free
+from diffsim_ti.mesh.geometry import inner_faces, triangle_normals
 
 
 @dataclass(frozen=True)
@@ -19,7 +18,7 @@ class Normal:
     mean: float
     deviation: float
 
-    def rows(self, free: "Free", mesh) -> tuple[np.ndarray, np.ndarray]:
+    def rows(self, free: Free, mesh) -> tuple[np.ndarray, np.ndarray]:
         """(R, r): R t - r has unit deviation."""
         return np.eye(free.size) / self.deviation, free.free(self.mean) / self.deviation
 
@@ -35,12 +34,13 @@ class Smooth:
     deviation: float
     edges: bool = False
 
-    def rows(self, free: "Free", mesh) -> tuple[np.ndarray, np.ndarray]:
+    def rows(self, free: Free, mesh) -> tuple[np.ndarray, np.ndarray]:
         """(R, r), a row for each inner face whose two sides lie in different groups."""
         groups = next(iter(free.rows.values()))
         if groups.shape != (mesh.num_tetrahedra,):
             raise ValueError(f"{free.label}: a smoothing prior needs regions or 'each', numbers of tetrahedra")
-        pairs, areas = inner_faces(mesh)
+        pairs, faces = inner_faces(mesh.tetrahedra, mesh.num_vertices)
+        areas = np.linalg.norm(triangle_normals(mesh.vertices, faces), axis=1)
         a, b = groups[pairs].T
         kept = (a != b) & (a >= 0) & (b >= 0)
         R = np.zeros((kept.sum(), free.size))
@@ -51,20 +51,10 @@ class Smooth:
         return R, R @ (base - base.mean()) if np.ptp(base) else np.zeros(len(R))
 
 
-def inner_faces(mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of tetrahedra that share a face, shape (k, 2), and the areas of these faces [m^2]."""
-    corners = mesh.tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
-    order = np.lexsort(np.sort(corners, 1).T)
-    same = np.all(np.diff(np.sort(corners, 1)[order], axis=0) == 0, 1)
-    first, second = order[:-1][same], order[1:][same]
-    a, b, c = np.moveaxis(mesh.vertices[corners[first]], 1, 0)
-    return np.stack([first // 4, second // 4], 1), np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
 class Priors:
     """All priors on the free variables as rows R t - r, and the weight of each row at the present t."""
 
-    def __init__(self, priors: dict | None, unknowns: list["Free"], mesh):
+    def __init__(self, priors: dict | None, unknowns: list[Free], mesh):
         size, parts, right, edges = sum(free.size for free in unknowns), [], [], []
         labels = [free.label for free in unknowns]
         for label, given in (priors or {}).items():
@@ -87,8 +77,12 @@ class Priors:
         return float(np.where(self.edges, 2 * (np.sqrt(1 + z**2) - 1), z**2).sum())
 
     def weights(self, t: np.ndarray) -> np.ndarray:
-        """w: half the cost's gradient is R^T w z, and R^T w R stands for half its Hessian."""
+        """w: half the cost's gradient is R^T w z."""
         return np.where(self.edges, 1 / np.sqrt(1 + (self.R @ t - self.r) ** 2), 1.0)
+
+    def hessian(self, t: np.ndarray) -> np.ndarray:
+        """What stands for half the cost's Hessian."""
+        return (self.R.T * self.weights(t)) @ self.R
 
     def gradient(self, t: np.ndarray) -> np.ndarray:
         return self.R.T @ (self.weights(t) * (self.R @ t - self.r))

@@ -41,7 +41,7 @@ class Problem:
                 measurement.check(rollout)
         self.rollouts, self.data, self.simulations = rollouts, data, 0
         given = {k: x if isinstance(x, Unknown) else _plain(k, x) for k, x in unknowns.items()}
-        self.unknowns = [unknown.settled(label, rollouts) for label, unknown in given.items()]
+        self.unknowns = [Free(unknown, label, rollouts) for label, unknown in given.items()]
         ends = np.cumsum([0, *(free.size for free in self.unknowns)])
         self.parts, self.size = [slice(a, b) for a, b in zip(ends, ends[1:])], int(ends[-1])
         self.labels = [f"{f.label}[{i}]" if f.size > 1 else f.label for f in self.unknowns for i in range(f.size)]

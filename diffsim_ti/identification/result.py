@@ -1,12 +1,10 @@
 """What an identification found and how well: estimates, intervals, what the data do not see, a test of the residuals."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from diffsim_ti.identification.problem import Problem
+from diffsim_ti.identification.problem import Problem
 
 
 @dataclass
@@ -90,13 +88,12 @@ class Identification:
     standard_errors: as estimates, what the noise alone makes uncertain; intervals: {unknown: (low, high)}, of 95 %, low and
     high as estimates, through the free variables, widened by what `mesh` found: from the lower end of the lower estimate to
     the upper end of the upper one, with a third of their distance beyond the finer mesh's. They mean nothing where the fit
-    does not explain the data: see `headline`. unseen: see Information;
+    does not explain the data: see `headline`.
     chi_square, degrees, p_value: of the residuals, whose sum of squares is chi^2 distributed if model and noise are right;
-    iterations: a dict each; simulations: forward, tangent and reverse runs; stopped: why, converged: whether because
-    of the tolerance; information: what the data tell; state: for `resume`.
-    starts: where each search began and ended, a dict each, in the order in which they were made; this is the best.
-    inputs: of each experiment, for rollout.forward(**inputs[k]). Covariance and what follows from it are None where
-    it was not asked for (many unknowns).
+    iterations: a dict each; simulations: forward, tangent and reverse runs; stopped: why, converged: whether because of the
+    tolerance; information: what the data tell; state: for `resume`; starts: where each search began and ended, a dict each,
+    of which this is the best; inputs: of each experiment, for rollout.forward(**inputs[k]). Covariance and what follows from
+    it are None where it was not asked for.
     Roache 1994, doi:10.1115/1.2910291, on errors from two meshes.
     """
 
@@ -239,7 +236,7 @@ def ends(intervals: dict) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.concatenate([np.atleast_1d(pair[k]) for pair in intervals.values()]) for k in (0, 1))
 
 
-def described(problem: "Problem", t: np.ndarray, found: Information, shifts: np.ndarray | float = 0.0) -> dict:
+def described(problem: Problem, t: np.ndarray, found: Information, shifts: np.ndarray | float = 0.0) -> dict:
     """Covariance, standard errors and intervals of the numbers, from the information on the free variables and what these
     change by on a finer mesh, from which as much as a third of that may be left."""
     slopes = np.concatenate([free.slopes(t[part]) for free, part in zip(problem.unknowns, problem.parts)])

@@ -25,12 +25,7 @@ class Search:
     """The best point so far, its cost sum r^2 + prior, and a report of each iteration, written to `path` if there is one."""
 
     def __init__(
-        self,
-        problem: Problem,
-        priors: Priors,
-        resume: dict | str | Path | None = None,
-        start: np.ndarray | None = None,
-        number: int = 0,
+        self, problem: Problem, priors: Priors, resume: dict | str | Path | None = None, start=None, number: int = 0
     ):
         self.problem, self.priors, self.damping, self.report, self.number = problem, priors, 1e-3, [], number
         self.path = Path(resume) if isinstance(resume, str | Path) else None
@@ -51,6 +46,11 @@ class Search:
     def cost_of(self, point: Point) -> float:
         return float(point.residual @ point.residual) + self.priors.cost(point.t)
 
+    @property
+    def chi_square(self) -> float:
+        """Sum of the squared residuals."""
+        return float(self.point.residual @ self.point.residual)
+
     def half_gradient(self, point: Point) -> np.ndarray:
         """Half the cost's gradient by t, from a reverse sweep of each experiment."""
         return self.problem.transposed(point, point.residual) + self.priors.gradient(point.t)
@@ -61,13 +61,8 @@ class Search:
 
     @property
     def state(self) -> dict:
-        return dict(
-            labels=self.problem.labels,
-            t=self.point.t.tolist(),
-            damping=self.damping,
-            report=self.report,
-            simulations=self.problem.simulations,
-        )
+        where = dict(labels=self.problem.labels, t=self.point.t.tolist(), damping=self.damping)
+        return where | dict(report=self.report, simulations=self.problem.simulations)
 
     def write(self) -> None:
         """Write the state, if there is a path for it."""
@@ -78,26 +73,13 @@ class Search:
 
     def row(self, iteration: int, promised: float | None = None, why: str | None = None) -> dict:
         """The report of an iteration: what its step promised, why it was not taken."""
-        return dict(
-            start=self.number,
-            iteration=iteration,
-            cost=self.cost,
-            chi_square=float(self.point.residual @ self.point.residual),
-            promised=promised,
-            damping=self.damping,
-            rejected=why,
-            simulations=self.problem.simulations,
-            seconds=time.perf_counter() - self.began,
-            numbers=self.problem.all_numbers(self.point.t).tolist(),
-        )
+        spent = dict(simulations=self.problem.simulations, seconds=time.perf_counter() - self.began)
+        where = dict(start=self.number, iteration=iteration, cost=self.cost, chi_square=self.chi_square)
+        step = dict(promised=promised, damping=self.damping, rejected=why)
+        return where | step | spent | dict(numbers=self.problem.all_numbers(self.point.t).tolist())
 
     def record(
-        self,
-        most: int,
-        show: Callable,
-        callback: Callable | None,
-        promised: float | None = None,
-        why: str | None = None,
+        self, most: int, show: Callable, callback: Callable | None, promised=None, why: str | None = None
     ) -> None:
         """Note an iteration, write the state, show and tell it. Raises Ended after the last one, or if the callback asks."""
         done = self.row(len(self.report) + 1, promised, why)

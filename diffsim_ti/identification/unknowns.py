@@ -45,10 +45,6 @@ class Unknown:
         if range is not None and scale is not None:
             raise ValueError("Unknown: give range or scale, not both")
 
-    def settled(self, label: str, rollouts: list[Rollout]) -> "Free":
-        """This unknown in these experiments."""
-        return Free(self, label, rollouts)
-
 
 class Free:
     """An unknown of given experiments: `size` variables t, their numbers x, and where these go in the input."""
@@ -81,9 +77,8 @@ class Free:
         if self.input == TIME_OFFSET:
             return np.zeros((), int)
         if self.input not in rollout.inputs:
-            raise ValueError(
-                f"{self.label}: no input named {self.input!r}; this rollout has {', '.join(rollout.inputs)}"
-            )
+            known = ", ".join(rollout.inputs)
+            raise ValueError(f"{self.label}: no input named {self.input!r}; this rollout has {known}")
         if regions is None:
             shape = rollout.values[self.input].shape
             each = self.unknown.start.ndim > 0 and self.unknown.start.shape == shape
@@ -101,9 +96,8 @@ class Free:
             return rows
         rows = np.asarray(regions, int)
         if rows.shape not in (rollout.values[self.input].shape, (mesh.num_tetrahedra,)):
-            raise ValueError(
-                f"{self.label}: regions have shape {rows.shape}, the input {rollout.values[self.input].shape}"
-            )
+            shape = rollout.values[self.input].shape
+            raise ValueError(f"{self.label}: regions have shape {rows.shape}, the input {shape}")
         return rows
 
     def numbers(self, t: np.ndarray) -> np.ndarray:

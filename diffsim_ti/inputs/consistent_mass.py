@@ -5,15 +5,12 @@ a hanging bar would fall short by an order. Zienkiewicz, Taylor, Zhu, The Finite
 """
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.reference_element import QUADRATIC, quadrature
-
-if TYPE_CHECKING:
-    from diffsim_ti.mesh import TetrahedralMesh
 
 
 class ElementMasses(Link):
@@ -73,7 +70,7 @@ class ConsistentMass:
         self.matrix, self.factor = matrix, factor
 
     @classmethod
-    def of(cls, mesh: "TetrahedralMesh", element_masses: np.ndarray) -> "ConsistentMass":
+    def of(cls, mesh: TetrahedralMesh, element_masses: np.ndarray) -> "ConsistentMass":
         """Of all elements together."""
         from scipy.sparse import coo_matrix
 

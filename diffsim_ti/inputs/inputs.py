@@ -13,9 +13,9 @@ from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.clamps import ClampedMotion
 from diffsim_ti.inputs.consistent_mass import ElementMasses
-from diffsim_ti.inputs.curved_shape import CurvedShape, StressPoints
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, length_per_step, speed
 from diffsim_ti.inputs.poses import PoseColumns
+from diffsim_ti.inputs.rest_shape import RestShape, StressPoints
 from diffsim_ti.inputs.rigid_start import RigidDisplacement, RigidVelocity
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 
@@ -176,7 +176,7 @@ class Inputs:
         mesh, scene, places = self.mesh, self.scene, {}
         shift = np.zeros(max(self.parameters.total, 1))
         out = [
-            links.RestShape(mesh.tetrahedra) if mesh.order == 1 else CurvedShape(mesh.elements),
+            RestShape(mesh),
             *self.start_links(),
             links.LumpedMass(mesh, scene.mass_scaling.factors if scene.mass_scaling else None),
             *([ElementMasses(mesh.elements)] if scene.consistent else []),
@@ -278,10 +278,8 @@ class Inputs:
 
     def derive_jvp(self, values: dict, tangents: dict) -> Derived:
         """Change of what kernels read for changes `tangents` of some inputs."""
-        out, changed = self.derive(values).zeros(), self.chain.jvp(values, tangents)
-        for name in out.parts():
-            setattr(out, name, changed.get(name, getattr(out, name)))
-        return out
+        changed = self.chain.jvp(values, tangents)
+        return self.derive(values).zeros().replaced(**{name: changed[name] for name in self.read if name in changed})
 
     def derive_vjp(self, values: dict, adj: Derived, wanted: Iterable[str]) -> dict[str, np.ndarray]:
         """Adjoints of the wanted inputs for adjoints of what kernels read; those of coefficients come per tetrahedron."""

@@ -1,59 +1,11 @@
-"""Links of a body, its rest shape, mass and start, and what joins the numbers of terms and the paths of obstacles."""
+"""Links of a body, its mass and start, and what joins the numbers of terms and the paths of obstacles."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
-from diffsim_ti.mesh import geometry
-
-
-class RestShape(Link):
-    """Of rest positions X: X itself, rows grad N_1..3 = D^-1 and volumes V = det D / 6, D the edges from corner 0.
-
-    dD^-1 = -D^-1 dD D^-1 and dV = V tr(D^-1 dD). Raises ValueError for a tetrahedron that is turned inside out.
-    """
-
-    reads, writes = ("rest_positions",), ("rest", "gradients", "volumes")
-
-    def __init__(self, tetrahedra: np.ndarray):
-        self.tetrahedra = tetrahedra
-        self._last = None  # X, D^-1, V: derivatives need what the value was made of
-
-    def value(self, X):
-        return X, *self._inverse(X)
-
-    def _inverse(self, X):
-        """(D^-1, V)"""
-        if self._last is not None and self._last[0] is X:
-            return self._last[1:]
-        D = geometry.edge_matrices(X, self.tetrahedra)
-        volumes = np.linalg.det(D) / 6
-        if not np.all(volumes > 0):
-            worst = int(np.argmin(volumes))
-            raise ValueError(
-                f"rest_positions turn tetrahedron {worst} inside out (volume {volumes[worst]:.3g} m^3, "
-                f"{(~(volumes > 0)).sum()} in all); take a smaller step in the rest shape"
-            )
-        out = np.linalg.inv(D), volumes
-        self._last = None if X.flags.writeable else (X, *out)
-        return out
-
-    def jvp(self, x, dx):
-        B, V = self._inverse(*x)
-        dD = geometry.edge_matrices(dx[0], self.tetrahedra)
-        return dx[0], -B @ dD @ B, V * np.einsum("eij,eji->e", B, dD)
-
-    def vjp(self, x, y_adj):
-        B, V = self._inverse(*x)
-        rest_adj, gradients_adj, volumes_adj = y_adj
-        Bt = np.swapaxes(B, 1, 2)
-        D_adj = -Bt @ gradients_adj @ Bt + (V * volumes_adj)[:, None, None] * Bt
-        by_edge = np.swapaxes(D_adj, 1, 2)  # one row per edge, the derivative by X_a - X_0
-        X_adj = np.array(rest_adj)
-        np.add.at(X_adj, self.tetrahedra[:, 1:].ravel(), by_edge.reshape(-1, 3))
-        np.add.at(X_adj, self.tetrahedra[:, 0], -by_edge.sum(1))
-        return (X_adj,)
+from diffsim_ti.inputs.loads import VertexShares
 
 
 class Displacement(Link):
@@ -93,33 +45,13 @@ class FreeVelocity(Link):
         return self.value(y_adj[0])
 
 
-class LumpedMass(Link):
+class LumpedMass(VertexShares):
     """Of each vertex, sum rho V s_a over its elements, with the node's share s_a, 1/4 of four nodes; rho is one number or
     one per tetrahedron; times the vertex's factor where there are some."""
 
-    writes = ("mass",)
-
     def __init__(self, mesh, factors: np.ndarray | None = None):
-        self.factors = factors
-        self.elements, self.num_vertices, self.shares = mesh.elements, mesh.num_vertices, mesh.reference.lumped
-        self.reads = ("density", "volumes" if mesh.order == 1 else "element volumes")
-
-    def value(self, density, volumes):
-        return (self._to_vertices(density * volumes),)
-
-    def jvp(self, x, dx):
-        (density, volumes), (d_density, d_volumes) = x, dx
-        return (self._to_vertices(d_density * volumes + density * d_volumes),)
-
-    def vjp(self, x, y_adj):
-        by_mass = y_adj[0] if self.factors is None else self.factors * y_adj[0]
-        (density, volumes), mass_adj = x, (by_mass[self.elements] * self.shares).sum(1)
-        by_density = volumes * mass_adj
-        return by_density if density.ndim else by_density.sum(), density * mass_adj
-
-    def _to_vertices(self, per_element: np.ndarray) -> np.ndarray:
-        mass = np.bincount(self.elements.ravel(), np.outer(per_element, self.shares).ravel(), self.num_vertices)
-        return mass if self.factors is None else self.factors * mass
+        every = np.arange(mesh.num_tetrahedra), np.arange(mesh.num_vertices)
+        super().__init__(mesh, *every, True, "mass", factors)
 
 
 class Same(Link):

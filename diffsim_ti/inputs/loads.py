@@ -70,16 +70,17 @@ class VertexAreas(Link):
 
 class VertexShares(Link):
     """What each of some vertices has of the volume [m^3] or, with density, of the mass [kg] of the given tetrahedra around
-    it: a fourth of each, or the shares of lumped masses of ten nodes."""
+    it: a fourth of each, or the shares of lumped masses of ten nodes; times factors of the vertices where there are some."""
 
-    def __init__(self, mesh, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str):
+    def __init__(self, mesh, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str, factors=None):
         volumes = "volumes" if mesh.order == 1 else "element volumes"
         self.reads, self.writes = (volumes, "density") if of_mass else (volumes,), (writes,)
         self.chosen, self.count, self.shares = chosen, len(vertices), mesh.reference.lumped
-        self.nodes = np.searchsorted(vertices, mesh.elements[chosen])
+        self.nodes, self.factors = np.searchsorted(vertices, mesh.elements[chosen]), factors
 
     def _to_vertices(self, of_each):
-        return np.bincount(self.nodes.ravel(), np.outer(of_each[self.chosen], self.shares).ravel(), self.count)
+        out = np.bincount(self.nodes.ravel(), np.outer(of_each[self.chosen], self.shares).ravel(), self.count)
+        return out if self.factors is None else self.factors * out
 
     def value(self, volumes, *density):
         return (self._to_vertices(density[0] * volumes if density else volumes),)
@@ -90,8 +91,9 @@ class VertexShares(Link):
         return (self._to_vertices(dx[1] * x[0] + x[1] * dx[0]),)
 
     def vjp(self, x, y_adj):
+        by_vertex = y_adj[0] if self.factors is None else self.factors * y_adj[0]
         by_each = np.zeros_like(x[0])
-        by_each[self.chosen] = (y_adj[0][self.nodes] * self.shares).sum(1)
+        by_each[self.chosen] = (by_vertex[self.nodes] * self.shares).sum(1)
         if len(x) == 1:
             return (by_each,)
         volumes, density = x

@@ -1,17 +1,15 @@
 """What materials made around another one share: numbers of their own, and coefficients of these that come first."""
 
-from abc import abstractmethod
-
 import numpy as np
 
-from diffsim_ti.materials.material import Material, _all_values, _short, summed
+from diffsim_ti.materials.material import Material, _all_values, _short
 
 
 class Around(Material):
     """A material with the numbers `own`, names in order, around `material`.
 
-    A subclass gives its own coefficients, of these numbers and, with `takes_moduli`, of the moduli (mu, lam) of small
-    strains of the isotropic part, with derivatives.
+    Its own coefficients are these numbers, vectors spread out, and, with `takes_moduli`, the moduli (mu, lam) of small
+    strains of the isotropic part; or what a subclass makes of them, with derivatives.
     """
 
     takes_moduli = True
@@ -54,21 +52,21 @@ class Around(Material):
         return {name: values[name] for name in self.isotropic.inputs if name in values}
 
     def _numbers_of(self, values: dict) -> list:
-        """Own values, and (mu, lam)."""
-        own = [np.asarray(values[name], np.float64) for name in self.own]
-        return [*own, *(self.isotropic.lame(self._moduli_values(values)) if self.takes_moduli else ())]
+        """Own values, vectors spread out, and (mu, lam)."""
+        moduli = self.isotropic.lame(self._moduli_values(values)) if self.takes_moduli else ()
+        return [*self._columns(values, self.own), *moduli]
 
-    @abstractmethod
-    def own_coefficients(self, *numbers) -> list:
+    def own_coefficients(self, numbers: list) -> list:
         """Columns, each shape () or (num_tetrahedra,), of these."""
+        return numbers
 
-    @abstractmethod
     def own_jvp(self, numbers: list, changes: list) -> list:
         """Their changes."""
+        return changes
 
-    @abstractmethod
     def own_vjp(self, numbers: list, by_columns: list) -> list:
         """Adjoints of the numbers, those of each tetrahedron."""
+        return by_columns
 
     @staticmethod
     def _joined(columns: list, of_material: np.ndarray) -> np.ndarray:
@@ -78,22 +76,22 @@ class Around(Material):
 
     def coefficients(self, values):
         self.check(values)
-        own = self.own_coefficients(*self._numbers_of(values))
+        own = self.own_coefficients(self._numbers_of(values))
         return self._joined(own, self.material.coefficients(self.inner(values)))
 
     def coefficients_jvp(self, values, tangents):
-        own = [np.broadcast_to(tangents.get(name, 0.0), np.shape(values[name])) for name in self.own]
+        own = {name: np.broadcast_to(tangents.get(name, 0.0), np.shape(values[name])) for name in self.own}
         by_moduli = ()
         if self.takes_moduli:
             by_moduli = self.isotropic.lame_jvp(self._moduli_values(values), self._moduli_values(tangents))
-        columns = self.own_jvp(self._numbers_of(values), [*own, *by_moduli])
+        columns = self.own_jvp(self._numbers_of(values), [*self._columns(own, self.own), *by_moduli])
         return self._joined(columns, self.material.coefficients_jvp(self.inner(values), self.inner(tangents)))
 
     def coefficients_vjp(self, values, coefficients_adj):
         adj, count = np.asarray(coefficients_adj, np.float64), len(self.law("f64").coefficient_names)
         first = count - len(self.material.law("f64").coefficient_names)
         own = self.own_vjp(self._numbers_of(values), [adj[..., k] for k in range(first)])
-        out = {name: summed(part, values[name], self.shape_of(name)) for name, part in zip(self.own, own)}
+        out = self._columns_vjp(values, self.own, own)
         out |= self.material.coefficients_vjp(self.inner(values), adj[..., first:])
         if self.takes_moduli:
             for name, part in self.isotropic.lame_vjp(self._moduli_values(values), *own[-2:]).items():

@@ -43,7 +43,7 @@ class EnergyLaw(Law):
             )
 
     def psi(self, H: Tensor, p: list) -> Number:
-        """psi [J/m^3], zero at rest; psi(H, p, z) where the law has a state."""
+        """psi [J/m^3], zero at rest; psi(H, p, z) where the law has a state. None of a law that dissipates alone."""
         raise NotImplementedError(f"{type(self).__name__} writes psi(H, p)")
 
     def next_state(self, H: Tensor, p: list, z: list, h: Number) -> list:
@@ -84,10 +84,11 @@ class EnergyLaw(Law):
         g = Graph(self.fp, waits=True)
         read, numbers = [Tensor(g.leaf(number) for number in one.numbers) for one in x], [g.leaf(c) for c in p]
         parted = self._parted(numbers)
-        P = g.gradient(self.psi(read[0], *parted), read[0].numbers)
+        psi = self.psi(read[0], *parted)
+        P = [] if psi is None else g.gradient(psi, read[0].numbers)
         if len(read) > 1:
             viscous = g.gradient(self.dissipation(*read, parted[0]), read[1].numbers)
-            P = [a + b for a, b in zip(P, viscous)]
+            P = [a + b for a, b in zip(P, viscous)] or viscous
         return g, [*_numbers(read), *numbers], P
 
     @traced
@@ -156,7 +157,8 @@ class EnergyLaw(Law):
 
     @traced
     def stress_differential(self, H, dH, p):
-        return self.stress_jvp_at([H], [dH], p, [])
+        g, leaves, P = self._record_stress([H], p)
+        return self._pulled([H], dH, g, leaves[:9], P)[0][0]  # symmetric; a sweep forwards takes a third more numbers
 
     @traced
     def stress_change(self, H, p, dp):

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 from diffsim_ti.differentiation import exp, where
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.sum_law import SumLaw
 from diffsim_ti.runtime import traced
 
 UNITS = {"k1": "Pa", "k2": "-", "fibre": "-"}
@@ -34,69 +34,33 @@ class FibreLaw(EnergyLaw):
 
 
 @dataclass(frozen=True)
-class FibreReinforcedLaw(Law):
-    """The sum of a law and of what fibres add; the coefficients of fibres come first."""
-
-    matrix: Law | None = None
+class FibreReinforcedLaw(SumLaw):
+    """The sum of a law and of what fibres add."""
 
     @property
-    def fibres(self) -> FibreLaw:
+    def added(self) -> FibreLaw:
         return FibreLaw(self.precision)
 
     @property
-    def coefficient_names(self):
-        return (*self.fibres.coefficient_names, *self.matrix.coefficient_names)
-
-    @property
     def last_without_lam(self):
-        factors = self.matrix.last_without_lam
-        return (0,) * 5 + tuple(factors) if factors else ()
-
-    @property
-    def lanes(self):
-        return self.matrix.lanes
+        factors = self.base.last_without_lam
+        return (0,) * len(FibreLaw.coefficient_names) + tuple(factors) if factors else ()
 
     @property
     def has_dilatation(self):
-        return self.matrix.has_dilatation
-
-    @traced
-    def energy_density(self, H, p):
-        return self.fibres.energy_density(H, p[:5]) + self.matrix.energy_density(H, p[5:])
-
-    @traced
-    def energy_by_coefficients(self, H, p):
-        return [*self.fibres.energy_by_coefficients(H, p[:5]), *self.matrix.energy_by_coefficients(H, p[5:])]
-
-    @traced
-    def stress(self, H, p):
-        return self.fibres.stress(H, p[:5]) + self.matrix.stress(H, p[5:])
-
-    @traced
-    def stress_differential(self, H, dH, p):
-        return self.fibres.stress_differential(H, dH, p[:5]) + self.matrix.stress_differential(H, dH, p[5:])
-
-    @traced
-    def stress_change(self, H, p, dp):
-        return self.fibres.stress_change(H, p[:5], dp[:5]) + self.matrix.stress_change(H, p[5:], dp[5:])
-
-    @traced
-    def stress_differential_and_products(self, H, dH, p):
-        of_fibres, by_fibres = self.fibres.stress_differential_and_products(H, dH, p[:5])
-        of_matrix, by_matrix = self.matrix.stress_differential_and_products(H, dH, p[5:])
-        return of_fibres + of_matrix, [*by_fibres, *by_matrix]
+        return self.base.has_dilatation
 
     @traced
     def dilatation(self, H):
-        return self.matrix.dilatation(H)
+        return self.base.dilatation(H)
 
     @traced
     def dilatation_gradient(self, H):
-        return self.matrix.dilatation_gradient(H)
+        return self.base.dilatation_gradient(H)
 
     @traced
     def dilatation_gradient_differential(self, H, dH):
-        return self.matrix.dilatation_gradient_differential(H, dH)
+        return self.base.dilatation_gradient_differential(H, dH)
 
 
 class FibreReinforced(Around):
@@ -132,16 +96,6 @@ class FibreReinforced(Around):
     def lame(self, values):
         mu, lam = self.material.lame(self.inner(values))
         return mu + 2 * np.asarray(values[self.own[0]]), lam
-
-    def own_coefficients(self, *numbers):
-        k1, k2, a = numbers
-        return [k1, k2, *(a[..., d] for d in range(3))]
-
-    def own_jvp(self, numbers, changes):
-        return self.own_coefficients(*changes)
-
-    def own_vjp(self, numbers, by_columns):
-        return [*by_columns[:2], np.stack(by_columns[2:], -1)]
 
     def law(self, precision):
         return FibreReinforcedLaw(precision, self.material.law(precision))

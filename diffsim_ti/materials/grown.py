@@ -103,15 +103,6 @@ class Grown(Around):
         mu, lam = self.material.lame(self.inner(values))
         return tuple(part * np.maximum(1 + np.asarray(values["growth"]), 1) for part in (mu, lam))
 
-    def own_coefficients(self, *numbers):
-        return list(numbers)
-
-    def own_jvp(self, numbers, changes):
-        return changes
-
-    def own_vjp(self, numbers, by_columns):
-        return by_columns
-
     def law(self, precision):
         return GrownLaw(precision, self.material.law(precision))
 

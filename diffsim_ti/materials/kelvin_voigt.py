@@ -6,36 +6,54 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.materials.around import Around
-from diffsim_ti.materials.calculus.green import (
-    SIX,
-    adjoint_of_six,
-    green_strain,
-    green_strain_differential,
-    of_six,
-    symmetric,
-)
-from diffsim_ti.materials.calculus.tensor import add_to_diagonal, inner
-from diffsim_ti.materials.law import Law
+from diffsim_ti.materials.calculus.green import SIX, green_strain, green_strain_differential, hooke, six
+from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, check_range
-from diffsim_ti.runtime import let, traced
+from diffsim_ti.materials.sum_law import SumLaw
+from diffsim_ti.runtime import traced
 
 
 @dataclass(frozen=True)
-class KelvinVoigtLaw(Law):
-    """P = P_base + F S, S = 2 eta R + lam_v tr(R) 1, with the rate R of Green's strain.
+class ViscousLaw(EnergyLaw):
+    """S = 2 eta R + lam_v tr(R) 1, with the rate R of Green's strain.
 
-    In explicit passes R = sym(F^T F_dot). In implicit ones (`in_step`) R = rate (E - Z), Z the strain held: then S has the
-    potential 1 / (2 rate) R : S, whose Hessian is symmetric, and a rigid turn from one state to the next has no rate.
+    In explicit passes R = sym(F^T F_dot), and phi = eta |R|^2 + lam_v/2 tr(R)^2. In implicit ones (`in_step`) R is
+    rate (E - Z), Z the strain held: then S has the potential phi / rate, whose Hessian is symmetric, and a rigid turn from
+    one state to the next has no rate.
     """
 
-    base: Law | None = None
+    in_step: bool = False
+
+    coefficient_names = ("eta", "lam_v")
+
+    @property
+    def reads(self):
+        return ("H",) if self.in_step else ("H", "H_dot")
+
+    @property
+    def held_names(self):
+        return SIX if self.in_step else ()
+
+    def psi(self, H, p):
+        if self.in_step:
+            eta, lam, *held, rate = p
+            return hooke([a - b for a, b in zip(six(green_strain(H, 0.5)), held)], eta, lam) * rate
+
+    def dissipation(self, H, H_dot, p):
+        return hooke(six(green_strain_differential(H, H_dot, 0.5)), *p)
+
+
+@dataclass(frozen=True)
+class KelvinVoigtLaw(SumLaw):
+    """P = P_base + F S. Who looks at a state, where nothing is held, sees the base alone."""
+
     in_step: bool = False
 
     viscous = True
 
     @property
-    def coefficient_names(self):
-        return ("eta", "lam_v", *self.base.coefficient_names)
+    def added(self) -> ViscousLaw:
+        return ViscousLaw(self.precision, in_step=self.in_step)
 
     @property
     def state_names(self):
@@ -47,134 +65,53 @@ class KelvinVoigtLaw(Law):
 
     @property
     def reads(self):
-        return ("H",) if self.in_step else ("H", "H_dot")
+        return self.added.reads
 
     @property
     def held_names(self):
-        return SIX if self.in_step else ()
-
-    @property
-    def lanes(self):
-        return self.base.lanes
+        return self.added.held_names
 
     def in_steps(self):
         return replace(self, in_step=True)
 
-    # ---- parts -------------------------------------------------------------------------------------------------------
-
     @traced
     def _parts(self, q):
-        """((eta, lam_v), what the base takes, what is held in a pass and the rate: none for who looks at a state)"""
         n = 2 + len(self.base.coefficient_names) + len(self.base.state_names)
-        return q[:2], q[2:n], q[n:]
+        return [*q[:2], *q[n:]], q[2:n]
 
     @traced
-    def _viscous(self, R, c):
-        """S"""
-        return add_to_diagonal(R * let(2 * c[0]), let(c[1] * R.trace()))
-
-    @traced
-    def _rate_in_step(self, H, held):
-        return (green_strain(H, self.real(0.5)) - of_six(held[:6])) * held[6]
-
-    @traced
-    def _rate(self, H, H_dot):
-        return green_strain_differential(H, H_dot, self.real(0.5))
-
-    @traced
-    def _push(self, H, S):
-        """F S"""
-        return add_to_diagonal(H, 1) @ S
-
-    @traced
-    def _by_viscosities(self, A, R):
-        """A : dS/d(eta, lam_v), A being symmetric"""
-        return [let(2 * inner(A, R)), let(A.trace() * R.trace())]
-
-    # ---- of the displacement gradient, and of what is held -----------------------------------------------------------
-
-    @traced
-    def energy_density(self, H, q):
-        c, own, held = self._parts(q)
-        psi = self.base.energy_density(H, own)
-        if not held:
-            return psi
-        E = green_strain(H, self.real(0.5)) - of_six(held[:6])
-        return psi + self.real(0.5) * inner(E, self._viscous(E * held[6], c))
-
-    @traced
-    def energy_by_coefficients(self, H, q):
-        zero = let(H[0, 0] * 0)
-        return [zero, zero, *self.base.energy_by_coefficients(H, self._parts(q)[1])]
-
-    @traced
-    def stress(self, H, q):
-        c, own, held = self._parts(q)
-        P = self.base.stress(H, own)
-        return P + self._push(H, self._viscous(self._rate_in_step(H, held), c)) if held else P
-
-    @traced
-    def stress_differential(self, H, dH, q):
-        c, own, held = self._parts(q)
-        dP = self.base.stress_differential(H, dH, own)
-        if not held:
-            return dP
-        S = self._viscous(self._rate_in_step(H, held), c)
-        return dP + dH @ S + self.viscous_differential(H, dH, q) * held[6]
-
-    @traced
-    def stress_change(self, H, q, dq):
-        (c, own, held), (dc, d_own, d_held) = self._parts(q), self._parts(dq)
-        dP = self.base.stress_change(H, own, d_own)
-        if not held:
-            return dP
-        dS = self._viscous(self._rate_in_step(H, held), dc) - self._viscous(of_six(d_held[:6]) * held[6], c)
-        return dP + self._push(H, dS)
-
-    @traced
-    def stress_differential_and_products(self, H, dH, q):
-        c, own, held = self._parts(q)
-        dP, products = self.base.stress_differential_and_products(H, dH, own)
-        zero = let(H[0, 0] * 0)
-        if not held:
-            return dP, [zero, zero, *products]
-        R, A = self._rate_in_step(H, held), self._rate(H, dH)
-        CA = self._viscous(A, c) * held[6]
-        dP = dP + dH @ self._viscous(R, c) + self._push(H, CA)
-        by_held = adjoint_of_six(CA * self.real(-1))
-        return dP, [*self._by_viscosities(A, R), *products, *by_held, zero]
+    def _terms(self, q):
+        terms = super()._terms(q)
+        return terms if len(terms[0][1]) > 2 else terms[1:]
 
     @traced
     def viscous_differential(self, H, dH, q):
-        return self._push(H, self._viscous(self._rate(H, dH), q[:2]))
+        return replace(self.added, in_step=False).stress_at([H, dH], q[:2])
 
     # ---- of the velocity's gradient too ------------------------------------------------------------------------------
 
     @traced
     def stress_at(self, x, q):
-        return self.stress(*x, q) if self.in_step else self.stress(x[0], q) + self.viscous_differential(*x, q)
+        if self.in_step:
+            return super().stress_at(x, q)
+        own, p = self._parts(q)
+        return self.base.stress(x[0], p) + self.added.stress_at(x, own)
 
     @traced
     def stress_jvp_at(self, x, dx, q, dq):
-        dP = self.stress_jvp(x[0], dx[0], q, dq)
         if self.in_step:
-            return dP
-        (H, H_dot), (dH, dH_dot) = x, dx
-        R = self._rate(H, H_dot)
-        dR = self._rate(H, dH_dot) + symmetric(dH.transpose() @ H_dot, self.real(0.5))
-        dS = self._viscous(dR, q[:2]) + self._viscous(R, dq[:2])
-        return dP + dH @ self._viscous(R, q[:2]) + self._push(H, dS)
+            return super().stress_jvp_at(x, dx, q, dq)
+        (own, p), (d_own, dp) = self._parts(q), self._parts(dq)
+        return self.base.stress_jvp(x[0], dx[0], p, dp) + self.added.stress_jvp_at(x, dx, own, d_own)
 
     @traced
     def stress_vjp_at(self, x, W, q):
-        dP, products = self.stress_differential_and_products(x[0], W, q)
         if self.in_step:
-            return [dP], products
-        H, H_dot = x
-        R, A = self._rate(H, H_dot), self._rate(H, W)
-        CA = self._viscous(A, q[:2])
-        by_H = dP + W @ self._viscous(R, q[:2]) + H_dot @ CA
-        return [by_H, self._push(H, CA)], [*self._by_viscosities(A, R), *products[2:]]
+            return super().stress_vjp_at(x, W, q)
+        own, p = self._parts(q)
+        dP, by_base = self.base.stress_differential_and_products(x[0], W, p)
+        (by_H, by_rate), by_own = self.added.stress_vjp_at(x, W, own)
+        return [dP + by_H, by_rate], self._joined(x[0], by_own, by_base)
 
     # ---- the state of the base ---------------------------------------------------------------------------------------
 
@@ -189,8 +126,7 @@ class KelvinVoigtLaw(Law):
     @traced
     def next_state_vjp(self, H, q, h, z_adj):
         by_H, by_q = self.base.next_state_vjp(H, q[2:], h, z_adj)
-        zero = let(H[0, 0] * 0)
-        return by_H, [zero, zero, *by_q]
+        return by_H, self._joined(H, by_q)
 
 
 class KelvinVoigt(Around):
@@ -242,9 +178,9 @@ class KelvinVoigt(Around):
         return self.material.lame(self.inner(values))
 
     def viscosities(self, values):
-        return tuple(self.own_coefficients(*self._numbers_of(values)))
+        return tuple(self.own_coefficients(self._numbers_of(values)))
 
-    def own_coefficients(self, *numbers):
+    def own_coefficients(self, numbers):
         *own, mu, lam = numbers
         if len(own) == 1:
             return [own[0] * mu, own[0] * lam]
@@ -254,7 +190,7 @@ class KelvinVoigt(Around):
         (*own, mu, lam), (*d_own, dmu, dlam) = numbers, changes
         if len(own) == 1:
             return [d_own[0] * mu + own[0] * dmu, d_own[0] * lam + own[0] * dlam]
-        return self.own_coefficients(*changes)
+        return self.own_coefficients(changes)
 
     def own_vjp(self, numbers, by_columns):
         *own, mu, lam = numbers

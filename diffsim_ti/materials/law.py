@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, traced
+from diffsim_ti.runtime import number_type, traced
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,7 @@ class Law:
         within = [x.title for x in vars(self).values() if isinstance(x, Law)]
         return type(self).__name__.removesuffix("Law") + (f"({within[0]})" if within else "")
 
-    @property
-    def fp(self):
-        """Taichi's type of its numbers."""
-        return PRECISIONS[self.precision]
+    fp = number_type
 
     @ti.func
     def real(self, x: ti.template()):

@@ -1,7 +1,6 @@
 """A material: a law with its numbers."""
 
 from abc import ABC, abstractmethod
-from math import prod
 
 import numpy as np
 
@@ -201,17 +200,12 @@ class Material(ABC):
         A uniform value takes the sum over all tetrahedra.
         """
         adj = np.asarray(coefficients_adj, np.float64)
-        v, matrix = self._columns(values), self._matrix()
+        v, matrix = self._columns(values, self.inputs), self._matrix()
         adj = adj if matrix is None else adj @ matrix
         parts = [adj[..., k] for k in range(adj.shape[-1])]
         if self._begins_with_E_and_nu():
             parts[:2] = moduli.lame_vjp(*v[:2], *parts[:2])
-        out, at = {}, 0
-        for name in self.inputs:
-            shape, value = self.shape_of(name), np.asarray(values[name])
-            own = [np.sum(x) if value.shape == shape else x for x in parts[at : at + prod(shape)]]
-            out[name], at = np.stack(own, -1).reshape(value.shape) if shape else own[0], at + len(own)
-        return out
+        return self._columns_vjp(values, self.inputs, parts)
 
     def _begins_with_E_and_nu(self) -> bool:
         return self.inputs[:2] == Material.spellings[0]
@@ -219,17 +213,26 @@ class Material(ABC):
     def _matrix(self) -> "np.ndarray | None":
         return self.from_lame if self.inputs in Material.spellings else self.from_own
 
-    def _columns(self, values: dict) -> list:
-        """The components of all numbers, one after the other, each of shape () or (num_tetrahedra,)."""
+    def _columns(self, values: dict, names: tuple) -> list:
+        """The components of some numbers, one after the other, each of shape () or (num_tetrahedra,)."""
         columns = []
-        for name in self.inputs:
+        for name in names:
             value, shape = np.asarray(values[name], np.float64), self.shape_of(name)
             columns += [value[..., k] for k in range(shape[0])] if shape else [value]
         return columns
 
+    def _columns_vjp(self, values: dict, names: tuple, by_columns: list) -> dict[str, np.ndarray]:
+        """Adjoints of these numbers from those of their components."""
+        out, rest = {}, iter(by_columns)
+        for name in names:
+            shape = self.shape_of(name)
+            own = np.stack([next(rest) for _ in range(shape[0])], -1) if shape else next(rest)
+            out[name] = summed(own, values[name], shape)
+        return out
+
     def _linear(self, values: dict, arguments: dict, derivative: bool = False) -> np.ndarray:
         """Coefficients of `arguments`, or their change for changes `arguments` at `values`."""
-        v, a = self._columns(values), self._columns(arguments)
+        v, a = (self._columns(of, self.inputs) for of in (values, arguments))
         if self._begins_with_E_and_nu():
             a[:2] = moduli.lame_jvp(*v[:2], *a[:2]) if derivative else moduli.lame(*a[:2])
         numbers, matrix = np.stack(np.broadcast_arrays(*a), -1), self._matrix()
@@ -261,7 +264,9 @@ class Coefficients(Link):
 def summed(adjoint: np.ndarray, value, shape: tuple = ()) -> np.ndarray:
     """The adjoint of a number of that shape which is uniform, or one per tetrahedron, from that of each tetrahedron."""
     adjoint, uniform = np.asarray(adjoint, np.float64), np.ndim(value) == len(shape)
-    return adjoint.reshape(-1, *shape).sum(0) if uniform else np.broadcast_to(adjoint, np.shape(value))
+    if uniform:
+        return adjoint.reshape(-1, *shape).sum(0)
+    return adjoint if adjoint.shape == np.shape(value) else np.broadcast_to(adjoint, np.shape(value))
 
 
 def check_range(name: str, value, low: float, high: float, low_included: bool, remedy: str) -> None:

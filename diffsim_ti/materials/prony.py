@@ -8,11 +8,10 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.differentiation import exp
 from diffsim_ti.materials.around import Around
-from diffsim_ti.materials.calculus.green import PAIRS, SIX
+from diffsim_ti.materials.calculus.green import SIX, green_strain, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.material import Material, check_range
-from diffsim_ti.runtime import let, traced
+from diffsim_ti.materials.sum_law import SumLaw
 
 
 @dataclass(frozen=True)
@@ -30,20 +29,14 @@ class BranchesLaw(EnergyLaw):
     def state_names(self):
         return tuple(f"z_{k}_{pair}" for k in range(1, self.terms + 1) for pair in SIX)
 
-    def _strain(self, H):
-        G = H + H.transpose() + H.transpose() @ H
-        return [G[i, j] * 0.5 for i, j in PAIRS]
-
     def psi(self, H, p, z):
-        mu, lam, E, total = p[-2], p[-1], self._strain(H), 0
+        E, total = six(green_strain(H, 0.5)), 0
         for k in range(self.terms):
-            e = [a - b for a, b in zip(E, z[6 * k : 6 * k + 6])]
-            trace, size = sum(e[:3]), sum(x * x for x in e[:3]) + 2 * sum(x * x for x in e[3:])
-            total = p[k] * (mu * size + lam / 2 * trace * trace) + total
+            total = p[k] * hooke([a - b for a, b in zip(E, z[6 * k : 6 * k + 6])], p[-2], p[-1]) + total
         return total
 
     def next_state(self, H, p, z, h):
-        E, out = self._strain(H), []
+        E, out = six(green_strain(H, 0.5)), []
         for k in range(self.terms):
             share = 1 - exp(-h / p[self.terms + k])
             out += [b + share * (a - b) for a, b in zip(E, z[6 * k : 6 * k + 6])]
@@ -51,84 +44,14 @@ class BranchesLaw(EnergyLaw):
 
 
 @dataclass(frozen=True)
-class PronyLaw(Law):
-    """The sum of a law and of branches, whose coefficients come first."""
+class PronyLaw(SumLaw):
+    """The sum of a law and of branches."""
 
-    base: Law | None = None
     terms: int = 1
 
     @property
-    def branches(self) -> BranchesLaw:
+    def added(self) -> BranchesLaw:
         return BranchesLaw(self.precision, terms=self.terms)
-
-    @property
-    def coefficient_names(self):
-        return (*self.branches.coefficient_names, *self.base.coefficient_names)
-
-    @property
-    def state_names(self):
-        return self.branches.state_names
-
-    @property
-    def lanes(self):
-        return self.base.lanes
-
-    @traced
-    def _parts(self, q):
-        """(what the branches take, what the base takes)"""
-        first, last = 2 * self.terms + 2, len(self.coefficient_names)
-        return [*q[:first], *q[last:]], q[first:last]
-
-    @traced
-    def _joined(self, of_branches, of_base):
-        first = 2 * self.terms + 2
-        return [*of_branches[:first], *of_base, *of_branches[first:]]
-
-    @traced
-    def energy_density(self, H, q):
-        own, p = self._parts(q)
-        return self.branches.energy_density(H, own) + self.base.energy_density(H, p)
-
-    @traced
-    def energy_by_coefficients(self, H, q):
-        own, p = self._parts(q)
-        return self._joined(self.branches.energy_by_coefficients(H, own), self.base.energy_by_coefficients(H, p))
-
-    @traced
-    def stress(self, H, q):
-        own, p = self._parts(q)
-        return self.branches.stress(H, own) + self.base.stress(H, p)
-
-    @traced
-    def stress_differential(self, H, dH, q):
-        own, p = self._parts(q)
-        return self.branches.stress_differential(H, dH, own) + self.base.stress_differential(H, dH, p)
-
-    @traced
-    def stress_change(self, H, q, dq):
-        (own, p), (d_own, dp) = self._parts(q), self._parts(dq)
-        return self.branches.stress_change(H, own, d_own) + self.base.stress_change(H, p, dp)
-
-    @traced
-    def stress_differential_and_products(self, H, dH, q):
-        own, p = self._parts(q)
-        of_branches, by_branches = self.branches.stress_differential_and_products(H, dH, own)
-        of_base, by_base = self.base.stress_differential_and_products(H, dH, p)
-        return of_branches + of_base, self._joined(by_branches, by_base)
-
-    @traced
-    def next_state_at(self, H, q, h):
-        return self.branches.next_state_at(H, self._parts(q)[0], h)
-
-    @traced
-    def next_state_jvp(self, H, dH, q, dq, h):
-        return self.branches.next_state_jvp(H, dH, self._parts(q)[0], self._parts(dq)[0], h)
-
-    @traced
-    def next_state_vjp(self, H, q, h, z_adj):
-        by_H, by_branches = self.branches.next_state_vjp(H, self._parts(q)[0], h, z_adj)
-        zero = let(H[0, 0] * 0)
-        return by_H, self._joined(by_branches, [zero] * len(self.base.coefficient_names))
 
 
 class Prony(Around):
@@ -174,17 +97,6 @@ class Prony(Around):
         own_mu, own_lam = self.isotropic.lame(self._moduli_values(values))
         shares = np.asarray(values["prony_shares"]).sum(-1)
         return mu + shares * own_mu, lam + shares * own_lam
-
-    def own_coefficients(self, *numbers):
-        g, tau, mu, lam = numbers
-        return [*(g[..., k] for k in range(self.terms)), *(tau[..., k] for k in range(self.terms)), mu, lam]
-
-    def own_jvp(self, numbers, changes):
-        return self.own_coefficients(*changes)
-
-    def own_vjp(self, numbers, by_columns):
-        n = self.terms
-        return [np.stack(by_columns[:n], -1), np.stack(by_columns[n : 2 * n], -1), *by_columns[2 * n :]]
 
     def law(self, precision):
         return PronyLaw(precision, self.material.law(precision), self.terms)

@@ -16,7 +16,7 @@ import taichi as ti
 
 from diffsim_ti.inputs import Derived, Link
 from diffsim_ti.mechanics.host_force import HostForce
-from diffsim_ti.runtime import PRECISIONS, traced
+from diffsim_ti.runtime import cross, number_type, traced, vector_type
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -48,24 +48,13 @@ class ForceKernel:
     asks_for_steps: ClassVar[bool] = False  # whether it reads numbers over time
     apart: ClassVar[bool] = False  # whether launches of their own compute them before each pass
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
+    fp, vector, cross = number_type, vector_type, staticmethod(cross)
 
     @traced
     def sizes(self, plan) -> dict:
         """{array of vectors of which each scene of a batch has its own: how many one of its rows has}; kernels of batches
         know the length of a row of each of `derived` as len_<name>."""
         return {name: getattr(plan, f"len_{name}") for name in self.derived}
-
-    @ti.func
-    def cross(self, a, b):
-        zero = ti.cast(0, self.fp)
-        return self.vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], zero)
 
 
 @dataclass(frozen=True)
@@ -193,18 +182,13 @@ class Interaction:
         """Add to `out` what these arrays hold, vectors of three numbers in float64; in batches all have one axis of scenes
         in front."""
 
-    # ---- what monitors ask -------------------------------------------------------------------------------------------
-
     def pulls_steadily(self, values: Derived) -> bool:
         """Of loads that pull: whether they do so in all steps alike."""
         return True
 
-    stiff_over_time: "tuple[Term, ...]" = ()  # terms whose stiffness may change over time
-    least: ClassVar[tuple[str, ...]] = ()  # plain names of their inputs that are stiffest where they are least
-
     def added_omega2(self, values: dict[str, np.ndarray], derived: Derived) -> float:
-        """What it adds to the body's largest omega^2 [1/s^2] at most, beside the sums of rows of its host form; at the
-        stiffest `values` and what is derived of them."""
+        """What it adds to the body's largest omega^2 [1/s^2] at most, beside the sums of rows of its host form; at values of
+        inputs that are the stiffest of all steps, which need not have others over time."""
         return 0.0
 
 

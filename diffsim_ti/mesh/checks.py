@@ -9,7 +9,7 @@ import numpy as np
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh import jacobian
-from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes, squared_edges
+from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces, squared_edges
 from diffsim_ti.mesh.reference_element import MID_EDGES
 from diffsim_ti.mesh.ten_nodes import FACE_NODES, MIRRORED
 
@@ -176,16 +176,7 @@ def surface_of(elements: np.ndarray, num_vertices: int) -> np.ndarray:
     ValueError for a repeated tetrahedron, a face of more than two tetrahedra, and two tetrahedra on one side of a face.
     """
     tetrahedra = elements[:, :4]
-    corners = tetrahedra[:, FACES].reshape(-1, 3)
-    a, b, c = np.sort(corners, 1).T
-    if num_vertices < 2_000_000:  # three indices fit in one 64-bit key
-        key = (a * num_vertices + b) * num_vertices + c
-        order = np.argsort(key, kind="stable")
-        key = key[order]
-        same = key[1:] == key[:-1]
-    else:
-        order = np.lexsort((c, b, a))
-        same = (a[order][1:] == a[order][:-1]) & (b[order][1:] == b[order][:-1]) & (c[order][1:] == c[order][:-1])
+    corners, order, same = sorted_faces(tetrahedra, num_vertices)
     left, right = order[:-1][same], order[1:][same]
     opposite = tetrahedra.ravel()  # face 4 e + a lies opposite corner a of tetrahedron e
     repeated = np.nonzero(opposite[left] == opposite[right])[0]

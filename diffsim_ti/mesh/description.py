@@ -45,9 +45,8 @@ def _ten_nodes(mesh: "TetrahedralMesh") -> list[str]:
         return [f"{text}, straight edges"]
     J = lowest_jacobian(mesh)
     worst = int(np.argmin(J))
-    return [
-        f"{text}; {mesh.curved.sum()} are curved, lowest bound of J over its mean {J[worst]:.3g} in tetrahedron {worst}"
-    ]
+    bound = f"lowest bound of J over its mean {J[worst]:.3g} in tetrahedron {worst}"
+    return [f"{text}; {mesh.curved.sum()} are curved, {bound}"]
 
 
 def lowest_jacobian(mesh: "TetrahedralMesh") -> np.ndarray:

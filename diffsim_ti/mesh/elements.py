@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti.mesh import checks
 from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes
 from diffsim_ti.mesh.reference_element import ReferenceElement, reference_element
-from diffsim_ti.mesh.sets import checked_sets
+from diffsim_ti.mesh.sets import checked_sets, frozen
 from diffsim_ti.mesh.ten_nodes import middles_in_set, middles_of, triangles_of, with_middles
 
 if TYPE_CHECKING:
@@ -51,16 +51,12 @@ class Elements:
     def curved(self) -> np.ndarray:
         """Whether an element has an edge that is not straight, or its middle off the mid-edge vertex; Booleans, shape
         (num_tetrahedra,)."""
-        found = checks.curved(self.vertices, self._elements)
-        found.flags.writeable = False
-        return found
+        return frozen(checks.curved(self.vertices, self._elements))
 
     @cached_property
     def corners(self) -> np.ndarray:
         """Sorted indices of the vertices that are no mid-edge vertices: vertex corners[k] is vertex k of `linear()`."""
-        found = np.setdiff1d(np.arange(self.num_vertices), self.middles[:, 0])
-        found.flags.writeable = False
-        return found
+        return frozen(np.setdiff1d(np.arange(self.num_vertices), self.middles[:, 0]))
 
     @cached_property
     def from_corners(self):
@@ -87,10 +83,9 @@ class Elements:
         if self.order == 2:
             return self
         vertices, elements, edges = with_middles(self.vertices, self.tetrahedra)
-        n = self.num_vertices
+        middles = {name: middles_in_set(rows, self, edges) for name, rows in self._vertex_sets.items()}
         vertex_sets = {
-            name: np.concatenate([rows, n + middles_in_set(rows, self, edges)])
-            for name, rows in self._vertex_sets.items()
+            k: np.concatenate([rows, self.num_vertices + middles[k]]) for k, rows in self._vertex_sets.items()
         }
         surface_sets = {name: (4 * rows[:, None] + np.arange(4)).ravel() for name, rows in self._surface_sets.items()}
         return self._with_nodes(vertices, elements, self._volumes, vertex_sets, surface_sets)
@@ -132,4 +127,4 @@ class Elements:
         self._middles = middles_of(elements, len(vertices))
         own = (self._tetrahedra, self._surface_faces, self._surface_triangles, self._middles)
         for array in (vertices, elements, volumes, *own):
-            array.flags.writeable = False
+            frozen(array)

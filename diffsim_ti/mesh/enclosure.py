@@ -7,6 +7,7 @@ import numpy as np
 
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.geometry import cross
+from diffsim_ti.mesh.sets import components
 
 FLAT = 1e-6  # of the size of a surface: how far its rim may lie off the planes that hold it
 
@@ -156,12 +157,9 @@ def _loops(rim: np.ndarray) -> list[np.ndarray]:
     """Rows of the rim's edges, one array for each connected part."""
     if len(rim) == 0:
         return []
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     names, place = np.unique(rim[:, :2], return_inverse=True)
     i, j = place.reshape(-1, 2).T
-    _, part = connected_components(coo_matrix((np.ones(len(i)), (i, j)), (len(names), len(names))), directed=False)
+    part = components(i, j, len(names))
     return [np.flatnonzero(part[i] == k) for k in range(part.max() + 1)]
 
 

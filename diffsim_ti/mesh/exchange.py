@@ -115,9 +115,8 @@ class Exchange:
         kinds = {number: name for number, name in VTK_CELLS.items() if number in grid.cells_dict}
         other = sorted(set(grid.cells_dict) - set(kinds))
         if other:
-            raise ValueError(
-                f"cells of VTK's types {other} cannot be read; there may be {', '.join(VTK_CELLS.values())}"
-            )
+            known = ", ".join(VTK_CELLS.values())
+            raise ValueError(f"cells of VTK's types {other} cannot be read; there may be {known}")
         cells = [(name, np.asarray(grid.cells_dict[number])) for number, name in kinds.items()]
         rows = [np.nonzero(np.asarray(grid.celltypes) == number)[0] for number in kinds]
         cell_data = {name: [np.asarray(grid.cell_data[name])[k] for k in rows] for name in grid.cell_data.keys()}

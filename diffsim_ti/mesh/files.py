@@ -162,8 +162,7 @@ def write_mesh(path, mesh) -> list[str]:
         )
     faces, vertex_sets = named_parts(mesh)
     if path.suffix == ".msh":
-        tetrahedra = ("tetra" if mesh.order == 1 else "tetra10", mesh.elements)
-        _write_gmsh(meshio, path, mesh.vertices, tetrahedra, vertex_sets, mesh.tetrahedron_sets, faces)
+        _write_gmsh(path, mesh, vertex_sets, faces)
         return []
     out, lost = as_meshio(mesh, bare=path.suffix not in KEEPS_SETS), []
     if path.suffix == ".inp":
@@ -193,7 +192,9 @@ def _lacking(what: str, error: ModuleNotFoundError) -> ImportError:
 def named_parts(mesh) -> tuple[dict, dict]:
     """(cells of surface sets by name, vertex sets that are not those of these cells)"""
     faces = {name: _cells_of(mesh, rows) for name, rows in mesh.surface_sets.items()}
-    return faces, {n: rows for n, rows in mesh.vertex_sets.items() if not _same_vertices(rows, faces.get(n))}
+    known = {name: np.unique(np.concatenate([c.ravel() for c in cells.values()])) for name, cells in faces.items()}
+    own = {n: rows for n, rows in mesh.vertex_sets.items() if n not in known or not np.array_equal(rows, known[n])}
+    return faces, own
 
 
 def as_meshio(mesh, bare: bool = False):
@@ -214,7 +215,8 @@ def as_meshio(mesh, bare: bool = False):
         for name, block, rows in members:
             masks = cell_data.setdefault(name, [np.zeros(len(data), np.int32) for _, data in cells])
             masks[block][rows] = 1
-        point_data = {VERTEX_PREFIX + name: _mask(rows, mesh.num_vertices) for name, rows in vertex_sets.items()}
+        for name, rows in vertex_sets.items():
+            point_data[VERTEX_PREFIX + name] = np.bincount(rows, minlength=mesh.num_vertices).astype(np.int32)
     return meshio.Mesh(mesh.vertices, cells, point_data=point_data, cell_data=cell_data)
 
 
@@ -227,22 +229,13 @@ def _cells_of(mesh, rows: np.ndarray) -> dict[str, np.ndarray]:
     return {kind: cells for kind, cells in out.items() if len(cells) or kind == "triangle6"}
 
 
-def _same_vertices(rows: np.ndarray, cells: dict[str, np.ndarray] | None) -> bool:
-    """Whether a vertex set is that of its triangles, which say so when they are read again."""
-    return cells is not None and np.array_equal(rows, np.unique(np.concatenate([c.ravel() for c in cells.values()])))
-
-
-def _mask(rows, count: int) -> np.ndarray:
-    mask = np.zeros(count, np.int32)
-    mask[rows] = 1
-    return mask
-
-
-def _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_sets, faces) -> None:
+def _write_gmsh(path, mesh, vertex_sets: dict, faces: dict) -> None:
     """Gmsh 2.2, binary: sets as named physical groups of points, surfaces, volumes; a member of several is listed again."""
-    kind, tetrahedra = tetrahedra
+    import meshio
+
+    kind, tetrahedra = "tetra" if mesh.order == 1 else "tetra10", mesh.elements
     field_data, first, again = {}, np.zeros(len(tetrahedra), np.int64), []
-    for tag, (name, rows) in enumerate(tetrahedron_sets.items(), start=1):
+    for tag, (name, rows) in enumerate(mesh.tetrahedron_sets.items(), start=1):
         field_data[name] = np.array([tag, 3])
         free = first[rows] == 0
         first[rows[free]] = tag
@@ -265,5 +258,5 @@ def _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_set
                     blocks.append((kind, cells))
                     tags.append(np.full(len(cells), tag))
     cell_data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
-    mesh = meshio.Mesh(vertices, blocks, cell_data=cell_data, field_data=field_data)
-    mesh.write(path, file_format="gmsh22", binary=True)
+    out = meshio.Mesh(mesh.vertices, blocks, cell_data=cell_data, field_data=field_data)
+    out.write(path, file_format="gmsh22", binary=True)

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from diffsim_ti.mesh.sets import components
+
 SURFACES = (".stl", ".obj", ".ply", ".off")  # files that hold surfaces alone
 INSTALL = 'pip install "diffsim-ti[surfaces]"'
 ELSEWHERE = "or fill it elsewhere, with Gmsh or fTetWild"
@@ -62,12 +64,8 @@ def filled(points: np.ndarray, triangles: np.ndarray, size: float | None = None)
 def _without_cavities(vertices, tetrahedra, points, triangles) -> tuple[np.ndarray, np.ndarray]:
     """Without tetrahedra of closed parts of the surface that lie within another: there, a ray leaves by an even number of
     triangles. A surface in one piece has none."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    ends = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(points),) * 2)
-    if len(np.unique(connected_components(graph, directed=False)[1][triangles[:, 0]])) == 1:
+    part = components(triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel(), len(points))
+    if len(np.unique(part[triangles[:, 0]])) == 1:
         return vertices, tetrahedra
     turn, _ = np.linalg.qr(np.array([[0.31, 0.77, 0.13], [0.59, 0.23, 0.83], [0.47, 0.91, 0.37]]))  # rays miss edges
     a, b, c = (points @ turn)[triangles].transpose(1, 0, 2)
@@ -75,16 +73,13 @@ def _without_cavities(vertices, tetrahedra, points, triangles) -> tuple[np.ndarr
     centers, inside = vertices[tetrahedra].mean(1) @ turn, []
     for center in np.array_split(centers, 1 + len(centers) * len(triangles) // 1_000_000):
         at = center[:, None]
-        sides = [np.sign(_cross(q - p, at - p)) for p, q in ((a, b), (b, c), (c, a))]
+        ways = [(q - p, at - p) for p, q in ((a, b), (b, c), (c, a))]  # seen along the ray
+        sides = [np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]) for u, v in ways]
         above = np.einsum("ij,kij->ki", normal, at - a) * np.sign(normal[:, 2]) < 0
         inside.append((((sides[0] == sides[1]) & (sides[1] == sides[2]) & above).sum(1) % 2) == 1)
     tetrahedra = tetrahedra[np.concatenate(inside)]
     used, corners = np.unique(tetrahedra, return_inverse=True)
     return vertices[used], corners.reshape(tetrahedra.shape).astype(np.int64)
-
-
-def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,28 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
+def sorted_faces(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(corners of all faces, shape (k, 3), face 4 e + a opposite corner a of e; an order in which faces of the same corners
+    follow each other; which of these has the corners of the next, shape (k - 1,))"""
+    corners = tetrahedra[:, FACES].reshape(-1, 3)
+    a, b, c = np.sort(corners, 1).T
+    if num_vertices < 2_000_000:  # three indices fit in one 64-bit key
+        key = (a * num_vertices + b) * num_vertices + c
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        return corners, order, key[1:] == key[:-1]
+    order = np.lexsort((c, b, a))
+    a, b, c = a[order], b[order], c[order]
+    return corners, order, (a[1:] == a[:-1]) & (b[1:] == b[:-1]) & (c[1:] == c[:-1])
+
+
+def inner_faces(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """(pairs of tetrahedra that share a face, shape (k, 2), its corners, shape (k, 3))"""
+    corners, order, same = sorted_faces(tetrahedra, num_vertices)
+    first, second = order[:-1][same], order[1:][same]
+    return np.stack([first // 4, second // 4], 1), corners[first]
+
+
 def squared_edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Squared edge lengths, shape (num_tetrahedra, 6) [m^2], edges in the order of EDGES."""
     out = np.empty((len(tetrahedra), 6))

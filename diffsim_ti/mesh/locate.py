@@ -9,6 +9,7 @@ from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.geometry import FACES, nearest_on_triangles
 from diffsim_ti.mesh.inverse_map import barycentric_in, nearest_on_face, reach
 from diffsim_ti.mesh.reference_face import functions
+from diffsim_ti.mesh.sets import places_of_triangles
 from diffsim_ti.mesh.ten_nodes import FACE_NODES, QUARTERS
 
 TOLERANCE = 1e-9  # how far below zero a barycentric coordinate may fall to round-off
@@ -104,8 +105,7 @@ def _in_curved(mesh, candidates: list[np.ndarray], points: np.ndarray) -> list[n
 def _nearest(mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The nearest points of the surface, the tetrahedra behind them, and barycentric coordinates there."""
     faces = mesh.tetrahedra[:, FACES].reshape(-1, 3)
-    keys = {tuple(face): k for k, face in enumerate(np.sort(faces, 1).tolist())}
-    owner = np.array([keys[tuple(face)] for face in np.sort(mesh.surface_faces[:, :3], 1).tolist()])
+    owner = places_of_triangles(mesh.surface_faces[:, :3], faces)
     if mesh.order == 2:
         return _nearest_on_faces(mesh, points, owner)
     owner = owner // 4

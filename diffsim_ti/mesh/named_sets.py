@@ -113,13 +113,11 @@ class NamedSets:
 
     def with_vertex_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
         """A mesh that has this vertex set too (or instead of one of that name); `chosen` as in `vertex_indices`."""
-        sets = {**self._vertex_sets, name: self.vertex_indices(chosen)}
-        return self._changed(_vertex_sets=checked_sets(sets, self.num_vertices, "vertex"))
+        return self._with_set("vertex", name, self.vertex_indices(chosen), self.num_vertices)
 
     def with_tetrahedron_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
         """A mesh that has this tetrahedron set too (or instead of one of that name)."""
-        sets = {**self._tetrahedron_sets, name: self.tetrahedron_indices(chosen)}
-        return self._changed(_tetrahedron_sets=checked_sets(sets, self.num_tetrahedra, "tetrahedron"))
+        return self._with_set("tetrahedron", name, self.tetrahedron_indices(chosen), self.num_tetrahedra)
 
     def with_surface_set(self, name: str, chosen: str | ArrayLike | Iterable[str] | Callable) -> "TetrahedralMesh":
         """A mesh that has this surface set too (or instead of one of that name), for loads and supports to name.
@@ -129,8 +127,11 @@ class NamedSets:
             mesh.with_surface_set("lid", lambda x, n: n[:, 1] > 0.9)
         """
         rows = self.surface_where(chosen) if callable(chosen) else self.surface_indices(chosen)
-        sets = {**self._surface_sets, name: rows}
-        return self._changed(_surface_sets=checked_sets(sets, len(self.surface_triangles), "surface"))
+        return self._with_set("surface", name, rows, len(self.surface_triangles))
+
+    def _with_set(self, what: str, name: str, rows: np.ndarray, count: int) -> "TetrahedralMesh":
+        own = f"_{what}_sets"
+        return self._changed(**{own: checked_sets({**getattr(self, own), name: rows}, count, what)})
 
 
 def _mask(values, count: int) -> np.ndarray:

@@ -4,6 +4,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from diffsim_ti.mesh.sets import components
+
 SIZE = 8
 _known = WeakKeyDictionary()  # meshes do not change
 
@@ -47,14 +49,10 @@ def _find_patches(mesh) -> np.ndarray:
 
 def _pieces(labels: np.ndarray, tets: np.ndarray) -> np.ndarray:
     """Labels anew, so that tetrahedra of one label hang together by shared vertices."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     m = len(tets)
     corners, place = np.unique(labels[:, None] * (tets.max() + 1) + tets, return_inverse=True)
-    edges = np.repeat(np.arange(m), 4), m + place.ravel()
-    graph = coo_matrix((np.ones(4 * m), edges), shape=(m + len(corners),) * 2)
-    return np.unique(connected_components(graph, directed=False)[1][:m], return_inverse=True)[1]
+    label = components(np.repeat(np.arange(m), 4), m + place.ravel(), m + len(corners))
+    return np.unique(label[:m], return_inverse=True)[1]
 
 
 def in_eights(patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

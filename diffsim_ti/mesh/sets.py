@@ -5,14 +5,19 @@ import numpy as np
 from diffsim_ti.common.checked import shape_of
 
 
+def frozen(array: np.ndarray) -> np.ndarray:
+    """The array itself, read-only from now on."""
+    array.flags.writeable = False
+    return array
+
+
 def checked_sets(sets: dict | None, count: int, what: str) -> dict[str, np.ndarray]:
     """name -> sorted read-only indices; ValueError for a name that is no name and for indices that do not fit."""
     out = {}
     for name, rows in (sets or {}).items():
         if not isinstance(name, str) or not name or '"' in name or "\n" in name:
             raise ValueError(f"a {what} set needs a name without quotes and line breaks, got {name!r}")
-        out[name] = indices_of(rows, count, f"{what} set {name!r}")
-        out[name].flags.writeable = False
+        out[name] = frozen(indices_of(rows, count, f"{what} set {name!r}"))
     return out
 
 
@@ -66,8 +71,14 @@ def join_sets(parts: list[dict], firsts: np.ndarray) -> dict[str, np.ndarray]:
         if any(name in other for other in parts):
             raise ValueError(f"joined names the bodies body_0, body_1, ..., but a mesh has a set {name!r}: rename it")
         out[name] = np.arange(firsts[k], firsts[k + 1])
+    return out | _merged([{name: rows + first for name, rows in sets.items()} for sets, first in zip(parts, firsts)])
+
+
+def _merged(parts: list[dict]) -> dict[str, np.ndarray]:
+    """The sets of all bodies by name, and of a name that several have also each body's part of it."""
+    out = {}
     for name in dict.fromkeys(name for sets in parts for name in sets):
-        own = {k: sets[name] + firsts[k] for k, sets in enumerate(parts) if name in sets}
+        own = {k: sets[name] for k, sets in enumerate(parts) if name in sets}
         out |= {part_of(name, k): rows for k, rows in own.items()} if len(own) > 1 else {}
         out[name] = np.concatenate([*own.values()])
     return out
@@ -139,16 +150,10 @@ def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict]:
         | {name: mesh.surface_triangles[rows] + first for name, rows in mesh.surface_sets.items()}
         for k, (mesh, first) in enumerate(zip(meshes, firsts))
     ]
-    names = dict.fromkeys(name for sets in triangles for name in sets)
-    surface_sets = {}
-    for name in names:
-        own = {k: sets[name] for k, sets in enumerate(triangles) if name in sets}
-        surface_sets |= {part_of(name, k): rows for k, rows in own.items()} if len(own) > 1 else {}
-        surface_sets[name] = np.concatenate([*own.values()])
     sets = dict(
         vertex_sets=join_sets([mesh.vertex_sets for mesh in meshes], firsts),
         tetrahedron_sets=join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets),
-        surface_sets=surface_sets,
+        surface_sets=_merged(triangles),
     )
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     return vertices, np.concatenate([mesh.elements + first for mesh, first in zip(meshes, firsts)]), sets
@@ -164,15 +169,18 @@ def without_unused(vertices: np.ndarray, tetrahedra: np.ndarray, sets: dict, tri
     return vertices[used], new[tetrahedra], sets, triangles
 
 
-def pieces(mesh) -> np.ndarray:
-    """For each vertex the number of the part that it belongs to; parts share no vertex, and an unused vertex is one."""
+def components(i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
+    """For each of `count` things the number of the part that it belongs to, where i[k] and j[k] hang together."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
+    return connected_components(coo_matrix((np.ones(len(i), bool), (i, j)), (count, count)), directed=False)[1]
+
+
+def pieces(mesh) -> np.ndarray:
+    """For each vertex the number of the part that it belongs to; parts share no vertex, and an unused vertex is one."""
     others = mesh.elements[:, 1:]
-    pairs = np.stack([np.repeat(mesh.elements[:, 0], others.shape[1]), others.ravel()])
-    graph = coo_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), (mesh.num_vertices, mesh.num_vertices))
-    return connected_components(graph, directed=False)[1]
+    return components(np.repeat(mesh.elements[:, 0], others.shape[1]), others.ravel(), mesh.num_vertices)
 
 
 def sizes(sets: dict) -> str:

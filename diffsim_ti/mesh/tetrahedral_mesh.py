@@ -18,7 +18,7 @@ from diffsim_ti.mesh.exchange import Exchange
 from diffsim_ti.mesh.grid import box
 from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
-from diffsim_ti.mesh.sets import checked_sets, join, pieces, rows_on_surface
+from diffsim_ti.mesh.sets import checked_sets, frozen, join, pieces, rows_on_surface
 from diffsim_ti.mesh.ten_nodes import edges_of
 
 CONNECTIVITY = (  # what stays when vertices move
@@ -159,7 +159,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
     @cached_property
     def surface_vertices(self) -> np.ndarray:
         """Sorted indices of the vertices of the surface."""
-        return _frozen(np.unique(self.surface_triangles))
+        return frozen(np.unique(self.surface_triangles))
 
     @property
     def unused_vertices(self) -> np.ndarray:
@@ -169,7 +169,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
     @cached_property
     def edges(self) -> np.ndarray:
         """Each edge once, by its two corners, shape (k, 2), the smaller index first."""
-        return _frozen(edges_of(self.tetrahedra, self.num_vertices)[0])
+        return frozen(edges_of(self.tetrahedra, self.num_vertices)[0])
 
     @cached_property
     def num_pieces(self) -> int:
@@ -192,28 +192,28 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
     def shape_gradients(self) -> np.ndarray:
         """grad N_a of linear functions of the corners [1/m], shape (num_tetrahedra, 4, 3); with four nodes the displacement
         gradient is sum_a u_a (x) grad N_a."""
-        return _frozen(geometry.shape_gradients(geometry.inverse_edges(self.vertices, self.tetrahedra)))
+        return frozen(geometry.shape_gradients(geometry.inverse_edges(self.vertices, self.tetrahedra)))
 
     @cached_property
     def altitudes(self) -> np.ndarray:
         """Height of each corner over its opposite face [m], h_a = 1 / |grad N_a|, shape (num_tetrahedra, 4)."""
-        return _frozen(1 / np.linalg.norm(self.shape_gradients, axis=2))
+        return frozen(1 / np.linalg.norm(self.shape_gradients, axis=2))
 
     @cached_property
     def quality(self) -> np.ndarray:
         """eta = 12 (3 V)^(2/3) / sum of the six squared edges, in (0, 1], 1: regular; shape (num_tetrahedra,)."""
         squares = geometry.squared_edges(self.vertices, self.tetrahedra).sum(1)
-        return _frozen(12 * np.cbrt(3 * self.volumes) ** 2 / squares)
+        return frozen(12 * np.cbrt(3 * self.volumes) ** 2 / squares)
 
     @cached_property
     def centroids(self) -> np.ndarray:
         """Mean of the four vertices [m], shape (num_tetrahedra, 3)."""
-        return _frozen(self.vertices[self.tetrahedra].mean(1))
+        return frozen(self.vertices[self.tetrahedra].mean(1))
 
     @cached_property
     def bounding_box(self) -> np.ndarray:
         """Lowest and highest corner [m], shape (2, 3)."""
-        return _frozen(np.stack([self.vertices.min(0), self.vertices.max(0)]))
+        return frozen(np.stack([self.vertices.min(0), self.vertices.max(0)]))
 
     # Points
 
@@ -281,7 +281,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         volumes = checks.checked_curved_volumes(vertices, self._elements, volumes)
         new = object.__new__(type(self))
         new.__dict__.update({name: self.__dict__[name] for name in CONNECTIVITY})
-        new._vertices, new._volumes = _frozen(vertices), _frozen(volumes)
+        new._vertices, new._volumes = frozen(vertices), frozen(volumes)
         return new
 
     def __setstate__(self, state: dict) -> None:
@@ -290,9 +290,4 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         sets = (self._vertex_sets, self._tetrahedron_sets, self._surface_sets)
         for value in (*state.values(), *(rows for named in sets for rows in named.values())):
             if isinstance(value, np.ndarray):
-                _frozen(value)
-
-
-def _frozen(array: np.ndarray) -> np.ndarray:
-    array.flags.writeable = False
-    return array
+                frozen(value)

@@ -69,9 +69,8 @@ class Chatter:
         material, remedy = type(ws.scene.material).__name__, "contact_damping=1"
         if not (ws.scene.law.viscous or ws.scene.law.state_names):
             time = VISCOUS * float(ws.solver.stable_dt().dt)
-            remedy = (
-                f"KelvinVoigt({material}(...), {time:.2g}) as the material, which damps these vibrations, or {remedy}"
-            )
+            damped = f"KelvinVoigt({material}(...), {time:.2g}) as the material"
+            remedy = f"{damped}, which damps these vibrations, or {remedy}"
         warnings.warn(
             f"{ws.when(ws.step_of(now - 1, num_passes))}: what slides on {term!r} at {slide:.3g} m/s shakes at {shake:.3g} "
             f"m/s, contact opening and closing, in steps that damp nothing: friction then does not point against the "

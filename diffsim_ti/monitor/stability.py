@@ -1,7 +1,6 @@
 """How large a step may be: a bound by elements, the tight limit by Lanczos, and a bound during the run."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,14 +10,11 @@ from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.mesh.patches import volume_patches
-from diffsim_ti.monitor.reduced_bounds import affine_bound
 from diffsim_ti.monitor.stiffest import stiffest
+from diffsim_ti.scene import Scene
 from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.viscous_stages import ViscousStages
 from diffsim_ti.terms.mass_scaling import row_sums
-
-if TYPE_CHECKING:
-    from diffsim_ti.scene import Scene
 
 ONE = ViscousStages()
 
@@ -46,7 +42,7 @@ class StepLimit(float):
         return f"{self.dt:.4g} s ({self.method}, set by tetrahedron {self.tetrahedron})"
 
 
-def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStages = ONE) -> StepLimit:
+def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages = ONE) -> StepLimit:
     """A step that is safe at rest, from each tetrahedron by itself, without contact.
 
         omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
@@ -83,13 +79,12 @@ def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStag
     omega2, c = bound_of(mu, lam), 0.0 if viscous is None else bound_of(*viscous)
     for body, own in together:
         if not body.rigid:
-            omega2[own[0]] = affine_bound(scene.mesh, derived.volumes, own, mu, lam, values["density"])
+            omega2[own[0]] = _affine_bound(scene.mesh, derived.volumes, own, mu, lam, values["density"])
             if viscous is not None:
-                c[own[0]] = affine_bound(scene.mesh, derived.volumes, own, *viscous, values["density"])
+                c[own[0]] = _affine_bound(scene.mesh, derived.volumes, own, *viscous, values["density"])
     omega2, c, worst = largest_of(omega2, c)
-    hosts = host_forces(scene).with_energy
-    more = sum(x.added_omega2(values, derived) for x in scene.interactions)
-    if hosts:  # what all of them add at the most
+    more = sum(x.added_omega2(values, derived) for x in scene.interactions)  # what all of them add at the most
+    if hosts := host_forces(scene).with_energy:
         at = hosts.stiffest(derived, EqualSteps(1.0, 1))
         more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
     if scene.mass_scaling:
@@ -115,6 +110,26 @@ def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
     rows = np.swapaxes(N, 2, 3).reshape(m, 3 * Q, -1)  # of grad v, whose squares are those of the smaller Gram matrices
     of_dilatation = np.einsum("eqai,epai->eqp", N, N, optimize=True)
     return np.linalg.eigvalsh(of_dilatation)[:, -1], np.linalg.eigvalsh(rows @ np.swapaxes(rows, 1, 2))[:, -1]
+
+
+def _affine_bound(mesh, volumes: np.ndarray, own: np.ndarray, mu, lam, density) -> float:
+    """The largest omega^2 [1/s^2] of elements `own` that move by nine strains together, free of all else: that of
+
+        sum V (lam (tr G)^2 + 2 mu |sym G|^2)    by    sum m |G y|^2
+
+    over all gradients G, the m being the elements' own lumped masses, and y places from their centre.
+    """
+    volumes = np.asarray(volumes).reshape(len(mesh.elements), -1).sum(1)[own]
+    mu, lam, density = (np.broadcast_to(x, len(mesh.elements))[own] for x in (mu, np.maximum(lam, 0), density))
+    mass = ((density * volumes)[:, None] * mesh.reference.lumped).ravel()
+    y = mesh.vertices[mesh.elements[own].ravel()]
+    y = y - mass @ y / mass.sum()
+    values, vectors = np.linalg.eigh(np.einsum("n,ni,nj->ij", mass, y, y))
+    G = np.einsum("ai,jk->akij", np.eye(3), vectors / np.sqrt(values)).reshape(9, 3, 3)  # orthonormal by mass
+    symmetric = 0.5 * (G + np.swapaxes(G, 1, 2))
+    trace = np.trace(G, axis1=1, axis2=2)
+    K = (volumes @ lam) * np.outer(trace, trace) + 2 * (volumes @ mu) * np.einsum("aij,bij->ab", symmetric, symmetric)
+    return float(np.linalg.eigvalsh(K)[-1])
 
 
 class Stiffness:

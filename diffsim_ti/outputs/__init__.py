@@ -14,24 +14,6 @@ from diffsim_ti.outputs.tensors import Strain, Stress
 from diffsim_ti.outputs.ties import TieLength, TieTension
 from diffsim_ti.outputs.work import WorkOfLoads
 
-__all__ = [
-    "ChamberPressure",
-    "Change",
-    "ContactForce",
-    "ContactTraction",
-    "Displacements",
-    "ElasticEnergy",
-    "EnclosedVolume",
-    "KineticEnergy",
-    "MaterialPoints",
-    "Output",
-    "Positions",
-    "Reaction",
-    "SelfContactForce",
-    "Strain",
-    "Stress",
-    "TieLength",
-    "TieTension",
-    "Velocities",
-    "WorkOfLoads",
-]
+__all__ = ["ChamberPressure", "Change", "ContactForce", "ContactTraction", "Displacements", "ElasticEnergy"]
+__all__ += ["EnclosedVolume", "KineticEnergy", "MaterialPoints", "Output", "Positions", "Reaction"]
+__all__ += ["SelfContactForce", "Strain", "Stress", "TieLength", "TieTension", "Velocities", "WorkOfLoads"]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import wholes
-from diffsim_ti.mesh.enclosure import weighted_triangles
+from diffsim_ti.mesh.enclosure import Enclosure, open_edges
 from diffsim_ti.outputs.output import Change, Output
 
 if TYPE_CHECKING:
@@ -54,27 +54,19 @@ class EnclosedVolume(Output):
                 f"{faces.shape[1]}: take whole faces, as mesh.surface_faces and mesh.faces_of(...) give them; columns "
                 "[0, 2, 1, 5, 4, 3] turn one of six round"
             )
-        out.triangles, out.weights = weighted_triangles(faces)
-        a, b = faces[:, :3], np.roll(faces[:, :3], -1, 1)
-        there, back = np.sort((a * n + b).ravel()), np.sort((b * n + a).ravel())
-        if not np.array_equal(there, back):
-            open_edge = int(np.setxor1d(there, back)[0]) if len(np.setxor1d(there, back)) else int(there[0])
+        out.enclosure, rim = Enclosure(faces, [], None), open_edges(faces[:, :3], n)
+        if len(rim):
             raise ValueError(
-                f"EnclosedVolume: the surface is open, or turned two ways, at the edge of vertices {open_edge // n} and "
-                f"{open_edge % n}: each edge must belong to two triangles, once in each direction"
+                f"EnclosedVolume: the surface is open, or turned two ways, at the edge of vertices {rim[0].min()} and "
+                f"{rim[0].max()}: each edge must belong to two triangles, once in each direction"
             )
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,)
 
-    def _corners(self, frames) -> np.ndarray:
-        x = frames.positions.astype(np.float64)
-        return (x - x[:, self.triangles[:1, 0]])[:, self.triangles]
-
     def value(self, frames: "Frames") -> np.ndarray:
-        x = self._corners(frames)
-        return (self.weights[:, None] * x[:, :, 0] * np.cross(x[:, :, 1], x[:, :, 2])).sum((1, 2)) / 6
+        return np.array([-self.enclosure.volume(x) for x in frames.positions.astype(np.float64)])
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         if change.positions is None:
@@ -83,9 +75,5 @@ class EnclosedVolume(Output):
         return (by * change.positions).sum((1, 2))
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
-        x, out = self._corners(frames), np.zeros(frames.positions.shape)
-        for a in range(3):
-            by = np.cross(x[:, :, (a + 1) % 3], x[:, :, (a + 2) % 3]) * self.weights[:, None] / 6 * seed[:, None, None]
-            for frame, rows in zip(out, by):
-                np.add.at(frame, self.triangles[:, a], rows)
-        return Change(positions=out)  # a closed surface: the first vertex, from which it counts, adds nothing
+        gradients = [-s * self.enclosure.gradient(x) for s, x in zip(seed, frames.positions.astype(np.float64))]
+        return Change(positions=np.stack(gradients))  # a closed surface: where it counts from adds nothing

@@ -1,7 +1,6 @@
 """Vibrations of a body about a state: frequencies and shapes, with the gradients of frequencies."""
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,9 +10,7 @@ from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.outputs.body_forces import BodyForces
-
-if TYPE_CHECKING:
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to which all of them are computed
 
@@ -29,7 +26,7 @@ class Modes:
     eigenvalues: np.ndarray
     shapes: np.ndarray
     groups: list[list[int]]
-    scene: "Scene" = field(repr=False)
+    scene: Scene = field(repr=False)
     displacements: np.ndarray = field(repr=False)
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -118,7 +115,7 @@ def _slope_of_hosts(hosts: HostForces, u: np.ndarray, phi: np.ndarray, derived, 
     return by_u
 
 
-def free_directions(scene: "Scene"):
+def free_directions(scene: Scene):
     """An orthonormal basis of the motions that supports leave, as columns of a SciPy CSC matrix, (3 num_vertices, k); each
     moves one vertex."""
     from scipy.sparse import csc_matrix
@@ -136,7 +133,7 @@ def free_directions(scene: "Scene"):
     return out
 
 
-def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None, **values) -> Modes:
+def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values) -> Modes:
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
 
     K: `scene.stiffness_matrix(displacements)`, of the body's stress, springs, cables and foundations at displacements [m]

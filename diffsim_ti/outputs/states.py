@@ -9,6 +9,7 @@ class _States(Output):
     """Vectors of all vertices in all frames."""
 
     num_vertices: int
+    part = "positions"  # of a Change
 
     def settled(self, scene) -> "Output":
         out = type(self)()
@@ -21,8 +22,12 @@ class _States(Output):
     def value(self, frames) -> np.ndarray:
         return getattr(frames, self.name)
 
-    def _or_zero(self, frames, change: np.ndarray | None) -> np.ndarray:
+    def jvp(self, frames, change: Change) -> np.ndarray:
+        change = getattr(change, self.part)
         return np.zeros(frames.positions.shape) if change is None else change
+
+    def vjp(self, frames, seed: np.ndarray) -> Change:
+        return Change(**{self.part: seed})
 
 
 class Positions(_States):
@@ -30,23 +35,11 @@ class Positions(_States):
 
     name = "positions"
 
-    def jvp(self, frames, change: Change) -> np.ndarray:
-        return self._or_zero(frames, change.positions)
-
-    def vjp(self, frames, seed: np.ndarray) -> Change:
-        return Change(positions=seed)
-
 
 class Velocities(_States):
     """How fast they move [m/s]."""
 
-    name = "velocities"
-
-    def jvp(self, frames, change: Change) -> np.ndarray:
-        return self._or_zero(frames, change.velocities)
-
-    def vjp(self, frames, seed: np.ndarray) -> Change:
-        return Change(velocities=seed)
+    name = part = "velocities"
 
 
 class Displacements(_States):
@@ -55,7 +48,7 @@ class Displacements(_States):
     name = "displacements"
 
     def jvp(self, frames, change: Change) -> np.ndarray:
-        return self._or_zero(frames, change.positions) - change.inputs.get("rest_positions", 0.0)
+        return super().jvp(frames, change) - change.inputs.get("rest_positions", 0.0)
 
     def vjp(self, frames, seed: np.ndarray) -> Change:
         return Change(positions=seed, inputs={"rest_positions": -seed.sum(0)})

@@ -3,7 +3,7 @@ patches."""
 
 import numpy as np
 
-from diffsim_ti.outputs.law_on_arrays import LawOnArrays
+from diffsim_ti.materials.evaluate import LawOnArrays
 from diffsim_ti.outputs.patch_pressure import PatchPressure
 
 

@@ -29,9 +29,8 @@ class _OfTies(Output):
     def settled(self, scene: "Scene") -> "_OfTies":
         out = copy(self)
         ties = scene.interaction(SpringsAndCables)
-        if ties is None:
-            scene.place_among((), self.tie, "spring or cable")
-        out.scene, out.own, out.ties = scene, ties.places(self.tie), ties.host()
+        number = scene.place_among(ties.terms if ties else (), self.tie, "spring or cable")
+        out.scene, out.own, out.ties = scene, ties.places(number), ties.host()
         out.count = out.own.stop - out.own.start
         return out
 

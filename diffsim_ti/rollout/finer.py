@@ -9,7 +9,6 @@ import numpy as np
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.terms import ExternalForce
 from diffsim_ti.terms.pose import Pose
 
@@ -19,9 +18,8 @@ SHARE = 0.5  # of the stable step, so that a body may be found four times as sti
 
 def is_named(chosen) -> bool:
     """Whether a part of a mesh is chosen by names of sets, or not at all, not by indices."""
-    return (
-        chosen is None or isinstance(chosen, str | Mapping) or all(isinstance(name, str) for name in np.ravel(chosen))
-    )
+    by_name = chosen is None or isinstance(chosen, str | Mapping)
+    return by_name or all(isinstance(name, str) for name in np.ravel(chosen))
 
 
 def on_ten_nodes(scene: Scene, mesh: TetrahedralMesh | None = None) -> Scene:
@@ -105,14 +103,12 @@ def rollout_on_ten_nodes(rollout: Rollout, values: dict) -> Rollout:
             scene, output = scene.replace(mesh=scene.mesh.with_vertex_set(name, output.support)), own
         outputs.append(output)
     fine, solver = on_ten_nodes(scene), rollout.solver
-    made = _divided(solver, fine, values) if solver.explicit else solver.for_scene(fine)
-    return rollout.on(made, outputs=outputs)
-
-
-def _divided(solver: Solver, fine: Scene, values: dict) -> Solver:
-    """The explicit solver with substeps for the finer mesh."""
-    if solver.unequal_steps is not None:
-        raise ValueError("its steps are of unequal lengths, which explicit steps of a finer mesh would have to divide")
-    stable = solver.unchecked_for(fine.with_values(values)).stable_dt(tight=True).dt
-    substeps = max(solver.substeps, math.ceil(solver.dt / (SHARE * stable)))
-    return solver.for_scene(fine, check_start=False, substeps=substeps)
+    more = {}
+    if solver.explicit:
+        if solver.unequal_steps is not None:
+            raise ValueError(
+                "its steps are of unequal lengths, which explicit steps of a finer mesh would have to divide"
+            )
+        stable = solver.unchecked_for(fine.with_values(values)).stable_dt(tight=True).dt
+        more = dict(check_start=False, substeps=max(solver.substeps, math.ceil(solver.dt / (SHARE * stable))))
+    return rollout.on(solver.for_scene(fine, **more), outputs=outputs)

@@ -81,16 +81,8 @@ class Rollout:
         instance("Rollout", "solver", solver, Solver, "a solver such as SemiImplicitSolver(scene)")
         solver, steps = self._stepped(solver, steps)
         self.solver, self.scene = solver, solver.scene
-        options = dict(
-            save_every=save_every,
-            checkpoint_every=checkpoint_every,
-            memory=memory,
-            gradients=gradients,
-            clip=clip,
-            truncate=truncate,
-            health=health,
-            raise_errors=raise_errors,
-        )
+        options = dict(save_every=save_every, checkpoint_every=checkpoint_every, memory=memory, gradients=gradients)
+        options |= dict(clip=clip, truncate=truncate, health=health, raise_errors=raise_errors)
         given = (outputs,) if isinstance(outputs, Output) else tuple(listed("outputs", outputs, "Outputs"))
         contacts = any(isinstance(output, Output) and output.needs_contact_forces(solver) for output in given)
         chambers = any(getattr(output, "reads_chamber_pressures", False) for output in given)
@@ -119,9 +111,8 @@ class Rollout:
         if isinstance(steps, UnequalSteps):
             return solver.on(steps), len(steps)
         if not isinstance(steps, int | float | np.integer) or not (steps >= 0 and steps == int(min(steps, 1e18))):
-            raise ValueError(
-                f"steps must be a whole number >= 0, got {steps!r}; or pass lengths of steps [s], or UnequalSteps"
-            )
+            remedy = "or pass lengths of steps [s], or UnequalSteps"
+            raise ValueError(f"steps must be a whole number >= 0, got {steps!r}; {remedy}")
         return solver, int(steps)
 
     def _check_outputs(self, outputs) -> dict[str, Output]:
@@ -129,16 +120,10 @@ class Rollout:
         for output in outputs:
             if not isinstance(output, Output):
                 raise ValueError(f"outputs: expected an Output such as MaterialPoints(points), got {output!r}")
-            if (
-                not isinstance(output.name, str)
-                or not output.name.isidentifier()
-                or output.name in out
-                or output.name in self.inputs
-            ):
-                taken = ", ".join((*out, *self.inputs))
-                raise ValueError(
-                    f"outputs: need names of their own without blanks, got {shown(output.name)}; taken: {taken}"
-                )
+            name, taken = output.name, (*out, *self.inputs)
+            if not isinstance(name, str) or not name.isidentifier() or name in taken:
+                rule = "need names of their own without blanks"
+                raise ValueError(f"outputs: {rule}, got {shown(name)}; taken: {', '.join(taken)}")
             out[output.name] = settled = output.settled(self.scene)
             if settled.reads_law_state:
                 raise ValueError(

@@ -269,10 +269,8 @@ class Simulator:
             raise ValueError(f"{output!r} is of a step: make the simulator with Simulator(solver, contact_forces=True)")
         if output.cumulative:
             raise ValueError(f"{output!r} counts from the start of a run: pass it to Rollout(..., outputs=[...])")
-        frames = Frames(
-            self.positions[None], self.velocities[None], self.displacements[None], np.array([self.time]), {}
-        )
-        frames.inputs = self.values_of_step
+        now = (x[None] for x in (self.positions, self.velocities, self.displacements))
+        frames = Frames(*now, np.array([self.time]), self.values_of_step)
         frames.steps = np.array([self.step_count])
         frames.law_state = self.law_state[None]
         if self._notes:
@@ -324,9 +322,8 @@ class Simulator:
         term, forces = self.scene.term(ExternalForce), numbers("forces", forces)
         given = None if term is None else term.values.get("external_forces")
         if given is None or given.ndim == 3:
-            raise ValueError(
-                "set_forces needs a scene with a constant ExternalForce, of shape (k, 3); add one of zeros"
-            )
+            remedy = "add one of zeros"
+            raise ValueError(f"set_forces needs a scene with a constant ExternalForce, of shape (k, 3); {remedy}")
         if forces.shape != given.shape or not np.all(np.isfinite(forces)):
             raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
         self._set[self.scene.input_names(term)["external_forces"]] = forces
@@ -365,15 +362,10 @@ class Simulator:
     def describe(self) -> str:
         """What is simulated, how, and what was built for it."""
         a = self.workspace.arrays
-        built = [type(t).__name__ for t in self.scene.terms] + (
-            ["prescribed motion"] if a.values.motion is not None else []
-        )
+        built = [type(t).__name__ for t in self.scene.terms] + ["prescribed motion"] * (a.values.motion is not None)
         moduli = "one set of moduli" if a.features().uniform else "moduli per tetrahedron"
-        return "\n".join(
-            [
-                self.scene.describe(),
-                self.solver.describe(),
-                f"built: {type(a.law).__name__} ({self.scene.precision}, {runtime.arch_name()}), {moduli}, "
-                f"terms {', '.join(built) or 'none'}; {runtime.allocated_megabytes():.1f} MB on the device",
-            ]
+        what = f"{type(a.law).__name__} ({self.scene.precision}, {runtime.arch_name()}), {moduli}"
+        return (
+            f"{self.scene.describe()}\n{self.solver.describe()}\nbuilt: {what}, terms {', '.join(built) or 'none'}; "
+            f"{runtime.allocated_megabytes():.1f} MB on the device"
         )

@@ -10,12 +10,12 @@ from diffsim_ti.common.checked import as_numbers, listed, number, whole
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
-from diffsim_ti.rollout.doubts import warn_of_coarse_steps, warn_of_explosion
 from diffsim_ti.rollout.run import Run, Seed
 from diffsim_ti.rollout.shape import MOVED
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FacesBend
+from diffsim_ti.state.watch import ContactResolution
 
 RECORD_BYTES = 200e6  # up to which the first run of implicit solvers is recorded
 
@@ -297,7 +297,7 @@ class Sweep:
         self.bring_back(run)
         if not (run.contact_resolution.resolved or self._warned):
             self._warned = True
-            warn_of_coarse_steps(self.solver, run.contact_resolution)
+            _warn_of_coarse_steps(self.solver, run.contact_resolution)
         of_frames = self._reverse(seed, self.careful)
         derived, of_start = seed.collect(self._adjoint, self.truncates)
         if not np.isfinite(sum(of_start) + derived.coefficients.sum()):
@@ -305,7 +305,7 @@ class Sweep:
                 self._reverse(seed, True)  # raises where it happens
             raise FloatingPointError("the adjoint is not finite at the start of the run")
         if not any(getattr(seed, name) is not None for name in self.noted):  # whose seeds are no adjoints of places
-            warn_of_explosion(of_frames, of_start, float(self.solver.schedule.time(self.steps)) or self.solver.dt)
+            _warn_of_explosion(of_frames, of_start, float(self.solver.schedule.time(self.steps)) or self.solver.dt)
         return derived
 
     def _no_adjoints(self, run: Run, seed: Seed) -> Derived:
@@ -392,3 +392,26 @@ class Sweep:
             scaled = self.clip / norm
             self._adjoint.scale(scaled)
         self.health.append({"step": step, "norm_position": by_position, "norm_velocity": by_velocity, "scaled": scaled})
+
+
+def _warn_of_coarse_steps(solver: Solver, seen: ContactResolution) -> None:
+    """Contacts that the steps hardly resolve."""
+    damped = solver.stages_contact and solver.contact_damping > 0
+    warnings.warn(
+        f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
+        f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier"
+        + (", or a smaller contact_damping" if damped else ""),
+        stacklevel=4,
+    )
+
+
+def _warn_of_explosion(of_frames: tuple, of_start: tuple, duration: float) -> None:
+    """An adjoint that grew, by its norms (by displacements, by velocities) where the sweep began and where it ended;
+    duration [s] of the run."""
+    start, end = (by_u + by_v / duration for by_u, by_v in (of_frames, of_start))
+    if end > 1e8 * start > 0:
+        warnings.warn(
+            f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this "
+            "gradient is of little use; shorten the rollout, pass truncate=, or see gradient_health",
+            stacklevel=4,
+        )

@@ -67,13 +67,11 @@ class TapeFace:
                 self._fields[name] = self._field_of_set(name)
             elif SPELLING.get(name, name) in rollout.inputs:
                 if {name, *self._fields} >= {"initial_positions", "initial_displacements"}:
-                    raise ValueError(
-                        "initial_positions and initial_displacements are two spellings of one input: use one"
-                    )
+                    both = "initial_positions and initial_displacements"
+                    raise ValueError(f"{both} are two spellings of one input: use one")
                 if {name, *self._fields} >= {"rest_positions", "initial_displacements"}:
-                    raise ValueError(
-                        "with rest_positions, use initial_positions: displacements are those from the mesh"
-                    )
+                    reason = "displacements are those from the mesh"
+                    raise ValueError(f"with rest_positions, use initial_positions: {reason}")
                 self._fields[name] = self._filled(name, self._loaded(name))
                 self._warn_if_coarse(name, name)
             else:
@@ -105,12 +103,8 @@ class TapeFace:
 
     def by_sets(self, gradients: dict) -> dict:
         """Gradients by the numbers of named sets that have fields."""
-        return {
-            f"{name}[{key}]": gradient
-            for name, rows in self._sets().items()
-            if name in gradients
-            for key, gradient in gathered(gradients[name], rows).items()
-        }
+        known = {name: gathered(gradients[name], rows) for name, rows in self._sets().items() if name in gradients}
+        return {f"{name}[{key}]": gradient for name, of in known.items() for key, gradient in of.items()}
 
     def _loaded(self, name: str) -> np.ndarray:
         """The scene's value of an input."""
@@ -168,14 +162,10 @@ class TapeFace:
     def run(self, k: int | None) -> None:
         """See `Rollout.run`."""
         if (k is None) != (self.runs is None) or k is not None and not (int(k) == k and 0 <= k < self.runs):
-            rule = (
-                f"make the {type(self.rollout).__name__} with runs=..."
-                if self.runs is None
-                else f"give a whole number of 0 .. {self.runs - 1}"
-            )
-            raise ValueError(
-                f"run({'' if k is None else k}): this {self.word} has {self.runs or 'no numbered'} runs: {rule}"
-            )
+            rule = f"make the {type(self.rollout).__name__} with runs=..."
+            rule = rule if self.runs is None else f"give a whole number of 0 .. {self.runs - 1}"
+            what = f"run({'' if k is None else k}): this {self.word}"
+            raise ValueError(f"{what} has {self.runs or 'no numbered'} runs: {rule}")
         tape = runtime.current_tape()
         if tape is None or self._tape is None or self._tape() is not tape:
             self._tape, self._held = None if tape is None else weakref.ref(tape), set()

@@ -59,5 +59,6 @@ from diffsim_ti.runtime.start import (
 )
 from diffsim_ti.runtime.threads import take_turns as _take_turns
 from diffsim_ti.runtime.threads import untaped
+from diffsim_ti.runtime.vectors import cross, number_type, vector_type
 
 _take_turns()

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.common.checked import as_numbers, instance, listed
+from diffsim_ti.common.checked import as_numbers, instance, listed, numbers
 from diffsim_ti.common.copies import MadeAgain
 from diffsim_ti.common.origin import middle_far_part, warn_of_coarse_places
 from diffsim_ti.inputs import ConsistentMass, Inputs
@@ -20,14 +20,13 @@ from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.interactions import NUMBERS, interactions_of
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene.locking import LOCKING_RATIO, warn_if_locking
-from diffsim_ti.terms import Drag, Gravity, Growth, Obstacle, SelfContact, Term
+from diffsim_ti.terms import Chamber, Drag, Gravity, Growth, Obstacle, SelfContact, Term
 from diffsim_ti.terms.mass_scaling import MassScaling
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 from diffsim_ti.terms.pose import Pose, sampled_path
 from diffsim_ti.terms.reduced import Reduced
 from diffsim_ti.terms.supports import Fixed, Supports
-from diffsim_ti.terms.terms_of_scene import TermsOfScene
 
 __all__ = ["LOCKING_RATIO", "Scene"]
 
@@ -37,7 +36,7 @@ def _kind(term) -> tuple:
     return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
 
 
-class Scene(TermsOfScene, MadeAgain):
+class Scene(MadeAgain):
     """A body, its material and what acts on it. Frozen: build another scene instead of changing one.
 
     mesh: TetrahedralMesh, the rest shape.
@@ -132,10 +131,6 @@ class Scene(TermsOfScene, MadeAgain):
         """The law that kernels are compiled for."""
         law = self.material.law(self.precision)
         return PatchLaw(self.precision, law) if self.volume == "patches" else law
-
-    def interaction(self, kind: type[Interaction]) -> Interaction | None:
-        """What acts on the body of one kind, all terms of it together, or None."""
-        return next((x for x in self.interactions if isinstance(x, kind)), None)
 
     def _twin(self) -> "Scene":
         out = Scene.__new__(Scene)
@@ -240,6 +235,56 @@ class Scene(TermsOfScene, MadeAgain):
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement or pose of each moving obstacle at a time [s], shape (3,), (6,) or (7,) [m]."""
         return {term: sampled_path(term.path_name, term.path, [time])[0] for term in self.moving}
+
+    # ---- its terms, by kinds and by names ----------------------------------------------------------------------------
+
+    def interaction(self, kind: type[Interaction]) -> Interaction | None:
+        """What acts on the body of one kind, all terms of it together, or None."""
+        return next((x for x in self.interactions if isinstance(x, kind)), None)
+
+    @property
+    def obstacles(self) -> tuple[Term, ...]:
+        """What the surface feels by distance, in the order of frames' contact forces."""
+        return tuple(t for t in self.ordered_terms if t.acts_on_surface)
+
+    def place_of(self, obstacle: Term | str) -> int:
+        """Place in `obstacles` of one that is given by its name, or as the scene lists it."""
+        return self.place_among(self.obstacles, obstacle, "obstacle")
+
+    def term(self, kind: type) -> Term | None:
+        """The scene's first term of a kind, or None."""
+        return next((t for t in self.terms if isinstance(t, kind)), None)
+
+    def terms_of(self, *kinds: type) -> tuple[Term, ...]:
+        """Its terms of each of some kinds, in the order in which kernels go through them."""
+        return tuple(t for kind in kinds for t in self.ordered_terms if isinstance(t, kind))
+
+    @property
+    def holds_volumes(self) -> bool:
+        """Whether some chamber holds a given volume."""
+        return any(t.holds for t in self.terms_of(Chamber))
+
+    def place_among(self, own: tuple[Term, ...], asked: Term | str, kind: str) -> int:
+        """Place among some of its terms of one that is given by its name, or as the scene lists it."""
+        for k, term in enumerate(own):
+            if asked is term or asked is self._given[self.terms.index(term)] or asked == (term.name or term):
+                return k
+        known = ", ".join(repr(t.name or t) for t in own) or "none"
+        raise ValueError(f"this scene has no {kind} {asked!r}; it has {known}: give them a name=")
+
+    def chamber_volume(self, chamber: Term | str, positions: ArrayLike | None = None) -> float:
+        """Volume [m^3] of a chamber, given by its name or as the scene lists it, at positions [m], default at rest."""
+        own, rest = self.terms_of(Chamber), self.mesh.vertices
+        u = None if positions is None else np.asarray(positions, np.float64) - rest
+        return own[self.place_among(own, chamber, "chamber")].enclosure.volume(rest + self.checked_displacements(u))
+
+    def checked_displacements(self, displacements: ArrayLike | None) -> np.ndarray:
+        """Displacements from the rest shape [m], shape (num_vertices, 3); None: zero."""
+        shape = self.mesh.vertices.shape
+        u = np.zeros(shape) if displacements is None else numbers("displacements [m]", displacements)
+        if u.shape != shape or not np.all(np.isfinite(u)):
+            raise ValueError(f"displacements: expected finite numbers [m] of shape {shape}, got shape {u.shape}")
+        return u
 
     # ---- matrices ----------------------------------------------------------------------------------------------------
 

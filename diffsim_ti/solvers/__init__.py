@@ -11,15 +11,5 @@ from diffsim_ti.solvers.static import StaticSolver
 from diffsim_ti.solvers.velocity_verlet import VelocityVerletSolver
 
 SOLVERS = (SemiImplicitSolver, VelocityVerletSolver, ImplicitEulerSolver, ImplicitMidpointSolver, BDF2Solver)
-__all__ = [
-    "SOLVERS",
-    "BDF2Solver",
-    "ImplicitEulerSolver",
-    "ImplicitMidpointSolver",
-    "NotConverged",
-    "SemiImplicitSolver",
-    "Solver",
-    "StaticSolver",
-    "VelocityVerletSolver",
-    "stable_dt",
-]
+__all__ = ["SOLVERS", "BDF2Solver", "ImplicitEulerSolver", "ImplicitMidpointSolver", "NotConverged"]
+__all__ += ["SemiImplicitSolver", "Solver", "StaticSolver", "VelocityVerletSolver", "stable_dt"]

@@ -27,6 +27,29 @@ def reversed_pass(now, j, plan) -> runtime.Bundle:
     return runtime.Bundle(**own)
 
 
+@runtime.traced
+def between(begin, end, share):
+    """What goes linearly from `begin` to `end` within a step, at a share of it: on the host and in kernels."""
+    return begin + share * (end - begin)
+
+
+def add_between(begin: np.ndarray, end: np.ndarray, share: float, adjoint: np.ndarray) -> None:
+    """Adjoint of `between`: adds to those of both ends."""
+    begin += (1 - share) * adjoint
+    end += share * adjoint
+
+
+@runtime.traced
+def kicks(now, per_step: bool, fp) -> list:
+    """(row of numbers given over time, share of its step at which they count, weight) of the two kicks of a pass. A step
+    before its own has ended there. per_step: whether there is a row for each step; else one holds in all."""
+    one = ti.cast(1, fp)
+    return [
+        (step if per_step else 0, runtime.let(ti.select(step == now.row, now.begin, one)), weight)
+        for step, weight in ((now.force0, now.share0), (now.force1, now.share1))
+    ]
+
+
 class PassTable:
     """Tables of some passes on the device, row after row: `ints` and `floats`; the first row is that of pass `window`."""
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
-from diffsim_ti.state.pass_table import FLOATS, INTS
+from diffsim_ti.state.pass_table import FLOATS, INTS, add_between, between
 
 
 class Schedule(ABC):
@@ -87,7 +87,7 @@ class Schedule(ABC):
     def place(self, rows: np.ndarray, j: int, share: float) -> np.ndarray:
         """The value at a share of the step of pass j; beyond the last row it stays."""
         r, after = self._rows(rows, j)
-        return rows[r] + share * (rows[after] - rows[r])
+        return between(rows[r], rows[after], share)
 
     def rate(self, rows: np.ndarray, j: int) -> np.ndarray:
         """The rate of change in the step of pass j [1/s]."""
@@ -101,8 +101,7 @@ class Schedule(ABC):
     def add_place(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
         """Adjoint of `place`."""
         r, after = self._rows(rows_adj, j)
-        rows_adj[r] += (1 - share) * adjoint
-        rows_adj[after] += share * adjoint
+        add_between(rows_adj[r], rows_adj[after], share, adjoint)
 
     def add_rate(self, rows_adj: np.ndarray, j: int, adjoint: np.ndarray) -> None:
         """Adjoint of `rate`."""
@@ -119,40 +118,45 @@ class Schedule(ABC):
     def load(self, rows: np.ndarray, j: int, share: float, keyed: bool) -> np.ndarray:
         """Forces at a share of the step of pass j; keyed: rows have those at the beginning and at the end in turn."""
         row = rows[self.load_row(rows, j)]
-        return row[0::2] + share * (row[1::2] - row[0::2]) if keyed else row
+        return between(row[0::2], row[1::2], share) if keyed else row
 
     def pressure(self, rows: np.ndarray, j: int, share: float) -> np.ndarray:
         """Pressures of loads at a share of the step of pass j."""
-        begin, end, _ = rows[self.load_row(rows, j)].T
-        return begin + share * (end - begin)
+        row = rows[self.load_row(rows, j)]
+        return between(row[:, 0], row[:, 1], share)
+
+    def growth(self, rows: np.ndarray, j: int, share: float) -> np.ndarray:
+        """What tetrahedra have grown by, of rows (steps, 2, m), at a share of the step of pass j."""
+        return between(*rows[self.load_row(rows, j)], share)
 
     def ties(self, rows: np.ndarray, j: int, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(tension, slack, stiffness) of springs and cables (inputs/ties.py) at a share of the step of pass j."""
         row = rows[self.load_row(rows, j)]
-        tension, slack = (part[:, 0] + share * (part[:, 1] - part[:, 0]) for part in (row[0::2], row[1::2]))
+        tension, slack = (between(part[:, 0], part[:, 1], share) for part in (row[0::2], row[1::2]))
         return tension, slack, row[0::2, 2]
 
     def add_load(self, rows_adj: np.ndarray, j: int, share: float, keyed: bool, adjoint: np.ndarray) -> None:
         """Adjoint of `load`."""
         row = rows_adj[self.load_row(rows_adj, j)]
         if keyed:
-            row[0::2] += (1 - share) * adjoint
-            row[1::2] += share * adjoint
+            add_between(row[0::2], row[1::2], share, adjoint)
         else:
             row += adjoint
 
     def add_pressure(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
         """Adjoint of `pressure`."""
         row = rows_adj[self.load_row(rows_adj, j)]
-        row[:, 0] += (1 - share) * adjoint
-        row[:, 1] += share * adjoint
+        add_between(row[:, 0], row[:, 1], share, adjoint)
+
+    def add_growth(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
+        """Adjoint of `growth`."""
+        add_between(*rows_adj[self.load_row(rows_adj, j)], share, adjoint)
 
     def add_ties(self, rows_adj: np.ndarray, j: int, share: float, adjoint: tuple) -> None:
         """Adjoint of `ties`."""
         row, (tension, slack, stiffness) = rows_adj[self.load_row(rows_adj, j)], adjoint
         for part, by in ((row[0::2], tension), (row[1::2], slack)):
-            part[:, 0] += (1 - share) * by
-            part[:, 1] += share * by
+            add_between(part[:, 0], part[:, 1], share, by)
         row[0::2, 2] += stiffness
 
     def _rows(self, rows, j):

@@ -10,23 +10,6 @@ from diffsim_ti.study.stability_map import StabilityMap, boundary, stability_map
 from diffsim_ti.study.sweep import Settings, Sweep, sweep
 from diffsim_ti.study.work_precision import Chart, Point, chart, pareto_front
 
-__all__ = [
-    "Chart",
-    "Growth",
-    "PROBLEMS",
-    "Point",
-    "Problem",
-    "Recommendation",
-    "Settings",
-    "StabilityMap",
-    "Sweep",
-    "boundary",
-    "chart",
-    "growth",
-    "pareto_front",
-    "power_limit",
-    "problem",
-    "recommend",
-    "stability_map",
-    "sweep",
-]
+__all__ = ["Chart", "Growth", "PROBLEMS", "Point", "Problem", "Recommendation", "Settings", "StabilityMap", "Sweep"]
+__all__ += ["boundary", "chart", "growth", "pareto_front", "power_limit", "problem", "recommend", "stability_map"]
+__all__ += ["sweep"]

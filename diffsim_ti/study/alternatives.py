@@ -37,16 +37,14 @@ def alternatives(trials, best) -> tuple[list[Alternative], list[str]]:
     """(what keeps to the tolerance, why the others are left out), of the advised option `best` of `Trials`."""
     found, notes = [], []
     longer, scene = trials.duration / trials.span, trials.scene.replace(precision=best.precision)
-    plain = best.solver(scene, dt=trials.span / trials.frames, substeps=best.substeps, **_unchecked(best))
-    base = Rollout(plain, trials.frames, save_every=1, memory=trials.memory)
+    base = _rollout(trials, best, scene, best.substeps)
     tried = [lambda how=how: how for how in _scaled(trials, best, scene, notes)]
     tried += _affine(trials, best, notes)
     tried += [lambda share=share: _adaptive(trials, best, scene, share) for share in TOLERANCES]
     for make in tried:
         try:
             how, rollout, search = make()
-            moved = rollout.forward().displacements.astype(np.float64)
-            error = trials.error(moved - moved[0]) * longer
+            error = _error(trials, rollout)
         except (FloatingPointError, ValueError) as problem:
             notes.append(f"a trial beside equal steps: {type(problem).__name__}")
             continue
@@ -75,9 +73,7 @@ def _scaled(trials, best, scene, notes):
         if gain < GAIN:
             notes.append(f"mass_scaling={share:g}: steps only {gain:.2g} times as long, the mesh has no slivers")
             continue
-        substeps = int(np.ceil(best.substeps / gain))
-        solver = best.solver(heavier, dt=trials.span / trials.frames, substeps=substeps, **_unchecked(best))
-        yield f"mass_scaling={share:g}", Rollout(solver, trials.frames, save_every=1, memory=trials.memory), 0.0
+        yield f"mass_scaling={share:g}", _rollout(trials, best, heavier, int(np.ceil(best.substeps / gain))), 0.0
 
 
 def stiff_sets(scene) -> list[str]:
@@ -115,14 +111,12 @@ def _affine(trials, best, notes):
 
 def _affine_run(trials, scene, option) -> Rollout:
     """A run at as many steps as its stable step allows; an implicit one at as many as its order asks for."""
-    substeps, longer = option.substeps, trials.duration / trials.span
+    substeps = option.substeps
     if option.solver.explicit:
         substeps = int(np.ceil(substeps * trials.stable / stable_dt(scene).dt))
     for _ in range(4):
-        solver = option.solver(scene, dt=trials.span / trials.frames, substeps=substeps, **_unchecked(option))
-        rollout = Rollout(solver, trials.frames, save_every=1, memory=trials.memory)
-        moved = rollout.forward().displacements.astype(np.float64)
-        error = trials.error(moved - moved[0]) * longer
+        rollout = _rollout(trials, option, scene, substeps)
+        error = _error(trials, rollout)
         if error <= trials.tolerance:
             break
         finer = np.clip((2 * error / trials.tolerance) ** (1 / option.solver.order), 1.3, 8)
@@ -140,6 +134,17 @@ def _adaptive(trials, best, scene, share):
     search = time.perf_counter() - begin
     how = f"adaptive_steps(solver, steps={trials.frames}, tolerance={tolerance:g})"
     return how, Rollout(solver, steps, save_every=1, memory=trials.memory), search
+
+
+def _rollout(trials, option, scene, substeps: int) -> Rollout:
+    solver = option.solver(scene, dt=trials.span / trials.frames, substeps=substeps, **_unchecked(option))
+    return Rollout(solver, trials.frames, save_every=1, memory=trials.memory)
+
+
+def _error(trials, rollout: Rollout) -> float:
+    """Of a run, carried on to the whole duration."""
+    moved = rollout.forward().displacements.astype(np.float64)
+    return trials.error(moved - moved[0]) * trials.duration / trials.span
 
 
 def _unchecked(best) -> dict:

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,23 +15,15 @@ if TYPE_CHECKING:
     from diffsim_ti.study.work_precision import Chart, Point
 
 
-COLORS = {
-    "SemiImplicit": "#E69F00",
-    "VelocityVerlet": "#0072B2",
-    "ImplicitEuler": "#D55E00",
-    "ImplicitMidpoint": "#009E73",
-    "BDF2": "#CC79A7",
-    "Static": "#56B4E9",
+STYLES = {  # of a solver: colour and marker
+    "SemiImplicit": ("#E69F00", "o"),
+    "VelocityVerlet": ("#0072B2", "s"),
+    "ImplicitEuler": ("#D55E00", "^"),
+    "ImplicitMidpoint": ("#009E73", "D"),
+    "BDF2": ("#CC79A7", "v"),
+    "Static": ("#56B4E9", "P"),
 }
 PEER_COLORS = {"torch-diffsim": "#555555", "Warp": "#999999", "JAX": "#BBBBBB"}
-MARKERS = {
-    "SemiImplicit": "o",
-    "VelocityVerlet": "s",
-    "ImplicitEuler": "^",
-    "ImplicitMidpoint": "D",
-    "BDF2": "v",
-    "Static": "P",
-}
 
 
 def new_figure(width: float = 9.2, height: float = 5.4) -> "tuple[Figure, Axes]":
@@ -57,19 +49,12 @@ def draw_chart(chart: "Chart", path: str | Path, peers: dict | None = None) -> N
         for precision, filled in (("f32", True), ("f64", False)):
             rows = [p for p in chart.points if p.solver == solver and p.precision == precision and np.isfinite(p.error)]
             if rows:
-                color = COLORS.get(name, "#000000")
-                axes.scatter(
-                    [p.seconds for p in rows],
-                    [p.error for p in rows],
-                    s=22,
-                    marker=MARKERS.get(name, "x"),
-                    facecolors=color if filled else "none",
-                    edgecolors=color,
-                    linewidths=1.0,
-                    alpha=0.75,
-                    label=f"{name}, {precision}",
-                    zorder=2,
+                color, marker = STYLES.get(name, ("#000000", "x"))
+                look = dict(
+                    s=22, marker=marker, facecolors=color if filled else "none", edgecolors=color, linewidths=1.0
                 )
+                seconds, errors = [p.seconds for p in rows], [p.error for p in rows]
+                axes.scatter(seconds, errors, alpha=0.75, label=f"{name}, {precision}", zorder=2, **look)
     front = chart.front
     axes.plot([p.seconds for p in front], [p.error for p in front], "k-", lw=1.3, zorder=1, label="Pareto front")
     for who, rows in (peers or {}).items():
@@ -86,16 +71,8 @@ def draw_chart(chart: "Chart", path: str | Path, peers: dict | None = None) -> N
     if chart.reference_error > 0:
         axes.axhspan(chart.reference_error / 2, chart.reference_error, color="0.9", zorder=0)
         axes.set_ylim(bottom=min(chart.reference_error / 2, axes.get_ylim()[0]))
-        axes.text(
-            0.99,
-            chart.reference_error,
-            "the reference's own error",
-            transform=axes.get_yaxis_transform(),
-            ha="right",
-            va="bottom",
-            fontsize=8,
-            color="0.35",
-        )
+        place = dict(transform=axes.get_yaxis_transform(), ha="right", va="bottom")
+        axes.text(0.99, chart.reference_error, "the reference's own error", fontsize=8, color="0.35", **place)
     label_front(axes, front)
     axes.legend(fontsize=8, frameon=False, ncols=1, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     save(figure, path)
@@ -108,18 +85,9 @@ def label_front(axes: "Axes", front: "Sequence[Point]", most: int = 9) -> None:
         if abs(np.log(p.seconds / apart[-1].seconds)) + abs(np.log(p.error / apart[-1].error)) > 0.35:
             apart.append(p)
     few = [apart[round(k)] for k in np.linspace(0, len(apart) - 1, min(most, len(apart)))]
+    look = dict(textcoords="offset points", xytext=(-3, -3), ha="right", va="top", fontsize=8, fontweight="bold")
     for k, p in enumerate(few):
-        axes.annotate(
-            str(k + 1),
-            (p.seconds, p.error),
-            textcoords="offset points",
-            xytext=(-3, -3),
-            ha="right",
-            va="top",
-            fontsize=8,
-            fontweight="bold",
-            zorder=4,
-        )
+        axes.annotate(str(k + 1), (p.seconds, p.error), zorder=4, **look)
     lines = ["the front:", *(f"{k + 1}  {p.label}" for k, p in enumerate(few))]
     axes.text(1.02, 0.0, "\n".join(lines), transform=axes.transAxes, fontsize=7.5, va="bottom", linespacing=1.5)
 
@@ -145,11 +113,21 @@ def write_csv(rows: list[dict], path: str | Path) -> None:
         writer.writerows(rows)
 
 
+def without_nan(row: dict) -> dict:
+    """A row of a table with None for what is not finite."""
+    return {k: (None if isinstance(x, float) and not np.isfinite(x) else x) for k, x in row.items()}
+
+
+def write_results(stem: Path, draw: Callable[[Path], object], rows: list[dict], record: dict) -> list[str]:
+    """A picture, rows and a record as `stem`.png, .csv, .json; returns their names."""
+    draw(stem.with_suffix(".png"))
+    write_csv(rows, stem.with_suffix(".csv"))
+    write_json(record, stem.with_suffix(".json"))
+    return [str(stem.with_suffix(suffix)) for suffix in (".png", ".csv", ".json")]
+
+
 def write_chart(chart: "Chart", folder: str | Path, peers: dict | None = None) -> list[str]:
     """chart_<problem>.png, .csv, .json in a folder; returns their names."""
     stem = Path(folder) / f"chart_{chart.problem.name.replace('-', '_')}"
-    record = chart.record()
-    draw_chart(chart, stem.with_suffix(".png"), peers)
-    write_csv(record["points"], stem.with_suffix(".csv"))
-    write_json(record | ({"peers": peers} if peers else {}), stem.with_suffix(".json"))
-    return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]
+    record = chart.record() | ({"peers": peers} if peers else {})
+    return write_results(stem, lambda path: draw_chart(chart, path, peers), record["points"], record)

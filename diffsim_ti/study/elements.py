@@ -55,6 +55,10 @@ def own_element(scene: Scene) -> str:
     return next(name for name, own in ELEMENTS.items() if own == how)
 
 
+def _with_volume(scene: Scene, how: dict) -> Scene:
+    return scene.replace(volume=how.get("volume", "tetrahedra"))
+
+
 class ElementTrials:
     """Runs of a scene by kinds of elements over `duration` [s], for at most about `budget` [s] of wall time.
 
@@ -75,7 +79,8 @@ class ElementTrials:
             self.notes.append("elements were not compared: the mesh has ten nodes already")
             return []
         try:
-            scenes = {name: self._scene(name) for name in ELEMENTS}
+            on_mesh = {1: scene, 2: on_ten_nodes(scene)}
+            scenes = {name: _with_volume(on_mesh[how.get("order", 1)], how) for name, how in ELEMENTS.items()}
         except ValueError as error:
             self.notes.append(f"ten-node tetrahedra were not tried: {error}")
             return []
@@ -103,18 +108,10 @@ class ElementTrials:
         try:
             made = on_coarser(self.scene, self.coarser)
             kinds = {name: how for name, how in ELEMENTS.items() if how.get("order") == 2}
-            return {
-                f"{name}, coarser mesh": made.replace(volume=how.get("volume", "tetrahedra"))
-                for name, how in kinds.items()
-            }
+            return {f"{name}, coarser mesh": _with_volume(made, how) for name, how in kinds.items()}
         except ValueError as error:
             self.notes.append(f"a coarser mesh was not tried: {error}")
             return {}
-
-    def _scene(self, name: str) -> Scene:
-        how = ELEMENTS[name]
-        made = on_ten_nodes(self.scene) if how.get("order") == 2 else self.scene
-        return made.replace(volume=how.get("volume", "tetrahedra"))
 
     def _finest(self, seconds: float) -> tuple:
         """(motion of ten-node tetrahedra on the mesh that is refined once, whether there is one); it takes some 16 times as
@@ -128,10 +125,8 @@ class ElementTrials:
             return None, False
 
     def _motion(self, scene: Scene) -> tuple[np.ndarray, float]:
-        step = SHARE * stable_dt(scene).dt
-        solver = VelocityVerletSolver(
-            scene, dt=self.duration / self.frames, substeps=int(np.ceil(self.duration / self.frames / step))
-        )
+        frame = self.duration / self.frames
+        solver = VelocityVerletSolver(scene, dt=frame, substeps=int(np.ceil(frame / (SHARE * stable_dt(scene).dt))))
         rollout = Rollout(solver, self.frames, save_every=1)
         rollout.forward()  # compiles
         begin = time.perf_counter()

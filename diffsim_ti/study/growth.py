@@ -11,7 +11,7 @@ from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import VelocityVerletSolver, stable_dt
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.study.charts import COLORS, new_figure, save, write_csv, write_json
+from diffsim_ti.study.charts import STYLES, new_figure, save, write_results
 from diffsim_ti.study.problems import beam_scene, lame_scene
 from diffsim_ti.terms import Gravity, Ground
 from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
@@ -49,8 +49,7 @@ def growth(
     rollout = Rollout(solver, steps // every * every, save_every=every)
     start, rng, sizes = rollout.forward(), np.random.default_rng(seed), []
     for _ in range(directions):
-        d = rng.standard_normal(start.positions.shape[1:])
-        d = solver.scene.supports.free(d)
+        d = solver.scene.supports.free(rng.standard_normal(start.positions.shape[1:]))
         moved, _ = rollout.jvp(start, initial_positions=d / np.linalg.norm(d))
         sizes.append(np.linalg.norm(moved, axis=(1, 2)))
     sizes, times = np.array(sizes), rollout.times
@@ -93,32 +92,19 @@ def draw_growth(results: dict[str, Growth], path: str | Path, rounding: float) -
     """Size of the tangent against time, a line per run, with the size at which rounding has grown to 1 % of the state."""
     figure, axes = new_figure()
     styles = ("-", "--", "-.", ":")
-    for k, ((name, result), color) in enumerate(zip(results.items(), COLORS.values())):
+    for k, ((name, result), (color, _)) in enumerate(zip(results.items(), STYLES.values())):
         largest = result.sizes.max(0)
         until = "to the end" if result.horizon is None else f"until {result.horizon:.2g} s"
-        axes.plot(
-            result.times,
-            largest,
-            styles[k % 4],
-            color=color,
-            lw=1.8,
-            label=f"{name}: {result.rate:.2g} 1/s, of use {until}",
-        )
+        label = f"{name}: {result.rate:.2g} 1/s, of use {until}"
+        axes.plot(result.times, largest, styles[k % 4], color=color, lw=1.8, label=label)
         if result.horizon is not None:
             axes.plot(result.horizon, np.interp(result.horizon, result.times, largest), "o", color=color, ms=8)
     axes.set(yscale="log", xlabel="time [s]", ylabel="largest d positions / d start [-]")
     top = max(np.nanmax(result.sizes) for result in results.values())
     if top * rounding > 1e-4:
         axes.axhline(1e-2 / rounding, color="0.4", lw=1)
-        axes.text(
-            0.01,
-            1e-2 / rounding,
-            "rounding grown to 1 % of the state",
-            transform=axes.get_yaxis_transform(),
-            va="bottom",
-            fontsize=9,
-            color="0.35",
-        )
+        place = dict(transform=axes.get_yaxis_transform(), va="bottom")
+        axes.text(0.01, 1e-2 / rounding, "rounding grown to 1 % of the state", fontsize=9, color="0.35", **place)
     axes.grid(which="major", color="0.9")
     axes.set_title("Growth of gradients with the length of a run", loc="left", fontsize=11)
     axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0, -0.12))
@@ -127,18 +113,6 @@ def draw_growth(results: dict[str, Growth], path: str | Path, rounding: float) -
 
 def write_growth(results: dict[str, Growth], folder: str | Path, rounding: float) -> list[str]:
     """growth.png, .csv, .json in a folder; returns their names."""
-    stem = Path(folder) / "growth"
-    draw_growth(results, stem.with_suffix(".png"), rounding)
-    write_csv(
-        [
-            dict(scene=name, time=t, size=s)
-            for name, result in results.items()
-            for t, s in zip(result.times, result.sizes.max(0))
-        ],
-        stem.with_suffix(".csv"),
-    )
-    write_json(
-        {name: asdict(r) | dict(times=r.times.tolist(), sizes=r.sizes.tolist()) for name, r in results.items()},
-        stem.with_suffix(".json"),
-    )
-    return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]
+    rows = [dict(scene=k, time=t, size=s) for k, r in results.items() for t, s in zip(r.times, r.sizes.max(0))]
+    record = {name: asdict(r) | dict(times=r.times.tolist(), sizes=r.sizes.tolist()) for name, r in results.items()}
+    return write_results(Path(folder) / "growth", lambda path: draw_growth(results, path, rounding), rows, record)

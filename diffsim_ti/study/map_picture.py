@@ -6,24 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.study.charts import save, write_csv, write_json
-from diffsim_ti.study.stability_map import OUTCOMES
+from diffsim_ti.study.charts import save, write_results
+from diffsim_ti.study.stability_map import OUTCOMES, StabilityMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from diffsim_ti.study.stability_map import StabilityMap
-
 
 OUTCOME_COLORS = ("#009E73", "#8FD0EC", "#F0E442", "#BBBBBB", "#D55E00")  # in the order of OUTCOMES
 LETTERS = "ABLR!"  # the same in letters, for eyes and printers that see no colours
-LEGEND = (
-    "accurate: energy keeps to 1 %",
-    "bounded",
-    "loses more than a tenth of the energy",
-    "raises, refuses or warns",
-    "wrong silently",
-)
+LOSES = "loses more than a tenth of the energy"
+LEGEND = ("accurate: energy keeps to 1 %", "bounded", LOSES, "raises, refuses or warns", "wrong silently")
 
 
 def draw_maps(results: list, path: str | Path) -> None:
@@ -49,19 +42,13 @@ def draw_maps(results: list, path: str | Path) -> None:
     save(figure, path)
 
 
-def draw_panel(result: "StabilityMap", axes: "Axes") -> None:
+def draw_panel(result: StabilityMap, axes: "Axes") -> None:
     """One solver's map. Rows are as high as each other, whatever lies between their steps."""
     from matplotlib.colors import ListedColormap
 
     outcomes = result.outcomes
-    axes.pcolormesh(
-        outcomes,
-        cmap=ListedColormap(OUTCOME_COLORS),
-        vmin=-0.5,
-        vmax=len(OUTCOMES) - 0.5,
-        edgecolors="white",
-        linewidth=0.8,
-    )
+    colours = dict(cmap=ListedColormap(OUTCOME_COLORS), vmin=-0.5, vmax=len(OUTCOMES) - 0.5)
+    axes.pcolormesh(outcomes, edgecolors="white", linewidth=0.8, **colours)
     for (row, column), outcome in np.ndenumerate(outcomes):
         axes.text(column + 0.5, row + 0.5, LETTERS[outcome], ha="center", va="center", fontsize=7, color="0.15")
     height = lambda share: np.interp(np.log(share), np.log(result.shares), np.arange(len(result.shares)) + 0.5)  # noqa: E731
@@ -74,7 +61,7 @@ def draw_panel(result: "StabilityMap", axes: "Axes") -> None:
     axes.set_title(result.solver.removesuffix("Solver"), loc="left", fontsize=10)
 
 
-def draw_legend(results: "Sequence[StabilityMap]", axes: "Axes") -> None:
+def draw_legend(results: Sequence[StabilityMap], axes: "Axes") -> None:
     """What colours, letters, line and crosses mean."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -84,29 +71,17 @@ def draw_legend(results: "Sequence[StabilityMap]", axes: "Axes") -> None:
     ]
     handles.append(Line2D([], [], color="black", lw=1.8, label="2 / omega max of the start, by power iteration"))
     if any(np.isfinite(r.bounds).any() for r in results):
-        handles.append(
-            Line2D([], [], color="black", marker="x", ms=8, lw=0, label="up to here bounded, refusal overridden")
-        )
+        label = "up to here bounded, refusal overridden"
+        handles.append(Line2D([], [], color="black", marker="x", ms=8, lw=0, label=label))
     axes.axis("off")
     axes.legend(handles=handles, loc="center left", frameon=False, fontsize=9, handlelength=1.6, labelspacing=0.9)
 
 
 def write_maps(results: list, folder: str | Path, name: str) -> list[str]:
     """stability_<name>.png, .csv, .json of all solvers on one axis in a folder; returns their names."""
-    stem = Path(folder) / f"stability_{name}"
-    draw_maps(results, stem.with_suffix(".png"))
-    write_csv([row for result in results for row in result.rows()], stem.with_suffix(".csv"))
-    write_json(
-        {
-            r.solver: dict(
-                axis=r.axis.name,
-                values=list(r.axis.values),
-                limits_s=list(r.limits),
-                runs=r.rows(),
-                bounded_up_to_s=[None if np.isnan(b) else b for b in r.bounds],
-            )
-            for r in results
-        },
-        stem.with_suffix(".json"),
-    )
-    return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]
+    rows, record = [row for result in results for row in result.rows()], {}
+    for r in results:
+        bounds = [None if np.isnan(b) else b for b in r.bounds]
+        of_axis = dict(axis=r.axis.name, values=list(r.axis.values), limits_s=list(r.limits))
+        record[r.solver] = of_axis | dict(runs=r.rows(), bounded_up_to_s=bounds)
+    return write_results(Path(folder) / f"stability_{name}", lambda path: draw_maps(results, path), rows, record)

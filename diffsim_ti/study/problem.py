@@ -103,13 +103,8 @@ class Problem:
 
     def quick(self) -> "Problem":
         """The same with its smallest meshes, of the first pattern and kind of elements."""
-        return replace(
-            self,
-            cells=self.cells[:2],
-            patterns=self.patterns[:1],
-            elements=self.elements[:1],
-            reference_cells=self.reference_cells and self.reference_cells[:3],
-        )
+        few = dict(cells=self.cells[:2], patterns=self.patterns[:1], elements=self.elements[:1])
+        return replace(self, reference_cells=self.reference_cells and self.reference_cells[:3], **few)
 
     @classmethod
     def of_scene(
@@ -138,23 +133,12 @@ class Problem:
             return out
 
         title = f"{name}: {scene.mesh.num_tetrahedra} tetrahedra, {duration:g} s"
+        own = dict(cells=(0,), patterns=("own mesh",), origin=origin)
         if gradient is None:
-            own = dict(cells=(0,), patterns=("own mesh",), origin=origin)
             return cls(name, title, "error of motion", build, duration, moved, frames, **own)
-        return cls(
-            f"{name}-{gradient}",
-            title,
-            f"error of the gradient by {gradient}",
-            build,
-            duration,
-            lambda _, gradients: np.atleast_1d(gradients[gradient]),
-            frames,
-            adjoint=adjoint,
-            inputs=(gradient,),
-            cells=(0,),
-            patterns=("own mesh",),
-            origin=origin,
-        )
+        name, own = f"{name}-{gradient}", own | dict(adjoint=adjoint, inputs=(gradient,))
+        number = lambda _, gradients: np.atleast_1d(gradients[gradient])  # noqa: E731
+        return cls(name, title, f"error of the gradient by {gradient}", build, duration, number, frames, **own)
 
 
 def _again(origin: tuple, changed: dict) -> Problem:

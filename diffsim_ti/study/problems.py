@@ -22,16 +22,8 @@ def oscillator() -> Problem:
 
     def scene(cells, pattern, precision, **element):
         mesh = TetrahedralMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, height]], [[0, 1, 2, 3]])
-        start = mesh.vertices + reach * np.eye(4, 3, -3)
-        return Scene(
-            mesh,
-            StableNeoHookean(E, 0.0),
-            density,
-            fixed=[0, 1, 2],
-            initial_positions=start,
-            precision=precision,
-            **element,
-        )
+        how = dict(initial_positions=mesh.vertices + reach * np.eye(4, 3, -3), precision=precision) | element
+        return Scene(mesh, StableNeoHookean(E, 0.0), density, fixed=[0, 1, 2], **how)
 
     times = np.linspace(0, time, 17)
     return Problem(
@@ -75,10 +67,8 @@ LAME = dict(E=1e5, density=1000.0, reach=1e-3)  # the reach is so small that wha
 def lame_scene(nu: float, cells: int, pattern: str, precision: str, order: int = 1, **element) -> Scene:
     """A free cube of 1 m in its Lame mode."""
     mesh = of_order(TetrahedralMesh.create_cube(cells + 1, 1.0, pattern), order)
-    start = mesh.vertices + LAME["reach"] * lame_mode(mesh.vertices)
-    return Scene(
-        mesh, StableNeoHookean(LAME["E"], nu), LAME["density"], initial_positions=start, precision=precision, **element
-    )
+    how = dict(initial_positions=mesh.vertices + LAME["reach"] * lame_mode(mesh.vertices), precision=precision)
+    return Scene(mesh, StableNeoHookean(LAME["E"], nu), LAME["density"], **how, **element)
 
 
 def lame_omega(nu: float) -> float:
@@ -146,10 +136,8 @@ def fit_oscillation(times: np.ndarray, q: np.ndarray, guess: float) -> np.ndarra
         wave = np.exp(-p[1] * times)[:, None] * np.stack([np.cos(p[0] * times), np.sin(p[0] * times)], 1)
         return wave @ np.linalg.lstsq(wave, q, rcond=None)[0] - q
 
-    start = min(
-        ([guess * s, guess * d] for s in (0.7, 0.85, 1.0, 1.2, 1.5) for d in (0.0, 0.2)),
-        key=lambda p: (remainder(p) ** 2).sum(),
-    )
+    near = ([guess * s, guess * d] for s in (0.7, 0.85, 1.0, 1.2, 1.5) for d in (0.0, 0.2))
+    start = min(near, key=lambda p: (remainder(p) ** 2).sum())
     return least_squares(remainder, start, x_scale=guess, xtol=1e-12, ftol=1e-12, gtol=1e-12).x
 
 
@@ -216,17 +204,9 @@ def bounce_scene(precision: str, speed: float, **element) -> Scene:
     It is the apex of a tetrahedron too soft to be felt (1e-6 Pa), hanging from three fixed vertices.
     """
     mesh = TetrahedralMesh([[0, 1, 0], [1, 1, 0], [0, 1, 1], [0, 0.015, 0]], [[0, 1, 2, 3]], fix_orientation=True)
-    velocities = -speed * np.eye(4, 3, -3)[:, [1, 0, 2]]
-    return Scene(
-        mesh,
-        StableNeoHookean(1e-6, 0.0),
-        4 / mesh.volume,
-        Ground(0.0, 1e4, 0.01),
-        fixed=[0, 1, 2],
-        initial_velocities=velocities,
-        precision=precision,
-        **element,
-    )
+    how = dict(initial_velocities=-speed * np.eye(4, 3, -3)[:, [1, 0, 2]], precision=precision) | element
+    floor = Ground(0.0, 1e4, 0.01)
+    return Scene(mesh, StableNeoHookean(1e-6, 0.0), 4 / mesh.volume, floor, fixed=[0, 1, 2], **how)
 
 
 def barrier_energy(d: float, stiffness: float = 1e4, width: float = 0.01) -> float:
@@ -246,6 +226,7 @@ def time_in_contact(speed: float, energy: Callable[[float], float] = barrier_ene
 
 
 BOUNCE_TIME = 0.03  # [s]
+ONE_MASS = dict(cells=(1,), patterns=("one mass",), largest_step=2e-3, levels=9)
 
 
 def bounce_height(speed: float, energy: Callable[[float], float] = barrier_energy) -> float:
@@ -265,10 +246,7 @@ def bounce(speed: float = 2.0) -> Problem:
         frames=1,
         exact=np.array([bounce_height(speed)]),
         scale=0.01,
-        cells=(1,),
-        patterns=("one mass",),
-        largest_step=2e-3,
-        levels=9,
+        **ONE_MASS,
     )
 
 
@@ -286,10 +264,7 @@ def bounce_gradient(speed: float = 2.0) -> Problem:
         exact=np.array([-1.0]),
         adjoint=FrameLoss.end(height, 1),
         inputs=("initial_positions",),
-        cells=(1,),
-        patterns=("one mass",),
-        largest_step=2e-3,
-        levels=9,
+        **ONE_MASS,
     )
 
 
@@ -322,16 +297,8 @@ def identify() -> Problem:
     )
 
 
-PROBLEMS = {
-    "oscillator": oscillator,
-    "lame": lame,
-    "lame-gradient": lame_gradient,
-    "beam": beam,
-    "sag": sag,
-    "bounce": bounce,
-    "bounce-gradient": bounce_gradient,
-    "identify": identify,
-}
+MAKERS = (oscillator, lame, lame_gradient, beam, sag, bounce, bounce_gradient, identify)
+PROBLEMS = {make.__name__.replace("_", "-"): make for make in MAKERS}
 
 
 def problem(name: str) -> Problem:

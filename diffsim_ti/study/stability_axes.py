@@ -76,18 +76,12 @@ def body(
     shaken by random velocities of 0.1 % of the speed of sound so that every mode takes part."""
     mesh = TetrahedralMesh.create_box(cells + 1, (0.2, 0.2 * flat, 0.2), "five").translated((0, lift, 0))
     shake = 1e-3 * np.sqrt(E / 1000.0) * np.random.default_rng(0).standard_normal(mesh.vertices.shape)
-    start, material = mesh.vertices * [1, squeeze, 1], SmithNeoHookean(E, nu)
+    start = dict(initial_positions=mesh.vertices * [1, squeeze, 1], initial_velocities=shake - [0, speed, 0])
+    law = SmithNeoHookean(E, nu)
+    law = KelvinVoigt(law, time=viscous_time) if viscous_time else law
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # nu near 1/2 and slivers are what is looked at
-        return Scene(
-            mesh,
-            KelvinVoigt(material, time=viscous_time) if viscous_time else material,
-            1000.0,
-            terms,
-            initial_positions=start,
-            initial_velocities=shake - [0, speed, 0],
-            precision="f64",
-        )
+        return Scene(mesh, law, 1000.0, terms, precision="f64", **start)
 
 
 def impact(speed: float) -> Scene:
@@ -104,8 +98,7 @@ def viscous(ratio: float) -> Scene:
 
 def pulled(ratio: float) -> Scene:
     """The cube, its muscles let go at once: fibres along y all through it, which pull with that share of Young's modulus."""
-    E = 1e5
-    return body(E=E, terms=[Muscle([0, 1, 0], ratio * E, 1.0)])
+    return body(E=1e5, terms=[Muscle([0, 1, 0], ratio * 1e5, 1.0)])
 
 
 def rubbing(friction: float) -> Scene:
@@ -119,21 +112,15 @@ def rubbing(friction: float) -> Scene:
     return Scene(both, material, 1000.0, [contact], initial_velocities=velocity, precision="f64")
 
 
+POISSON = 0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.495, 0.499
+FLAT = 1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01
+STRETCH = 1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3
 AXES = {
     "stiffness": Axis("Young's modulus", "Pa", tuple(10.0 ** np.arange(3, 8.1, 1.0)), lambda E: body(E=E)),
-    "nu": Axis(
-        "Poisson's ratio", "-", (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.495, 0.499), lambda nu: body(nu=nu)
-    ),
+    "nu": Axis("Poisson's ratio", "-", POISSON, lambda nu: body(nu=nu)),
     "impact": Axis("speed of impact", "m/s", (0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0), impact),
-    "quality": Axis(
-        "height of the elements over their width",
-        "-",
-        (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01),
-        lambda flat: body(flat=flat),
-    ),
-    "compression": Axis(
-        "stretch at the start", "-", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3), lambda s: body(squeeze=s)
-    ),
+    "quality": Axis("height of the elements over their width", "-", FLAT, lambda flat: body(flat=flat)),
+    "compression": Axis("stretch at the start", "-", STRETCH, lambda s: body(squeeze=s)),
     "viscosity": Axis("damping ratio of the fastest motion", "-", (0.01, 0.1, 0.3, 1.0, 3.0, 20.0), viscous),
     "activation": Axis("pull of muscles over Young's modulus", "-", (0.01, 0.03, 0.1, 0.3, 0.5, 1.0, 2.0), pulled),
     "friction": Axis("friction of soft on soft", "-", (0.0, 0.1, 0.3, 0.6, 1.0, 10.0), rubbing),

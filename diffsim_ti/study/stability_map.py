@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -60,14 +60,11 @@ def judge(scene: Scene, kind: type[Solver], dt: float, steps: int = 200, overrid
                     break
     except (ValueError, FloatingPointError) as error:
         return Run("raises", said=f"{type(error).__name__}: {error}")
-    warned = [
-        str(w.message) for w in said if "energy may be gained" in str(w.message) or "has gained" in str(w.message)
-    ]
-    if behind > 0:
-        said = f"vertices are {behind:.3g} m behind an obstacle"
-        return Run("raises", rise, change, warned[0]) if warned else Run("wrong silently", rise, change, said)
-    if not rise <= GAINS:
-        return Run("raises", rise, change, warned[0]) if warned else Run("wrong silently", rise, change, "it grew")
+    texts = [str(warning.message) for warning in said]
+    warned = [text for text in texts if "energy may be gained" in text or "has gained" in text]
+    if behind > 0 or not rise <= GAINS:
+        wrong = f"vertices are {behind:.3g} m behind an obstacle" if behind > 0 else "it grew"
+        return Run("raises", rise, change, warned[0]) if warned else Run("wrong silently", rise, change, wrong)
     if (still_kept - kept) / scale < -LOSES:
         return Run("loses energy", rise, change)
     return Run("accurate" if change < ACCURATE else "bounded", rise, change)
@@ -90,7 +87,7 @@ def measure(simulator: Simulator) -> tuple[float, float, float, float]:
         simulator.step()
         total = kept = float(energy) - given
         if solver.explicit:
-            kept += kept_energy(solver, mass, u, v, simulator.displacements - u, simulator.velocities - v)
+            kept += kept_energy(solver, mass, v, simulator.displacements - u, simulator.velocities - v)
         moving = float(sum(part for name, part in energy.parts.items() if name != "gravity"))
         return total, moving, kept, given
 
@@ -101,9 +98,7 @@ def given_by_muscles(simulator: Simulator) -> float:
     return -hosts.load_energy(simulator.displacements.astype(float))
 
 
-def kept_energy(
-    solver: Solver, mass: np.ndarray, u: np.ndarray, v: np.ndarray, du: np.ndarray, dv: np.ndarray
-) -> float:
+def kept_energy(solver: Solver, mass: np.ndarray, v: np.ndarray, du: np.ndarray, dv: np.ndarray) -> float:
     """What an explicit solver keeps besides the energy H, exactly for linear forces f:
 
     symplectic Euler H + (h / 2) v . f, velocity Verlet H - (h^2 / 8) f . f / m. Forces are those that made the step.
@@ -169,18 +164,8 @@ class StabilityMap:
     def rows(self) -> list[dict]:
         """One row per run, for a table."""
         return [
-            dict(
-                solver=self.solver,
-                axis=self.axis.name,
-                value=value,
-                dt=share * limit,
-                share=share,
-                limit=limit,
-                outcome=run.outcome,
-                rise=run.rise,
-                change=run.change,
-                said=run.said,
-            )
+            dict(solver=self.solver, axis=self.axis.name, value=value, dt=share * limit, share=share, limit=limit)
+            | asdict(run)
             for share, row in zip(self.shares, self.runs)
             for value, limit, run in zip(self.axis.values, self.limits, row)
         ]

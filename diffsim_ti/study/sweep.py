@@ -39,9 +39,8 @@ class Settings:
         dt, substeps = self.duration / self.frames, 1
         if self.solver.explicit:
             substeps = int(np.ceil(dt / (SHARE * element_limit(scene, scene.inputs.values | values).dt)))
-        solver = self.solver(
-            scene, dt=dt, substeps=substeps, **({"check_start": False} if self.solver.explicit else {})
-        )
+        unchecked = {"check_start": False} if self.solver.explicit else {}
+        solver = self.solver(scene, dt=dt, substeps=substeps, **unchecked)
         return Rollout(solver, self.frames, save_every=1)
 
 
@@ -169,12 +168,10 @@ def _row(make, results: Callable, settings: Settings, point: dict) -> dict:
                 plain, part = split_name(name)
                 plain = ALIASES.get(plain, plain)
                 values[plain] = x if part is None else values.get(plain, {}) | {part: x}
-            rollout = made if isinstance(made, Rollout) else settings.rollout(made, _plain(made, values))
+            rollout = made
+            if isinstance(made, Scene):
+                checked = made.inputs.check(spread_all(made, made.inputs.values, values)[0])
+                rollout = settings.rollout(made, checked)
             return point | {name: float(x) for name, x in results(rollout.forward(**values)).items()}
     except (ValueError, FloatingPointError) as error:
         return point | {"said": f"{type(error).__name__}: {error}"}
-
-
-def _plain(scene: Scene, values: dict) -> dict:
-    """Values as arrays, checked."""
-    return scene.inputs.check(spread_all(scene, scene.inputs.values, values)[0])

@@ -5,12 +5,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.study.charts import save, write_csv, write_json
+from diffsim_ti.study.charts import save, without_nan, write_results
+from diffsim_ti.study.sweep import Sweep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from diffsim_ti.study.sweep import Sweep
 
 
 def is_log(values) -> bool:
@@ -19,7 +18,7 @@ def is_log(values) -> bool:
     return len(x) > 2 and bool((x > 0).all()) and x.max() > 20 * x.min()
 
 
-def draw_sweep(sweep: "Sweep", path: str | Path) -> None:
+def draw_sweep(sweep: Sweep, path: str | Path) -> None:
     """A panel for each result: over one number a line, over two a map, over more lines over the last one; refused points are
     crosses at the foot of the panel, or white."""
     from matplotlib.figure import Figure
@@ -37,18 +36,15 @@ def draw_sweep(sweep: "Sweep", path: str | Path) -> None:
     save(figure, path)
 
 
-def _lines(axes: "Axes", sweep: "Sweep", name: str) -> None:
+def _lines(axes: "Axes", sweep: Sweep, name: str) -> None:
     along = list(sweep.over)[-1]
     x, values = np.array(sweep.over[along]), sweep.column(name)
     values = values.reshape(-1, len(x))
     for k, row in enumerate(values):
-        axes.plot(
-            x, row, "o-", ms=3.5, lw=1.2, color="#0072B2", alpha=1 if len(values) == 1 else 0.3 + 0.7 * k / len(values)
-        )
-    refused = x[np.isnan(values).any(0)]
-    axes.plot(
-        refused, np.zeros(len(refused)), "x", color="#D55E00", transform=axes.get_xaxis_transform(), clip_on=False
-    )
+        alpha = 1 if len(values) == 1 else 0.3 + 0.7 * k / len(values)
+        axes.plot(x, row, "o-", ms=3.5, lw=1.2, color="#0072B2", alpha=alpha)
+    refused, foot = x[np.isnan(values).any(0)], dict(transform=axes.get_xaxis_transform(), clip_on=False)
+    axes.plot(refused, np.zeros(len(refused)), "x", color="#D55E00", **foot)
     axes.set_xlabel(along)
     axes.set_xscale("log" if is_log(x) else "linear")
     axes.set_yscale("log" if is_log(values[np.isfinite(values)]) else "linear")
@@ -57,7 +53,7 @@ def _lines(axes: "Axes", sweep: "Sweep", name: str) -> None:
         axes.spines[side].set_visible(False)
 
 
-def _map(axes: "Axes", sweep: "Sweep", name: str) -> None:
+def _map(axes: "Axes", sweep: Sweep, name: str) -> None:
     (first, y), (second, x) = sweep.over.items()
     drawn = axes.pcolormesh(x, y, sweep.column(name), shading="nearest", cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes)
@@ -66,20 +62,10 @@ def _map(axes: "Axes", sweep: "Sweep", name: str) -> None:
     axes.set_yscale("log" if is_log(y) else "linear")
 
 
-def write_sweep(sweep: "Sweep", folder: str | Path) -> list[str]:
+def write_sweep(sweep: Sweep, folder: str | Path) -> list[str]:
     """sweep.csv, .json, and .png where a run gave a number, in a folder; returns their names."""
     stem = Path(folder) / "sweep"
-    rows = [
-        {k: (None if isinstance(x, float) and not np.isfinite(x) else x) for k, x in row.items()} for row in sweep.rows
-    ]
-    write_csv(rows, _made(stem.with_suffix(".csv")))
-    write_json(dict(over=sweep.over, results=sweep.results, rows=rows), stem.with_suffix(".json"))
-    if not sweep.results:
-        return [str(stem.with_suffix(s)) for s in (".csv", ".json")]
-    draw_sweep(sweep, stem.with_suffix(".png"))
-    return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]
-
-
-def _made(path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
+    rows = [without_nan(row) for row in sweep.rows]
+    record = dict(over=sweep.over, results=sweep.results, rows=rows)
+    files = write_results(stem, lambda path: draw_sweep(sweep, path) if sweep.results else None, rows, record)
+    return files if sweep.results else files[1:]

@@ -213,11 +213,8 @@ class Trials:
         if not known and not kind.explicit:
             return self.spent > self.budget
         longer = self.duration / self.span
-        seconds = (
-            min(o.seconds / o.substeps for o in known) * substeps
-            if known
-            else self.explicit_cost * substeps * self.frames * longer * (3 if self.gradients else 1)
-        )
+        guess = self.explicit_cost * self.frames * longer * (3 if self.gradients else 1)
+        seconds = substeps * min((o.seconds / o.substeps for o in known), default=guess)
         trial, dearer = 3 * seconds / longer, best is not None and seconds > 12 * best.seconds
         if dearer or (self.spent + trial > self.budget and (known or best is not None)):
             step = self.span / self.frames / substeps
@@ -288,11 +285,8 @@ class Trials:
             f"{name} {times:.1f} times as long" for name, times in sorted(others.items(), key=lambda x: x[1])
         )
         share = best.substep / self.stable
-        limit = (
-            f"its step is {share:.2g} of the stable step {self.stable:.3g} s"
-            if best.solver.explicit
-            else f"its step is {share:.2g} times the explicit limit {self.stable:.3g} s"
-        )
+        of = "of the stable step" if best.solver.explicit else "times the explicit limit"
+        limit = f"its step is {share:.2g} {of} {self.stable:.3g} s"
         kept = plan.checkpoints
         again = "each step runs once more in the reverse sweep" if kept.num_segments > 1 else "all steps are kept"
         return [

@@ -14,6 +14,7 @@ from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver, stable_dt
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.study.charts import without_nan
 from diffsim_ti.study.executors import each
 from diffsim_ti.study.problem import VARIANTS, Problem, distance
 
@@ -84,19 +85,9 @@ class Chart:
 
     def record(self) -> dict:
         """Everything in numbers and words, as JSON takes it."""
-        rows = [
-            {k: (None if isinstance(v, float) and not np.isfinite(v) else v) for k, v in asdict(p).items()}
-            for p in self.points
-        ]
-        return dict(
-            problem=self.problem.name,
-            title=self.problem.title,
-            error=self.problem.error,
-            duration_s=self.problem.duration,
-            reference_error=self.reference_error,
-            points=rows,
-            left_out=self.left_out,
-        )
+        rows, problem = [without_nan(asdict(p)) for p in self.points], self.problem
+        of_problem = dict(problem=problem.name, title=problem.title, error=problem.error, duration_s=problem.duration)
+        return of_problem | dict(reference_error=self.reference_error, points=rows, left_out=self.left_out)
 
 
 def pareto_front(points: Iterable) -> list:
@@ -187,13 +178,7 @@ class Runs:
     """The runs of a chart, mesh by mesh; predicts what they cost and leaves out those beyond `limit` seconds each."""
 
     def __init__(
-        self,
-        problem: Problem,
-        solvers: Sequence[type[Solver]],
-        precisions: Sequence[str],
-        levels: int,
-        repeats: int,
-        limit: float,
+        self, problem: Problem, solvers: Sequence, precisions: Sequence[str], levels: int, repeats: int, limit: float
     ):
         self.problem, self.solvers, self.precisions = problem, solvers, precisions
         self.levels, self.repeats, self.limit = levels, repeats, limit
@@ -210,25 +195,11 @@ class Runs:
         out = []
         for precision in self.precisions:
             scene = self.problem.scene(cells, pattern, precision, **VARIANTS[element])
+            what = cells, pattern, element, precision, scene.mesh.num_tetrahedra
             for kind in self.solvers:
                 for k in choose_substeps(self.problem, scene, kind, self.levels):
                     total = k * self.problem.frames
-                    out.append(
-                        (
-                            Point(
-                                kind.__name__,
-                                cells,
-                                pattern,
-                                element,
-                                precision,
-                                scene.mesh.num_tetrahedra,
-                                self.problem.duration / total,
-                                total,
-                            ),
-                            kind,
-                            scene,
-                        )
-                    )
+                    out.append((Point(kind.__name__, *what, self.problem.duration / total, total), kind, scene))
         return out
 
     def predict(self, point: Point, explicit: bool) -> float:

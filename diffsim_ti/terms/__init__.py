@@ -22,51 +22,10 @@ from diffsim_ti.terms.term import Term, VertexForce
 from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
-LOADS = (
-    ExternalForce,
-    Traction,
-    Pressure,
-    BodyForce,
-    GasChamber,
-    FilledChamber,
-    Spring,
-    Cable,
-    Muscle,
-    Growth,
-    ElasticFoundation,
-)
+LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, Muscle)
+LOADS += (Growth, ElasticFoundation)
 TERMS = (Gravity, Drag, RotatingFrame, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact)
-__all__ = [
-    "Anchor",
-    "BodyForce",
-    "Box",
-    "Cable",
-    "Capsule",
-    "Chamber",
-    "Cylinder",
-    "Drag",
-    "ElasticFoundation",
-    "ExternalForce",
-    "FilledChamber",
-    "GasChamber",
-    "Gravity",
-    "Ground",
-    "Growth",
-    "HalfSpace",
-    "Load",
-    "MeshObstacle",
-    "Muscle",
-    "OBSTACLES",
-    "Obstacle",
-    "Pose",
-    "Pressure",
-    "RotatingFrame",
-    "SelfContact",
-    "Sphere",
-    "Spring",
-    "SurfaceDrag",
-    "Term",
-    "TERMS",
-    "Traction",
-    "VertexForce",
-]
+__all__ = ["Anchor", "BodyForce", "Box", "Cable", "Capsule", "Chamber", "Cylinder", "Drag", "ElasticFoundation"]
+__all__ += ["ExternalForce", "FilledChamber", "GasChamber", "Gravity", "Ground", "Growth", "HalfSpace", "Load"]
+__all__ += ["MeshObstacle", "Muscle", "OBSTACLES", "Obstacle", "Pose", "Pressure", "SelfContact", "Sphere", "Spring"]
+__all__ += ["RotatingFrame", "SurfaceDrag", "Term", "TERMS", "Traction", "VertexForce"]

@@ -12,14 +12,15 @@ from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.ten_nodes import triangles_of
+from diffsim_ti.terms.gas_law import gas_law
 from diffsim_ti.terms.marks import pressing
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
+from diffsim_ti.terms.term import OnSurface, Term
 
 ATMOSPHERE = 101325.0  # [Pa]
 
 
-class Chamber(Term):
+class Chamber(GivenOverTime, OnSurface, Term):
     """A cavity, by a surface of the body around it, whose filling pushes on it with one pressure.
 
     The surface is closed, or has rims that are held wholly or move in planes (supports by component), which close it there.
@@ -30,40 +31,23 @@ class Chamber(Term):
     """
 
     holds = False  # whether it holds a volume
-    shape = ()  # of what is given over time
     num_numbers = 0  # what is read of it lies in rows of its own
     row_names: tuple[str, ...] = ()  # of its numbers, each of which has a row in time
 
     def __init__(self, argument: str, given: OverTime, unit: str, plain: str, surface, name: str | None, *more: Input):
         described = replace(amount(argument, given, (), unit, plain), range=POSITIVE)
         super().__init__(described, *more, name=name)
-        self.given, self.keyed, self.surface = given, is_keyed(given), surface
-        if self.keyed:
-            self.rows([0.0])  # refuses what does not fit
-
-    @property
-    def plain(self) -> str:
-        """Plain name of what is given over time."""
-        return self.described[0].plain
-
-    def rows(self, times: ArrayLike) -> np.ndarray:
-        """That at each time [s], where it is keyed."""
-        return rows_at(f"{type(self).__name__}: {self.plain}", self.given, times, ())
+        self.surface = surface
+        self._give(given)
 
     def check(self, mesh: TetrahedralMesh) -> None:
         if len(self.faces(mesh)) == 0:
             raise ValueError(f"{type(self).__name__}: its surface is empty; name a set that has members")
 
-    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Its surface, as vertex indices, normals into it, shape (k, 3) or (k, 6)."""
-        return mesh.faces_of(self.surface)
-
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Chamber":
-        out, mesh, supports = copy(self), scene.mesh, scene.supports
-        free = supports.freedom(mesh.num_vertices)
-        called = f"{type(self).__name__}" + (f" {self.name!r}" if self.name else "")
-        moves = scene.motion is not None
-        out.enclosure = Enclosure.of(self.faces(mesh), free, mesh.vertices, called, moves)
+        out, mesh, called = copy(self), scene.mesh, type(self).__name__ + (f" {self.name!r}" if self.name else "")
+        free = scene.supports.freedom(mesh.num_vertices)
+        out.enclosure = Enclosure.of(self.faces(mesh), free, mesh.vertices, called, moves=scene.motion is not None)
         return out
 
     def rows_in_time(self, own: str) -> list[str]:
@@ -71,17 +55,12 @@ class Chamber(Term):
         return [f"{own} {row} in time" for row in self.row_names]
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
-        volume = f"{own} volume"
-        sources = [volume if row == "rest" else names[i.plain] for row, i in zip(self.row_names, self._described_rows)]
+        volume, described = f"{own} volume", iter(self.described)
+        sources = [volume if row == "rest" else names[next(described).plain] for row in self.row_names]
         out = [RestVolume(self.enclosure, volume)]
         for k, (source, row) in enumerate(zip(sources, self.rows_in_time(own))):
             out.append(InTime(source, row, 1, self.keyed and k == 0))
         return out
-
-    @property
-    def _described_rows(self) -> list:
-        described = iter(self.described)
-        return [None if row == "rest" else next(described) for row in self.row_names]
 
 
 class GasChamber(Chamber):
@@ -100,7 +79,7 @@ class GasChamber(Chamber):
     Volume-dependent pressure loading and its influence on the stability of structures, doi:10.1002/nme.561.
     """
 
-    row_names = ("pressure", "outside", "rest", "exponent")
+    row_names, stiffest = ("pressure", "outside", "rest", "exponent"), staticmethod(np.max)
 
     def __init__(
         self,
@@ -118,9 +97,9 @@ class GasChamber(Chamber):
 
     def drawn(self, moment):
         p, outside, exponent = (float(moment.values[i.plain]) for i in self.described)
-        ratio = self.enclosure.volume(moment.mesh.vertices) / self.enclosure.volume(moment.positions)
+        V0, V = (self.enclosure.volume(x) for x in (moment.mesh.vertices, moment.positions))
         label = f"{self.name or 'gas'} [Pa]"
-        return pressing(label, moment, triangles_of(self.faces(moment.mesh)), p * ratio**exponent - outside)
+        return pressing(label, moment, triangles_of(self.faces(moment.mesh)), gas_law(p, outside, V0, exponent, V)[0])
 
 
 class FilledChamber(Chamber):

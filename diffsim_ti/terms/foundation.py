@@ -1,8 +1,5 @@
 """An elastic foundation on a surface."""
 
-from copy import copy
-
-import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import present
@@ -10,11 +7,11 @@ from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.foundation import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import MOST, Points, spread
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import OnMesh, OnSurface, Term
 from diffsim_ti.terms.ties import AT_LEAST_0
 
 
-class ElasticFoundation(Term):
+class ElasticFoundation(OnSurface, OnMesh, Term):
     """Springs under a surface that pull it back to where it is at rest (Winkler): on each vertex f = -K u, u its
     displacement from the rest shape,
 
@@ -48,14 +45,6 @@ class ElasticFoundation(Term):
         super().__init__(*both, name=name)
         self.surface = surface
 
-    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, shape (k, 3) or (k, 6)."""
-        return mesh.faces_of(self.surface)
-
-    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Vertices that it holds."""
-        return np.unique(self.faces(mesh))
-
     def sizes(self, mesh):
         return {"k": len(self.faces(mesh))}
 
@@ -65,14 +54,8 @@ class ElasticFoundation(Term):
             raise ValueError("ElasticFoundation holds nothing: the set is empty; name a set that has members")
         for i in self.described:
             if i.value.ndim and len(i.value) != count:
-                raise ValueError(
-                    f"ElasticFoundation: {i.name} has {len(i.value)} numbers for {count} {kind}; give one or {count}"
-                )
-
-    def settled(self, scene, density, initial_positions, initial_velocities) -> "ElasticFoundation":
-        out = copy(self)
-        out.mesh = scene.mesh
-        return out
+                given = f"{i.name} has {len(i.value)} numbers"
+                raise ValueError(f"ElasticFoundation: {given} for {count} {kind}; give one or {count}")
 
     def drawn(self, moment):
         vertices = self.indices(moment.mesh)

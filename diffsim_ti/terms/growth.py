@@ -9,10 +9,9 @@ from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import Input, Link, Range
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
-from diffsim_ti.terms.term import Term
-
-PER = ("all", "set", "tetrahedron")
+from diffsim_ti.terms.of_tetrahedra import OfTetrahedra
+from diffsim_ti.terms.over_time import OverTime
+from diffsim_ti.terms.term import Term, nonempty
 
 
 def _beyond(x: np.ndarray) -> np.ndarray:
@@ -22,7 +21,7 @@ def _beyond(x: np.ndarray) -> np.ndarray:
 BEYOND = Range("> -1, which leaves nothing of the body", _beyond)
 
 
-class Growth(Term):
+class Growth(OfTetrahedra, Term):
     """Growth, swelling or thermal strain over time, added to that of the material `Grown`: F_g = (1 + g) I and
 
         psi = det(F_g) psi_material(F F_g^-1) [J/m^3],    g = growth of `Grown` + sum of all Growth terms,
@@ -51,52 +50,23 @@ class Growth(Term):
         per: str = "all",
         name: str | None = None,
     ):
-        if per not in PER:
-            raise ValueError(f"Growth: per must be one of {', '.join(map(repr, PER))}, got {per!r}")
-        if per == "set" and (isinstance(tetrahedra, str) or not all(isinstance(s, str) for s in tetrahedra or [0])):
-            raise ValueError(f'Growth: per="set" takes tetrahedra=["left", "right"], names of sets, got {tetrahedra!r}')
         present("growth", growth)
-        shape = () if per == "all" else (len(tetrahedra),) if per == "set" else ("k",)
-        self.given, self.keyed, self.per, self.tetrahedra = growth, is_keyed(growth), per, tetrahedra
-        self.plain, self.ndim = "growth_over_time", len(shape) + 1
-        described = amount("growth", growth, shape, "-", self.plain)
+        described, _ = self._take("growth", growth, "growth_over_time", tetrahedra, per)
         own = {name: getattr(described, name) for name in ("name", "value", "shapes", "unit", "plain", "label")}
         super().__init__(Input(**own, range=BEYOND), name=name)
-        if self.keyed:
-            if not np.all(_beyond(self.rows([0.0]))):
-                raise ValueError(f"Growth: growth must be {BEYOND.words}")
-
-    def rows(self, times: ArrayLike) -> np.ndarray:
-        """Growth [-] at times [s], a row for each."""
-        at = self.given(0.0) if callable(self.given) else np.asarray(self.given[1])[0]
-        return rows_at("Growth: growth", self.given, times, np.shape(at))
-
-    def groups(self, mesh: TetrahedralMesh) -> tuple[np.ndarray, np.ndarray]:
-        """(tetrahedra, which number each has)"""
-        if self.per == "set":
-            each = [mesh.tetrahedron_indices(own) for own in self.tetrahedra]
-            return np.concatenate(each), np.repeat(np.arange(len(each)), [len(own) for own in each])
-        every = np.arange(mesh.num_tetrahedra)
-        chosen = every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra)
-        return chosen, np.arange(len(chosen)) if self.per == "tetrahedron" else np.zeros(len(chosen), np.int64)
+        if self.keyed and not np.all(_beyond(self.rows([0.0]))):
+            raise ValueError(f"Growth: growth must be {BEYOND.words}")
 
     @property
     def everywhere(self) -> bool:
         """Whether all grow alike."""
         return self.per == "all" and self.tetrahedra is None
 
-    def sizes(self, mesh):
-        return {"k": len(self.groups(mesh)[0])}
-
     def check(self, mesh: TetrahedralMesh) -> None:
-        chosen, _ = self.groups(mesh)
-        if len(chosen) == 0:
-            raise ValueError("Growth acts on nothing: the set is empty; name a set that has members")
+        chosen = nonempty(self, self.groups(mesh)[0])
         if len(np.unique(chosen)) < len(chosen):
             raise ValueError("Growth: a tetrahedron is in two of its sets; list two Growth terms, which add up")
-        count = () if self.per == "all" else (len(self.tetrahedra) if self.per == "set" else len(chosen),)
-        given = None if self.keyed else self.described[0].value
-        last = self.rows([0.0]).shape[1:] if self.keyed else given.shape[given.ndim - len(count) :]
+        count, last = self._shapes(chosen)
         if last != count:
             raise ValueError(f'Growth: per="{self.per}" takes growth of shape {count} here, got {last}')
 

@@ -1,7 +1,5 @@
 """Loads on surfaces and volumes: traction, pressure, body force."""
 
-from copy import copy
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -10,11 +8,11 @@ from diffsim_ti.inputs.loads import ConsistentShares, InTime, Spread, VertexArea
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import arrows, pressing
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
+from diffsim_ti.terms.term import OnMesh, OnSurface, Term, nonempty
 
 
-class Load(Term):
+class Load(GivenOverTime, OnMesh, Term):
     """An amount per area or volume, over time. A scene may list several of a kind: they add up.
 
     Subclasses say what it is: its `argument`, what was `given`, its `unit` and its plain name.
@@ -23,35 +21,17 @@ class Load(Term):
     """
 
     num_numbers = 0  # what kernels read of it lies in arrays of its own
-    shape: tuple = ()  # of the amount
 
     def __init__(self, argument: str, given: OverTime, unit: str, plain: str, name: str | None):
         super().__init__(amount(argument, given, self.shape, unit, plain), name=name)
-        self._given, self.keyed = given, is_keyed(given)
-        if self.keyed:
-            self.rows([0.0])  # refuses what does not fit
-
-    @property
-    def plain(self) -> str:
-        """Plain name of its input."""
-        return self.described[0].plain
-
-    def rows(self, times: ArrayLike) -> np.ndarray:
-        """Its amount at each time [s], where it is keyed."""
-        return rows_at(f"{type(self).__name__}: {self.plain}", self._given, times, self.shape)
-
-    def settled(self, scene, density, initial_positions, initial_velocities) -> "Load":
-        """For a mesh, whose sets it names."""
-        out = copy(self)
-        out.mesh = scene.mesh
-        return out
+        self._give(given)
 
     def in_time(self, names: dict[str, str], own: str) -> Link:
         """Its amount in time, as inputs/loads.py has it, by the name `own` in time."""
         return InTime(names[self.plain], f"{own} in time", len(self.shape) + 1, self.keyed)
 
 
-class Traction(Load):
+class Traction(OnSurface, Load):
     """Force per area of the surface at rest, t [N/m^2], whatever becomes of the surface: a dead load, f_i = t A_i.
 
     A_i is the integral of the shape function of vertex i over the surface: a third of the area of each triangle around it;
@@ -82,15 +62,7 @@ class Traction(Load):
         self.surface = surface
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        self.faces(mesh)
-
-    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, shape (k, 3) or (k, 6)."""
-        return _some(self, mesh.faces_of(self.surface))
-
-    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Vertices that are acted upon."""
-        return np.unique(self.faces(mesh))
+        nonempty(self, self.faces(mesh))
 
     def drawn(self, moment):
         vertices = self.indices(moment.mesh)
@@ -134,7 +106,7 @@ class BodyForce(Load):
     def chosen(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Tetrahedra that are acted upon."""
         every = np.arange(mesh.num_tetrahedra)
-        return _some(self, every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra))
+        return nonempty(self, every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra))
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Vertices that are acted upon."""
@@ -153,7 +125,7 @@ class BodyForce(Load):
         return [self.in_time(names, own), shares, Spread((f"{own} in time", weights), f"{own} forces")]
 
 
-class Pressure(Load):
+class Pressure(OnSurface, Load):
     """Pressure p [Pa] on the surface as it is now: it follows area and normal, f_a = -p n / 3 at each corner of a triangle.
 
     n = (x_1 - x_0) x (x_2 - x_0) / 2 points outwards, so that positive pressures push inwards; on faces of six nodes f_a is
@@ -175,11 +147,7 @@ class Pressure(Load):
         self.surface = surface
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        self.faces(mesh)
-
-    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, normals outwards, shape (k, 3) or (k, 6)."""
-        return _some(self, mesh.faces_of(self.surface))
+        nonempty(self, self.faces(mesh))
 
     def rows_in_time(self, own: str) -> list[str]:
         """Names of the rows of its numbers, of which `own` is the beginning."""
@@ -191,9 +159,3 @@ class Pressure(Load):
     def drawn(self, moment):
         label, pressure = f"{self.name or 'pressure'} [Pa]", float(moment.values[self.plain])
         return pressing(label, moment, triangles_of(self.faces(moment.mesh)), pressure)
-
-
-def _some(load: Load, rows: np.ndarray) -> np.ndarray:
-    if len(rows) == 0:
-        raise ValueError(f"{type(load).__name__} acts on nothing: the set is empty; name a set that has members")
-    return rows

@@ -58,7 +58,7 @@ class MassScaling:
         mu, lam = material.lame(material.values(mesh))
         K = stiffness_at_rest(scene, mu, lam, scene.volume == "patches")
         rows = sums_of_rows(K)
-        (mass,) = LumpedMass(mesh).value(density, mesh.volumes)
+        (mass,) = LumpedMass(mesh).value(mesh.volumes, density)
         total, mass = mass.sum(), np.where(mass > 0, mass, 1.0)  # of vertices in no tetrahedron, whose rows are zero
         if not rows.any():  # all is held
             return cls(np.ones(len(mass)), 0.0, mass, K)

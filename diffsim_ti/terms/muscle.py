@@ -13,14 +13,13 @@ from diffsim_ti.inputs.ties import Segments, TieRows
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.terms.marks import MOST, Lines, spread
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.of_tetrahedra import OfTetrahedra
+from diffsim_ti.terms.over_time import OverTime
+from diffsim_ti.terms.term import Term, nonempty
 from diffsim_ti.terms.ties import AT_LEAST_0, Cable
 
-PER = ("all", "set", "tetrahedron")
 
-
-class Muscle(Cable):
+class Muscle(OfTetrahedra, Cable):
     """Fibres along a in tetrahedra, which add the energy alpha s (|F a| - 1) [J/m^3] and so the stress P = alpha s t a^T,
     t = F a / |F a|: a pull that turns with the fibre, whatever its length, in every substep and every Newton iteration.
 
@@ -49,61 +48,23 @@ class Muscle(Cable):
         per: str = "all",
         name: str | None = None,
     ):
-        if per not in PER:
-            raise ValueError(f"Muscle: per must be one of {', '.join(map(repr, PER))}, got {per!r}")
-        if per == "set" and (isinstance(tetrahedra, str) or not all(isinstance(s, str) for s in tetrahedra or [0])):
-            raise ValueError(f'Muscle: per="set" takes tetrahedra=["left", "right"], names of sets, got {tetrahedra!r}')
+        amount, shape = self._take("activation", activation, "activation", tetrahedra, per)
         a = numbers("Muscle: fibre", fibre)
         if a.shape[-1:] != (3,) or a.ndim > 2 or not np.all(np.isfinite(a)) or np.any(np.linalg.norm(a, axis=-1) == 0):
             raise ValueError(f"Muscle: fibre must be finite directions, shape (3,) or (k, 3), got shape {a.shape}")
-        shape = () if per == "all" else (len(tetrahedra),) if per == "set" else ("k",)
-        self.given, self.plain, self.keyed, self.per = activation, "activation", is_keyed(activation), per
         present("Muscle: stress", stress)
-        self.fibre, self.tetrahedra = a / np.linalg.norm(a, axis=-1, keepdims=True), tetrahedra
-        self.ndim = len(shape) + 1
-        inputs = (
-            amount("activation", activation, shape, "-", "activation"),
-            Input(
-                "stress",
-                stress,
-                ((),) if per == "all" else ((), shape),
-                "Pa",
-                AT_LEAST_0,
-                plain="muscle_stress",
-                label="stress",
-            ),
-        )
-        Term.__init__(self, *inputs, name=name)
-        if np.any((self.rows([0.0]) if self.keyed else inputs[0].value) < 0):
+        self.fibre, shapes = a / np.linalg.norm(a, axis=-1, keepdims=True), ((),) if per == "all" else ((), shape)
+        strength = Input("stress", stress, shapes, "Pa", AT_LEAST_0, plain="muscle_stress", label="stress")
+        Term.__init__(self, amount, strength, name=name)
+        if np.any((self.rows([0.0]) if self.keyed else amount.value) < 0):
             raise ValueError("Muscle: activation must be >= 0, for it pulls only")
 
-    def rows(self, times: ArrayLike) -> np.ndarray:
-        at = self.given(0.0) if callable(self.given) else np.asarray(self.given[1])[0]
-        return rows_at("Muscle: activation", self.given, times, np.shape(at))
-
-    def groups(self, mesh: TetrahedralMesh) -> tuple[np.ndarray, np.ndarray]:
-        """(tetrahedra, which activation each has)"""
-        if self.per == "set":
-            each = [mesh.tetrahedron_indices(own) for own in self.tetrahedra]
-            return np.concatenate(each), np.repeat(np.arange(len(each)), [len(own) for own in each])
-        every = np.arange(mesh.num_tetrahedra)
-        chosen = every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra)
-        return chosen, np.arange(len(chosen)) if self.per == "tetrahedron" else np.zeros(len(chosen), np.int64)
-
-    def sizes(self, mesh):
-        return {"k": len(self.groups(mesh)[0])}
-
     def check(self, mesh: TetrahedralMesh) -> None:
-        chosen, group = self.groups(mesh)
-        if len(chosen) == 0:
-            raise ValueError("Muscle acts on nothing: the set is empty; name a set that has members")
+        chosen = nonempty(self, self.groups(mesh)[0])
         if self.fibre.ndim == 2 and len(self.fibre) != len(chosen):
-            raise ValueError(
-                f"Muscle: fibre has {len(self.fibre)} directions for {len(chosen)} tetrahedra; give one or all"
-            )
-        count = () if self.per == "all" else (len(self.tetrahedra) if self.per == "set" else len(chosen),)
-        alpha, stress = (i.value for i in self.described)
-        last = self.rows([0.0]).shape[1:] if self.keyed else alpha.shape[alpha.ndim - len(count) :]
+            count = len(self.fibre)
+            raise ValueError(f"Muscle: fibre has {count} directions for {len(chosen)} tetrahedra; give one or all")
+        (count, last), stress = self._shapes(chosen), self.described[1].value
         if last != count or stress.shape not in ((), count):
             raise ValueError(
                 f'Muscle: per="{self.per}" takes activations of shape {count} here, one row or one for each step, got '
@@ -130,9 +91,8 @@ class Muscle(Cable):
     def drawn(self, moment):
         mesh, reference = moment.mesh, moment.mesh.reference
         nodes = mesh.elements[self.groups(mesh)[0]]
-        middles = np.einsum("qn,tni->tqi", reference.functions(reference.points), moment.positions[nodes]).reshape(
-            -1, 3
-        )
+        N = reference.functions(reference.points)
+        middles = np.einsum("qn,tni->tqi", N, moment.positions[nodes]).reshape(-1, 3)
         shown = spread(middles, MOST)
         half = (0.5 * self.paths(mesh).matrix(mesh.num_vertices)[1::2] @ moment.positions)[shown]
         return [Lines(self.name or "muscle", np.stack([middles[shown] - half, middles[shown] + half], 1))]

@@ -12,6 +12,26 @@ from diffsim_ti.inputs import Input
 OverTime = ArrayLike | Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike]
 
 
+class GivenOverTime:
+    """The part of a term whose first input is an amount over time, of a `shape`."""
+
+    shape: tuple = ()
+
+    def _give(self, given: OverTime) -> None:
+        self.given, self.keyed = given, is_keyed(given)
+        if self.keyed:
+            self.rows([0.0])  # refuses what does not fit
+
+    @property
+    def plain(self) -> str:
+        """Plain name of the input."""
+        return self.described[0].plain
+
+    def rows(self, times: ArrayLike) -> np.ndarray:
+        """The amount at each time [s], where it is keyed."""
+        return rows_at(f"{type(self).__name__}: {self.plain}", self.given, times, self.shape)
+
+
 def is_keyed(given: OverTime) -> bool:
     """Whether a load is given by a function or by keyframes, and so changes within steps."""
     return callable(given) or (isinstance(given, tuple) and len(given) == 2 and len(shape_of("times", given[0])) == 1)

@@ -1,5 +1,6 @@
 """Contact of the surface with itself, and of several bodies with each other."""
 
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -7,7 +8,8 @@ import numpy as np
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.terms.bow import warn_of_bow
+from diffsim_ti.mesh.collision_surface import cuts_of
+from diffsim_ti.mesh.face_points import bow
 from diffsim_ti.terms.described import positive
 from diffsim_ti.terms.term import Term
 
@@ -84,16 +86,22 @@ class SelfContact(Term):
     def _check_pairs(pairs: tuple) -> None:
         for pair in pairs:
             if not (isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(name, str) for name in pair)):
-                raise ValueError(
-                    f"SelfContact: friction needs pairs of names of sets, such as ('a', 'b'), got {pair!r}"
-                )
+                rule = "friction needs pairs of names of sets, such as ('a', 'b')"
+                raise ValueError(f"SelfContact: {rule}, got {pair!r}")
             if pair[0] != pair[1] and pair[::-1] in pairs:
-                raise ValueError(
-                    f"SelfContact: friction has {pair!r} and {pair[::-1]!r}, which are one pair: name it once"
-                )
+                both = f"{pair!r} and {pair[::-1]!r}"
+                raise ValueError(f"SelfContact: friction has {both}, which are one pair: name it once")
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        warn_of_bow(mesh, self)
+        width = float(self.values["self_contact_width"])
+        off = bow(mesh) / 4 ** cuts_of(mesh, self)  # so far faces may reach through
+        if off > width:
+            warnings.warn(
+                f"{type(self).__name__}: faces of this mesh are curved, and lie up to {off:.3g} m from the triangles that "
+                f"stand for each, more than the width {width:.3g} m: refine the mesh where it is curved, or take a wider "
+                "one",
+                stacklevel=3,
+            )
         if self.has_friction:
             self.labels(mesh)
 
@@ -104,15 +112,14 @@ class SelfContact(Term):
             return label[mesh.surface_vertices], np.zeros((1, 1), int)
         names = sorted({name for pair in self.rubbing for name in pair})
         for k, name in enumerate(names, start=1):
-            known = mesh.vertex_sets
-            members = known[name] if name in known else None
-            if members is None and name in mesh.tetrahedron_sets:
-                members = np.unique(mesh.elements[mesh.tetrahedron_sets[name]])
-            if members is None:
+            if name not in mesh.vertex_sets and name not in mesh.tetrahedron_sets:
                 raise ValueError(
                     f"SelfContact: friction names {name!r}, which is no set of vertices or tetrahedra of the mesh; it has "
-                    f"{sorted({*known, *mesh.tetrahedron_sets})}"
+                    f"{sorted({*mesh.vertex_sets, *mesh.tetrahedron_sets})}"
                 )
+            members = mesh.vertex_sets.get(name)
+            if members is None:
+                members = np.unique(mesh.elements[mesh.tetrahedron_sets[name]])
             if np.any(label[members] > 0):
                 other, i = names[int(label[members].max()) - 1], int(members[label[members].argmax()])
                 raise ValueError(

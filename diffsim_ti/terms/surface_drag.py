@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input, Range
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import Term, nonempty
 
 
 def _not_negative(x: np.ndarray) -> np.ndarray:
@@ -55,8 +55,7 @@ class SurfaceDrag(Term):
         self.surface = surface
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        if len(self.triangles(mesh)) == 0:
-            raise ValueError("SurfaceDrag acts on nothing: the set is empty; name a set that has members")
+        nonempty(self, self.triangles(mesh))
 
     def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Where it acts, as vertex indices, shape (k, 3)."""

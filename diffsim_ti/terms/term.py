@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.runtime import number_type
 from diffsim_ti.terms.marks import Mark, Moment
 
 if TYPE_CHECKING:
@@ -36,13 +36,13 @@ class Term(ABC):
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
     variant: tuple = ()  # what else than its class decides about the kernels of a term
     keyed = False  # whether its input is sampled at the ends of each run's steps (`rows`)
+    stiffest = None  # np.max or np.min: which of what it is given over time asks for the shortest steps
 
     def __init__(self, *inputs: Input, name: str | None = None):
         kind = type(self).__name__
         if name is not None and not (isinstance(name, str) and name.isidentifier()):
-            raise ValueError(
-                f"{kind}: name must be a word such as 'floor', got {name!r}: its inputs' names begin with it"
-            )
+            rule = f"name must be a word such as 'floor', got {name!r}"
+            raise ValueError(f"{kind}: {rule}: its inputs' names begin with it")
         for described in inputs:
             if described.value is not None:
                 described.check_given(kind)
@@ -125,12 +125,38 @@ class Term(ABC):
 
     def __repr__(self) -> str:
         named = [] if self.name is None else [f"name={self.name!r}"]
-        numbers = [f"{name}={_short(value)}" for name, value in self.values.items()]
+        short = lambda x: f"array{x.shape}" if x.size > 3 else np.array2string(x, separator=", ", precision=6)  # noqa: E731
+        numbers = [f"{name}={short(value)}" for name, value in self.values.items()]
         return f"{type(self).__name__}({', '.join(named + numbers)})"
 
 
-def _short(value: np.ndarray) -> str:
-    return f"array{value.shape}" if value.size > 3 else np.array2string(value, separator=", ", precision=6)
+def nonempty(term: Term, rows: np.ndarray) -> np.ndarray:
+    """What a term acts on. Raises ValueError if that is nothing."""
+    if len(rows) == 0:
+        raise ValueError(f"{type(term).__name__} acts on nothing: the set is empty; name a set that has members")
+    return rows
+
+
+class OnMesh:
+    """The part of a term whose links need the `mesh` of its scene."""
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> Term:
+        """The term with that mesh."""
+        out = copy(self)
+        out.mesh = scene.mesh
+        return out
+
+
+class OnSurface:
+    """The part of a term that acts on a `surface` of the body; None: all of it."""
+
+    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Where it acts, as vertex indices, normals out of the body, shape (k, 3) or (k, 6)."""
+        return mesh.faces_of(self.surface)
+
+    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Vertices of these faces, sorted."""
+        return np.unique(self.faces(mesh))
 
 
 @dataclass(frozen=True)
@@ -146,10 +172,7 @@ class VertexForce(ABC):
     # of obstacles only (obstacle.py): is there friction, is stiffness per area, does it turn, is nearness noted?
     friction, per_area, turns, watched = False, False, False, False
 
-    @property
-    def fp(self):
-        """Taichi's type of its numbers."""
-        return PRECISIONS[self.precision]
+    fp = number_type
 
     @ti.func
     def energy(self, parameters: ti.template(), first, X, u):

@@ -1,7 +1,6 @@
 """Springs and cables: ties between points of the body, and between these and points fixed in space."""
 
 from collections.abc import Sequence
-from copy import copy
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +13,8 @@ from diffsim_ti.inputs.ties import Segments, TieRows
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.terms.marks import Lines, Points
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
+from diffsim_ti.terms.term import OnMesh, Term
 
 
 def _at_least_0(x):
@@ -45,7 +44,7 @@ class Anchor:
 Point = int | str | ArrayLike | Anchor  # vertices, material points as places at rest, anchors
 
 
-class Tie(Term):
+class Tie(OnMesh, Term):
     """What runs along paths through points, with one tension each."""
 
     num_numbers = 0  # what kernels read of it lies in arrays of its own
@@ -67,11 +66,6 @@ class Tie(Term):
 
     def check(self, mesh: TetrahedralMesh) -> None:
         self.paths(mesh)
-
-    def settled(self, scene, density, initial_positions, initial_velocities) -> "Tie":
-        out = copy(self)
-        out.mesh = scene.mesh
-        return out
 
     def drawn(self, moment):
         paths, label = self.paths(moment.mesh), self.name or type(self).__name__.lower()
@@ -178,11 +172,8 @@ class Spring(Tie):
         shapes = (), ("k",)
         inputs = [Input("stiffness", stiffness, shapes, "N/m", AT_LEAST_0, plain="spring_stiffness", label="stiffness")]
         if rest_length is not None:
-            inputs.append(
-                Input(
-                    "rest_length", rest_length, shapes, "m", AT_LEAST_0, plain="spring_rest_length", label="rest_length"
-                )
-            )
+            words = dict(plain="spring_rest_length", label="rest_length")
+            inputs.append(Input("rest_length", rest_length, shapes, "m", AT_LEAST_0, **words))
         if tension is not None:
             inputs.append(Input("tension", tension, shapes, "N", plain="spring_tension", label="tension"))
         super().__init__(*inputs, *_anchors((start, end), "spring_anchors"), name=name)
@@ -202,14 +193,13 @@ class Spring(Tie):
             raise ValueError("Spring: both ends are anchors, and nothing of the body; give a point of it")
         for i in self.described:
             if i.name != "anchors" and i.value.ndim and len(i.value) != count:
-                raise ValueError(
-                    f"Spring: {i.name} has {len(i.value)} numbers for {count} springs; give one or {count}"
-                )
+                given = f"{i.name} has {len(i.value)} numbers"
+                raise ValueError(f"Spring: {given} for {count} springs; give one or {count}")
         start, end = (points * count if len(points) == 1 else points for points in (start, end))
         return Paths.of([[a, b] for a, b in zip(start, end)])
 
 
-class Cable(Tie):
+class Cable(GivenOverTime, Tie):
     """A cable (tendon) that slides without friction through points, with one tension T along all of it.
 
     tension [N]: given, T = tension, whatever its length; or length [m]: that without force, of an elastic cable with
@@ -227,8 +217,7 @@ class Cable(Tie):
     doi:10.15607/RSS.2019.XV.052.
     """
 
-    one_sided = True
-    shape = ()
+    one_sided, stiffest = True, staticmethod(np.max)
     ndim = 1
 
     def __init__(
@@ -244,22 +233,18 @@ class Cable(Tie):
         if len(points) < 2:
             raise ValueError(f"Cable: runs through two points at least, got {len(points)}")
         self.by_tension = by_tension = length is None
-        argument, self.given = ("tension", tension) if by_tension else ("length", length)
-        self.plain = f"cable_{argument}"
-        inputs = [amount(argument, self.given, (), "N" if by_tension else "m", self.plain)]
+        argument, given, unit = ("tension", tension, "N") if by_tension else ("length", length, "m")
+        self.stiffest = np.max if by_tension else np.min
+        inputs = [amount(argument, given, (), unit, f"cable_{argument}")]
         if not by_tension:
-            inputs.append(
-                Input("stiffness", stiffness, ((),), "N/m", AT_LEAST_0, plain="cable_stiffness", label="stiffness")
-            )
+            words = dict(plain="cable_stiffness", label="stiffness")
+            inputs.append(Input("stiffness", stiffness, ((),), "N/m", AT_LEAST_0, **words))
         super().__init__(*inputs, *_anchors(points, "cable_anchors"), name=name)
-        self.points, self.keyed = list(points), is_keyed(self.given)
+        self.points = list(points)
+        self._give(given)
         least = self.rows([0.0]) if self.keyed else inputs[0].value
         if np.any(least < 0):
             raise ValueError(f"Cable: {argument} must be >= 0, for it pulls only, got {float(np.min(least)):g}")
-
-    def rows(self, times: ArrayLike) -> np.ndarray:
-        """Its tension or length at each time [s], where it is keyed."""
-        return rows_at(f"Cable: {self.plain}", self.given, times, ())
 
     def found_paths(self, mesh: TetrahedralMesh) -> Paths:
         points, places = [], []

@@ -1,13 +1,10 @@
 """A batch of scenes as a node of torch's graph; all goes through the host."""
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from diffsim_ti.batch import Batch
-from diffsim_ti.common.checked import numbers
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
-from diffsim_ti.torch_bridge.set_tensors import spread_tensors
+from diffsim_ti.torch_bridge.set_tensors import as_tensors, on_host
 
 STATES = "positions", "velocities", "displacements"
 
@@ -28,13 +25,8 @@ class TorchBatchFrames(dict):
 class _BatchNode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, batch: Batch, names: tuple, kept: list, *tensors):
-        values = {}
-        for name, tensor in zip(names, tensors):
-            value = tensor.detach().to("cpu", torch.promote_types(tensor.dtype, torch.float32)).numpy()
-            if name == "initial_displacements":
-                name, value = "initial_positions", batch.scene.inputs.values["rest_positions"] + value
-            values[name] = value
-        frames = batch.forward(**values)
+        rest = batch.scene.inputs.values["rest_positions"]
+        frames = batch.forward(**dict(on_host(name, x, rest) for name, x in zip(names, tensors)))
         kept.append(frames.alive)
         ctx.batch, ctx.names, ctx.tensors, ctx.frames = batch, names, tensors, frames
         like = tensors[0] if tensors else torch.empty(0, dtype=torch.float64)
@@ -43,9 +35,8 @@ class _BatchNode(torch.autograd.Function):
     @staticmethod
     @first_order_only("take tangents of the batch, and reverse products along them")
     def backward(ctx, *adjoints):
-        seeds = dict(
-            zip((*STATES, *ctx.frames.outputs), (x.detach().to("cpu", torch.float64).numpy() for x in adjoints))
-        )
+        arrays = (x.detach().to("cpu", torch.float64).numpy() for x in adjoints)
+        seeds = dict(zip((*STATES, *ctx.frames.outputs), arrays))
         by_displacements = seeds.pop("displacements")
         seeds["positions"] = seeds["positions"] + by_displacements
         gradients = ctx.batch.vjp(ctx.frames, **seeds)
@@ -62,20 +53,9 @@ class _BatchNode(torch.autograd.Function):
 
 def batch_frames(batch: Batch, tensors: dict) -> TorchBatchFrames:
     """Run a batch with some inputs given as tensors, see `rollout_frames`."""
-    if "rest_positions" in tensors and "initial_displacements" in tensors:
-        raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
-    known, scenes = batch.one.values, batch.num_scenes
-    tensors = {
-        name: spread_tensors(batch.scene, name, known.get(name), x, scenes) if isinstance(x, Mapping) else x
-        for name, x in tensors.items()
-    }
-    tensors = {
-        name: x if isinstance(x, torch.Tensor) else torch.from_numpy(numbers(name, x)) for name, x in tensors.items()
-    }
+    tensors = as_tensors(batch.scene, batch.one.values, tensors, batch.num_scenes)
     for name, tensor in tensors.items():
         known = "initial_positions" if name == "initial_displacements" else name
-        if not tensor.is_floating_point():
-            raise ValueError(f"{name}: expected a floating point tensor, got {tensor.dtype}")
         if tensor.requires_grad and known in batch.inputs and known not in batch.wanted:
             raise ValueError(f"{name} requires a gradient: name it in Batch(gradients=[...]), or pass gradients='all'")
     kept = []

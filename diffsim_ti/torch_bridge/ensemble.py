@@ -41,9 +41,8 @@ class Ensemble:
             raise ValueError("members: there are none; give rollouts, batches, or what `make` makes them from")
         costs = np.ones(len(self)) if costs is None else np.asarray(costs, np.float64)
         if costs.shape != (len(self),) or not (costs > 0).all() or not np.isfinite(costs).all():
-            raise ValueError(
-                f"costs: expected {len(self)} finite numbers > 0, one for each member, got {costs.tolist()}"
-            )
+            rule = f"expected {len(self)} finite numbers > 0, one for each member"
+            raise ValueError(f"costs: {rule}, got {costs.tolist()}")
         self.rank, self.num_ranks, self.is_first = ranks.rank(), ranks.world(), ranks.rank() == 0
         self.own = shares(costs, self.num_ranks)[self.rank]
 

@@ -1,18 +1,16 @@
 """A rollout as a node of torch's graph, and each of its further outputs as another."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from diffsim_ti.batch import Batch
-from diffsim_ti.common.checked import numbers
 from diffsim_ti.common.origin import START_NEARER, warn_of_rounding
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.rollout.shape import spread_shape
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
 from diffsim_ti.torch_bridge.batch_node import TorchBatchFrames, batch_frames
-from diffsim_ti.torch_bridge.set_tensors import spread_tensors
+from diffsim_ti.torch_bridge.set_tensors import as_tensors
 from diffsim_ti.torch_bridge.tensors import TensorRollout
 
 REMEDY = "use verify.hessian_product or verify.gauss_newton_product"
@@ -103,10 +101,9 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
 
     Names are those of `rollout.inputs`, whose numbers per tetrahedron {named set: tensor} may give; also
     "initial_displacements" instead of "initial_positions" (which keeps its digits in float32), and "shape", which moves
-    initial and rest positions together. Numbers of the scene's
-    terms that were given as tensors, as in `Sphere(radius=tensor)`, are among the
-    inputs by themselves. Two runs before one backward are right. Second derivatives are refused (see
-    `verify.hessian_product`).
+    initial and rest positions together. Numbers of the scene's terms that were given as tensors, as in
+    `Sphere(radius=tensor)`, are inputs by themselves. Two runs before one backward are right. Second derivatives are
+    refused (see `verify.hessian_product`).
 
     Frames are copied between tensors and the device by one kernel, and so are, with explicit solvers, initial displacements
     and velocities and the gradients by all of these (tensors.py); all other inputs are small and go through the host, as do
@@ -123,20 +120,12 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
         return batch_frames(rollout, tensors)
     if "initial_positions" in tensors and "initial_displacements" in tensors:
         raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
-    if "rest_positions" in tensors and "initial_displacements" in tensors:
-        raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
-    tensors = {
-        name: spread_tensors(rollout.scene, name, rollout.values.get(name), x) if isinstance(x, Mapping) else x
-        for name, x in tensors.items()
-    }
     for name, value in rollout.scene.given_tensors().items():
         tensors.setdefault(name, value.expand(rollout.values[name].shape))
-    for name, value in tensors.items():
-        tensors[name] = value if isinstance(value, torch.Tensor) else torch.from_numpy(numbers(name, value))
-        if not tensors[name].is_floating_point():
-            raise ValueError(f"{name}: expected a floating point tensor, got {tensors[name].dtype}")
+    tensors = as_tensors(rollout.scene, rollout.values, tensors)
+    for name, tensor in tensors.items():
         costs_extra = name in ("density", "rest_positions") and name not in rollout.wanted
-        if tensors[name].requires_grad and costs_extra and torch.is_grad_enabled():
+        if tensor.requires_grad and costs_extra and torch.is_grad_enabled():
             raise ValueError(
                 f"{name} requires a gradient, but this rollout computes {', '.join(rollout.wanted)}: name it in "
                 'Rollout(gradients=[...]), or pass gradients="all"'

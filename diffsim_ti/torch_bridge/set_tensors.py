@@ -1,13 +1,36 @@
-"""Numbers of named sets as tensors."""
+"""Inputs of runs as tensors: numbers of named sets spread over tetrahedra, and the way to arrays of the host."""
 
 from collections.abc import Mapping
 
 import numpy as np
 
 from diffsim_ti.batch.set_values import own_sets
+from diffsim_ti.common.checked import numbers as as_array
 from diffsim_ti.rollout.set_values import per_tetrahedron, rows_of_sets
 from diffsim_ti.scene import Scene
 from diffsim_ti.torch_bridge.autograd import torch
+
+
+def as_tensors(scene: Scene, values: dict, given: dict, scenes: int | None = None) -> dict[str, torch.Tensor]:
+    """Inputs as tensors, those of named sets spread; scenes: as in `spread_tensors`.
+
+    Raises ValueError for what is no floating point number, and for displacements beside another rest shape.
+    """
+    if "rest_positions" in given and "initial_displacements" in given:
+        raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
+    out = {}
+    for name, x in given.items():
+        x = spread_tensors(scene, name, values.get(name), x, scenes) if isinstance(x, Mapping) else x
+        out[name] = x if isinstance(x, torch.Tensor) else torch.from_numpy(as_array(name, x))
+        if not out[name].is_floating_point():
+            raise ValueError(f"{name}: expected a floating point tensor, got {out[name].dtype}")
+    return out
+
+
+def on_host(name: str, tensor: torch.Tensor, rest: np.ndarray) -> tuple[str, np.ndarray]:
+    """(name of an input, its value) of a tensor; rest: places that "initial_displacements" are from."""
+    value = tensor.detach().to("cpu", torch.promote_types(tensor.dtype, torch.float32)).numpy()
+    return ("initial_positions", rest + value) if name == "initial_displacements" else (name, value)
 
 
 def spread_tensors(

@@ -16,6 +16,7 @@ from diffsim_ti.rollout.frames import HostSeed, check_finite
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.torch_bridge.autograd import torch
+from diffsim_ti.torch_bridge.set_tensors import on_host
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
 START = ("initial_displacements", "initial_velocities")  # what can be copied; all else goes through Inputs
@@ -166,9 +167,7 @@ class TensorRollout:
             if direct and name in START:
                 start[name] = tensor
                 continue
-            value = tensor.detach().to("cpu", torch.promote_types(tensor.dtype, torch.float32)).numpy()
-            if name == "initial_displacements":
-                name, value = "initial_positions", self.rollout.values["rest_positions"] + value
+            name, value = on_host(name, tensor, self.rollout.values["rest_positions"])
             values[name] = value
         from_tensors = TensorStart(self, start) if start else None
         run = sweep.run(values, from_tensors)
@@ -187,18 +186,17 @@ class TensorRollout:
         rollout, adjoints = self.rollout, (by_displacements, by_velocities)
         noted = dict(zip(rollout.sweep.noted, (x.detach().to("cpu", torch.float64).numpy() for x in more)))
         direct = is_direct(rollout, wanted)
-        on_host = [name for name in wanted if not (direct and name in START)]
-        on_host = ["initial_positions" if name == "initial_displacements" else name for name in on_host]
+        others = [name for name in wanted if not (direct and name in START)]
+        others = ["initial_positions" if name == "initial_displacements" else name for name in others]
         if direct:
-            seed = TensorSeed(
-                self, [self._ready(x) for x in adjoints], "initial_positions" in on_host, noted.get("contact_forces")
-            )
+            pair = [self._ready(x) for x in adjoints]
+            seed = TensorSeed(self, pair, "initial_positions" in others, noted.get("contact_forces"))
         else:
             seed = HostSeed(*(x.detach().to("cpu", torch.float64).numpy() for x in adjoints), **noted)
             for name, x in (("positions", seed.positions), ("velocities", seed.velocities)):
                 check_finite(name, x, rollout.save_every)
         derived = rollout.sweep.pull_back(run, seed)
-        out = rollout.gradients = rollout.gradients_of(run, derived, Change(), on_host)
+        out = rollout.gradients = rollout.gradients_of(run, derived, Change(), others)
         if "initial_displacements" in wanted and not direct:
             out = out | {"initial_displacements": out["initial_positions"]}
         if direct:

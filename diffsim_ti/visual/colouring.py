@@ -49,8 +49,7 @@ class Colouring:
                 "values to colour must be finite numbers, at least one; a diverged state cannot be coloured"
             )
         if field is None:
-            signed = values.min() < 0 < values.max()
-            field = Field(label, SIGNED, 0.0) if signed else Field(label)
+            field = Field(label, SIGNED, 0.0) if values.min() < 0 < values.max() else Field(label)
         if limits is None:
             least = values.min() if field.middle is None else np.percentile(values, 0.5)
             limits = field.limits(float(least), float(np.percentile(values, 99.5)))

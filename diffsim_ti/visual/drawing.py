@@ -32,9 +32,8 @@ def painter(backend: str, size: tuple[int, int]) -> "SoftwarePainter | VulkanPai
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
     if backend == "vulkan" and not has_vulkan():
-        raise ValueError(
-            "backend='vulkan': no Vulkan driver was found; install one (mesa-vulkan-drivers) or use 'software'"
-        )
+        remedy = "install one (mesa-vulkan-drivers) or use 'software'"
+        raise ValueError(f"backend='vulkan': no Vulkan driver was found; {remedy}")
     return SoftwarePainter(size) if backend == "software" or not has_vulkan() else VulkanPainter(size)
 
 
@@ -115,11 +114,9 @@ class Drawing:
         """The triangles to paint, and (points, triangles) of what throws shadows."""
         points = np.asarray(positions, np.float64)
         if points.shape != (self.mesh.num_vertices, 3) or not np.all(np.isfinite(points)):
-            raise ValueError(
-                f"positions: expected finite numbers of shape ({self.mesh.num_vertices}, 3), got shape {points.shape}"
-            )
-        size = size or self.size
-        colour = PLAIN
+            shape = f"({self.mesh.num_vertices}, 3)"
+            raise ValueError(f"positions: expected finite numbers of shape {shape}, got shape {points.shape}")
+        size, colour = size or self.size, PLAIN
         if values is not None:
             values = to_vertices(self.mesh, values)
             self.colouring = self.colouring or Colouring.of(values[self.mesh.surface_vertices])
@@ -128,27 +125,23 @@ class Drawing:
         soups = [with_edges(body, 0.0006 * size[1]) if self.wireframe else body]
         placed = [s.points for s in self._around] if obstacles is None else obstacles
         soups += [s.lit(p, OBSTACLE, self.camera, size) for s, p in zip(self._around, placed)]
-        soups += self._supports(points, size) + self._glyphs(drawn, size)
+        soups += self._supports(points, size)
+        if drawn:
+            self.scale = longest(drawn, self.scale)
+            for mark in drawn:
+                self.colours.setdefault(mark.label, COLOURS[len(self.colours) % len(COLOURS)])
+            soups += glyphs(drawn, self.scale, self.colours, arrow_length(self.mesh), self.camera, size)
         shapes = [(points, self.mesh.surface_triangles), *((p, s.triangles) for s, p in zip(self._around, placed))]
         return Soup.joined(soups), shapes
 
     def _supports(self, points: np.ndarray, size: tuple[int, int]) -> list[Soup]:
-        wholly, extent = self.fixed, float(np.ptp(self.box, 0).max())
-        out = []
+        wholly, extent, out = self.fixed, float(np.ptp(self.box, 0).max()), []
         if self._cones is not None:
             wholly, vertices, axes = self._cones
             out.append(cones(points[vertices], axes, 0.035 * extent, self.camera, size))
         if len(wholly):
             out.append(marks(points[wholly], self.camera, size, 0.004 * size[1], 0.01 * extent))
         return out
-
-    def _glyphs(self, drawn: Sequence[Mark], size: tuple[int, int]) -> list[Soup]:
-        if not drawn:
-            return []
-        self.scale = longest(drawn, self.scale)
-        for mark in drawn:
-            self.colours.setdefault(mark.label, COLOURS[len(self.colours) % len(COLOURS)])
-        return glyphs(drawn, self.scale, self.colours, arrow_length(self.mesh), self.camera, size)
 
     def key(self, drawn: Sequence[Mark]) -> list[tuple[str, np.ndarray]]:
         """(text, colour) of lines that say what cones, arrows and lines of a picture mean; none where there are none."""

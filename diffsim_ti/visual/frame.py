@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from diffsim_ti.obstacles import floor_of, obstacle_surfaces
 from diffsim_ti.outputs import Output, Stress
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.given_loads import GivenLoads
+from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms.marks import Mark
@@ -19,9 +19,6 @@ from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.colouring import measured_fields
 from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.scene_marks import marks_of
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
 
 
 @dataclass
@@ -73,7 +70,7 @@ class Frame:
         return {name: values for name, values in self.fields.items() if name in FIELDS}
 
     @classmethod
-    def of_run(cls, scene: Scene, frames: "Frames", k: int) -> "Frame":
+    def of_run(cls, scene: Scene, frames: Frames, k: int) -> "Frame":
         """Frame k of a Rollout's run of a scene; its fields are displacement, speed, J, von Mises stress where `Stress`
         supports the law, and the outputs that each vertex or each tetrahedron has: vectors such as
         ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices"). What some vertices have,
@@ -112,7 +109,7 @@ class Frame:
         return cls(simulator.time, x, u, v, fields | shown, moved, **dict(marks=drawn, units=units) | more)
 
 
-def _strained(scene: Scene, frames: "Frames", k: int) -> dict[str, np.ndarray]:
+def _strained(scene: Scene, frames: Frames, k: int) -> dict[str, np.ndarray]:
     """Of each tetrahedron in a frame: J, the smallest of its points and of ten nodes' corners, and the mean von Mises stress
     of its points [Pa]."""
     mesh, derived = scene.mesh, scene.inputs.derive(frames.inputs)

@@ -43,10 +43,8 @@ class FrameSource(ABC):
     @property
     def look(self) -> dict:
         """What `Drawing` takes: floor, obstacles, fixed vertices, box."""
-        shared = self.setting
-        return dict(
-            ground=shared.ground, obstacles=shared.obstacles, fixed=shared.fixed, held=shared.held, box=self.box()
-        )
+        own = {name: getattr(self.setting, name) for name in ("ground", "obstacles", "fixed", "held")}
+        return own | dict(box=self.box())
 
     @abstractmethod
     def box(self) -> np.ndarray:

@@ -21,9 +21,8 @@ def legend(colouring: Colouring, size: tuple[int, int]) -> tuple:
     scale = min(width / 1200, height / 900)
     figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor=(0, 0, 0, 0))
     canvas = FigureCanvasAgg(figure)
-    bar = figure.colorbar(
-        ScalarMappable(Normalize(*colouring.limits), colouring.map), cax=figure.add_axes((0.925, 0.25, 0.02, 0.5))
-    )
+    colours = ScalarMappable(Normalize(*colouring.limits), colouring.map)
+    bar = figure.colorbar(colours, cax=figure.add_axes((0.925, 0.25, 0.02, 0.5)))
     bar.outline.set_visible(False)
     small = max(16 * scale, 7)
     bar.ax.tick_params(labelsize=small, color=INK, labelcolor=INK, length=4 * scale)

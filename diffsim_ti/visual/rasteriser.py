@@ -30,9 +30,8 @@ def spans(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.nd
 
     long = crossing(x0, y0, x2, y2)
     short = np.where(y < y1[triangle], crossing(x0, y0, x1, y1), crossing(x1, y1, x2, y2))
-    first, end = (
-        np.clip(np.ceil(x - 0.5), 0, width).astype(np.int64) for x in (np.minimum(long, short), np.maximum(long, short))
-    )
+    sides = np.minimum(long, short), np.maximum(long, short)
+    first, end = (np.clip(np.ceil(x - 0.5), 0, width).astype(np.int64) for x in sides)
     some = end > first
     return triangle[some], row[some], first[some], end[some]
 
@@ -83,9 +82,8 @@ class SoftwarePainter:
         of, pixel = planes[:, 1:].astype(np.float32)[triangle[span[front]]], pixel[front]
         row, column = np.divmod(pixel, width)
         x, y = (column + 0.5).astype(np.float32), (row + 0.5).astype(np.float32)
-        colour = (of[..., 0] * x[:, None] + of[..., 1] * y[:, None] + of[..., 2]) / nearness[front, None].astype(
-            np.float32
-        )
+        colour = of[..., 0] * x[:, None] + of[..., 1] * y[:, None] + of[..., 2]
+        colour /= nearness[front, None].astype(np.float32)
         return _averaged(np.clip(colour, 0, 1), row, column, background)
 
     def close(self) -> None:

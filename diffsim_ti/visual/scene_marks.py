@@ -16,11 +16,7 @@ OF_A_RESULT = 200  # arrows that are drawn of one
 
 
 def marks_of(
-    scene: Scene,
-    positions: np.ndarray,
-    time: float = 0.0,
-    step: int = 0,
-    values: Mapping[str, np.ndarray] | None = None,
+    scene: Scene, positions: np.ndarray, time: float = 0.0, step: int = 0, values: Mapping | None = None
 ) -> list[Mark]:
     """What the terms of a scene say that is drawn of them (`Term.drawn`) at positions [m], shape (num_vertices, 3).
 
@@ -40,12 +36,10 @@ def marks_of(
 
 def _at(value: np.ndarray, shapes, step: int) -> np.ndarray:
     """What of a value holds after so many steps."""
-    rule = next(
-        (rule for rule in shapes if len(rule) == value.ndim and rule and rule[0] in ("steps", "steps + 1")), None
-    )
-    if rule is None:
-        return value
-    return value[min(max(step - (rule[0] == "steps"), 0), len(value) - 1)]
+    for rule in shapes:
+        if len(rule) == value.ndim and rule and rule[0] in ("steps", "steps + 1"):
+            return value[min(max(step - (rule[0] == "steps"), 0), len(value) - 1)]
+    return value
 
 
 def results_as_arrows(frame: "Frame", mesh, names: Sequence[str]) -> list[Mark]:
@@ -58,13 +52,6 @@ def results_as_arrows(frame: "Frame", mesh, names: Sequence[str]) -> list[Mark]:
             raise ValueError(f"arrows: {name!r} must be a vector of each vertex that frames hold; they hold {known}")
         unit = frame.units.get(name)
         label = name.replace("_", " ") + (f" [{unit}]" if unit else "")
-        own = arrows(
-            label,
-            mesh,
-            np.asarray(frame.positions, np.float64),
-            range(mesh.num_vertices),
-            frame.fields[name],
-            OF_A_RESULT,
-        )
-        out.append(replace(own, through=True))
+        x, each = np.asarray(frame.positions, np.float64), range(mesh.num_vertices)
+        out.append(replace(arrows(label, mesh, x, each, frame.fields[name], OF_A_RESULT), through=True))
     return [mark for mark in out if len(mark.points)]

@@ -18,31 +18,24 @@ def write_marks(path: Path, drawn: Sequence[Mark], labels: list[str]) -> None:
     """Write marks, adding labels that are new to the list."""
     import meshio
 
-    points, vectors, onto, cells = [], [], [], {"line": [], "vertex": []}
-    numbers, kinds, count = {"line": [], "vertex": []}, {"line": [], "vertex": []}, 0
+    points, vectors, onto, rows, count = [], [], [], {}, 0  # rows: (cells, numbers, kinds) of each form of cells
     for mark in drawn:
         if mark.label not in labels:
             labels.append(mark.label)
-        x = mark.ends.reshape(-1, 3) if isinstance(mark, Lines) else mark.points
-        form, kind = (
-            ("line", LINE) if isinstance(mark, Lines) else ("vertex", ARROW if isinstance(mark, Arrows) else POINT)
-        )
+        kind = LINE if isinstance(mark, Lines) else ARROW if isinstance(mark, Arrows) else POINT
+        x = mark.ends.reshape(-1, 3) if kind == LINE else mark.points
         points.append(x)
         vectors.append(mark.vectors if kind == ARROW else np.zeros_like(x))
         onto.append(mark.onto if kind == ARROW else np.zeros(len(x), bool))
-        cells[form].append(np.arange(count, count + len(x)).reshape(-1, 2 if kind == LINE else 1))
-        numbers[form].append(np.full(len(cells[form][-1]), labels.index(mark.label)))
-        kinds[form].append(np.full(len(cells[form][-1]), kind))
+        cells = np.arange(count, count + len(x)).reshape(-1, 2 if kind == LINE else 1)
+        own = cells, np.full(len(cells), labels.index(mark.label)), np.full(len(cells), kind)
+        rows.setdefault("line" if kind == LINE else "vertex", []).append(own)
         count += len(x)
-    used = [form for form in cells if cells[form]]
-    meshio.Mesh(
-        np.concatenate(points),
-        [(form, np.concatenate(cells[form])) for form in used],
-        point_data=dict(vector=np.concatenate(vectors).astype(float), onto=np.concatenate(onto).astype(np.uint8)),
-        cell_data={
-            name: [np.concatenate(of[form]) for form in used] for name, of in (("mark", numbers), ("kind", kinds))
-        },
-    ).write(path, file_format="vtu", binary=True)
+    joined = [[np.concatenate(part) for part in zip(*of)] for of in rows.values()]
+    cells, numbers, kinds = map(list, zip(*joined))
+    point_data = dict(vector=np.concatenate(vectors).astype(float), onto=np.concatenate(onto).astype(np.uint8))
+    saved = meshio.Mesh(np.concatenate(points), list(zip(rows, cells)), point_data, dict(mark=numbers, kind=kinds))
+    saved.write(path, file_format="vtu", binary=True)
 
 
 def read_part(path: Path, *names: str):

@@ -133,7 +133,10 @@ class Viewer:
         if self.window.is_pressed(ti.ui.RMB) and np.any(move) and np.all(np.isfinite(move)):
             self.drawing.camera = self.drawing.camera.orbited(-180 * move[0], -120 * move[1])
         pressed = self.window.is_pressed(ti.ui.LMB)
-        if pressed and not self._pressed and not self._on_panel():
+        left, top, width = PANEL
+        x, y = self._cursor[0] - left, 1 - self._cursor[1] - top
+        on_panel = 0 <= x <= width and 0 <= y <= self._panel_height
+        if pressed and not self._pressed and not on_panel:
             self.grab()
         elif not pressed and self.held is not None:
             self.held = None
@@ -141,11 +144,6 @@ class Viewer:
         if self.held is not None:
             self.source.grab(self.held, self._under_cursor())
         self._pressed = pressed
-
-    def _on_panel(self) -> bool:
-        left, top, width = PANEL
-        x, y = self._cursor[0], 1 - self._cursor[1]
-        return left <= x <= left + width and top <= y <= top + self._panel_height
 
     def _ray(self) -> np.ndarray:
         """Unit direction from the eye through the cursor, which counts from the lower left, in shares of the window."""

@@ -47,10 +47,7 @@ class Canvas:
         self.canvas.set_image(self._image)
         if len(soup.corners) > self._room:
             self._room = max(1024, 2 * len(soup.corners))
-            self._at, self._colours = (
-                ti.Vector.field(2, ti.f32, 3 * self._room),
-                ti.Vector.field(3, ti.f32, 3 * self._room),
-            )
+            self._at, self._colours = (ti.Vector.field(k, ti.f32, 3 * self._room) for k in (2, 3))
         order = np.argsort(-soup.distance, kind="stable")
         at, colours = (np.zeros((3 * self._room, k), np.float32) for k in (2, 3))
         at[: 3 * len(order)] = (soup.corners[order, :, :2] / size).reshape(-1, 2)

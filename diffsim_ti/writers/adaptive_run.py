@@ -74,11 +74,10 @@ class Seen:
 class ForwardRun:
     """Frames of equal length; the substeps of each follow the stable step of the state, unless `dt` is given.
 
-    A frame has 16 parts, after each of which the state is looked at. One that diverges, outgrows its step or gains
-    energy is run again from its start with twice the substeps, and that is counted; where that helps no more, the part is
-    done by implicit Euler, and that is said. With an implicit solver a frame has 4
-    parts, whose steps are halved only where one does not converge or gains energy. With dt nothing is chosen and nothing
-    repeated: what goes wrong is an error.
+    A frame has 16 parts, after each of which the state is checked. One that diverges, outgrows its step or gains energy is
+    run again from its start with twice the substeps, and that is counted; where that helps no more, implicit Euler does the
+    part, and that is said. With an implicit solver a frame has 4 parts, whose steps are halved only where one does not
+    converge or gains energy. With dt nothing is chosen and nothing repeated: what goes wrong is an error.
 
     Raises ValueError for a body that no step saves (strength.py), naming what would.
 
@@ -107,18 +106,14 @@ class ForwardRun:
         gravity = scene.term(Gravity)
         self._pull = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
         self.implicit = not solver_class.explicit
-        if dt is None and self.implicit:
-            self.parts = 4
-            solver = solver_class(scene, dt=frame_time / self.parts, **options)
-        elif dt is None:
-            solver = solver_class(scene, dt=frame_time / self.parts, check_start=False, **options)
+        if dt is None:
+            self.parts, unchecked = (4, {}) if self.implicit else (self.parts, dict(check_start=False))
+            solver = solver_class(scene, dt=frame_time / self.parts, **unchecked, **options)
         else:
             if not dt > 0:
                 raise ValueError(f"--dt must be > 0 [s], got {dt:g}")
             steps = max(1, round(frame_time / dt))
-            self.parts = max(
-                p for p in range(1, self.parts + 1) if steps % p == 0
-            )  # dt and the time both stay as asked
+            self.parts = max(p for p in range(1, self.parts + 1) if steps % p == 0)  # dt and the time stay as asked
             steps //= self.parts
             solver = solver_class(scene, dt=steps * dt, substeps=steps, **options)
         self.outputs = tuple(outputs)
@@ -300,9 +295,8 @@ class ForwardRun:
             positions = self.simulator.positions
             speed += max((t.way(positions, now[t], then[t]) / dt for t in now), default=0.0)
             in_a_width = STEPS.in_a_width[self.simulator.solver.contact]
-            fewest = max(
-                fewest, in_a_width * speed * dt / min(float(t.values["barrier_width"]) for t in self.obstacles)
-            )
+            width = min(float(t.values["barrier_width"]) for t in self.obstacles)
+            fewest = max(fewest, in_a_width * speed * dt / width)
         return max(1, int(np.ceil(fewest)))
 
     @staticmethod

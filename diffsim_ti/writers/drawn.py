@@ -33,34 +33,21 @@ class DrawnWriter(Writer):
         values = np.asarray(frame.fields[self.colour])
         marks = [*frame.marks, *results_as_arrows(frame, self.setting.mesh, self.view.arrows)]
         self._extent.add(frame.positions, values, marks)
-        for array in (frame.time, frame.positions, values, *self._points(frame)):
+        points = [x for x, _ in self.setting.obstacles] if frame.obstacles is None else frame.obstacles
+        for array in (frame.time, frame.positions, values, *points):
             np.save(self._waiting, array)
         pickle.dump(marks, self._waiting)
         self.count += 1
 
-    def _points(self, frame: Frame) -> list[np.ndarray]:
-        return [points for points, _ in self.setting.obstacles] if frame.obstacles is None else frame.obstacles
-
     def images(self) -> Iterator[np.ndarray]:
         """A picture of each frame that waits, RGB uint8 (height, width, 3)."""
-        view, setting = self.view, self.setting
+        view, setting, extent = self.view, self.setting, self._extent
         self._waiting.seek(0)
-        with Drawing(
-            setting.mesh,
-            view.size or self.usual_size,
-            camera=view.camera,
-            ground=setting.ground if view.ground is None else view.ground,
-            obstacles=setting.obstacles,
-            fixed=setting.fixed,
-            wireframe=view.wireframe,
-            colouring=self._extent.colouring,
-            box=self._extent.box,
-            azimuth=view.azimuth,
-            elevation=view.elevation,
-            backend=view.backend,
-            held=setting.held,
-        ) as drawing:
-            drawing.scale = self._extent.scale
+        look = {name: getattr(view, name) for name in ("camera", "wireframe", "azimuth", "elevation", "backend")}
+        look |= {name: getattr(setting, name) for name in ("obstacles", "fixed", "held")}
+        look |= dict(ground=setting.ground if view.ground is None else view.ground, colouring=extent.colouring)
+        with Drawing(setting.mesh, view.size or self.usual_size, box=extent.box, **look) as drawing:
+            drawing.scale = extent.scale
             if view.say:
                 view.say(drawing.describe())
             for _ in range(self.count):

@@ -19,8 +19,7 @@ class GltfWriter(Writer):
 
     Each frame is a morph target, whose weight the animation brings to 1 at the frame's time [s] and leads linearly to the
     next. Places are those of the first frame, of what is far from the origin less a translation (origin.py), and float32
-    differences to it [m], y upwards. A body has one colour: what a
-    field shows cannot move in glTF, .vtu and films have it.
+    differences to it [m], y upwards. A body has one colour: colours of a field cannot move in glTF.
     Khronos Group 2021, glTF 2.0 Specification, sections 3.7.2 (morph targets) and 3.11 (animations).
     """
 
@@ -70,9 +69,8 @@ class Content:
         self.bytes += data.tobytes()
         self.parts["bufferViews"].append(view | (dict(target=target) if target else {}))
         columns = data.shape[1] if data.ndim > 1 else 1
-        own = dict(
-            bufferView=len(self.parts["bufferViews"]) - 1, componentType=kind, count=len(data), type=TYPES[columns]
-        )
+        last = len(self.parts["bufferViews"]) - 1
+        own = dict(bufferView=last, componentType=kind, count=len(data), type=TYPES[columns])
         if limits:
             rows = data.reshape(len(data), columns)
             own |= dict(min=rows.min(0).tolist(), max=rows.max(0).tolist())
@@ -82,25 +80,21 @@ class Content:
     def add_surface(self, name: str, triangles: np.ndarray, places: list, times: int | None, colour: tuple) -> None:
         """Triangles that go through `places`, at the times of an accessor."""
         changes, away = [x - places[0] for x in places[1:]], middle_far_part(places[0])
-        shape = dict(
-            attributes=dict(POSITION=self.add(places[0] - away, ARRAY, limits=True)),
-            indices=self.add(triangles.ravel().astype(np.uint32), ELEMENTS),
-            material=len(self.parts["materials"]),
-        )
+        shape = dict(attributes=dict(POSITION=self.add(places[0] - away, ARRAY, limits=True)))
+        shape["indices"] = self.add(triangles.ravel().astype(np.uint32), ELEMENTS)
+        shape["material"] = len(self.parts["materials"])
         if changes:
             shape["targets"] = [dict(POSITION=self.add(x, ARRAY, limits=True)) for x in changes]
         node = len(self.parts["nodes"])
-        self.parts["meshes"].append(
-            dict(name=name, primitives=[shape]) | (dict(weights=[0.0] * len(changes)) if changes else {})
-        )
+        weights = dict(weights=[0.0] * len(changes)) if changes else {}
+        self.parts["meshes"].append(dict(name=name, primitives=[shape]) | weights)
         self.parts["nodes"].append(dict(name=name, mesh=node) | (dict(translation=away.tolist()) if away.any() else {}))
         look = dict(baseColorFactor=[*colour, 1.0], metallicFactor=0.0, roughnessFactor=0.8)
         self.parts["materials"].append(dict(name=name, pbrMetallicRoughness=look, doubleSided=True))
         if changes:
             weights = np.eye(len(places))[:, 1:].astype(np.float32)  # the first frame is where all are zero
             self.samplers.append(dict(input=times, output=self.add(weights.ravel()), interpolation="LINEAR"))
-            target = dict(node=node, path="weights")
-            self.channels.append(dict(sampler=len(self.samplers) - 1, target=target))
+            self.channels.append(dict(sampler=len(self.samplers) - 1, target=dict(node=node, path="weights")))
 
     def packed(self) -> bytes:
         """The file: a header, the JSON, the numbers."""

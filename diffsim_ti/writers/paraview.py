@@ -69,12 +69,10 @@ class ParaViewWriter(Writer):
             {text_of(name): _rows(value).astype(dtype) for name, value in data.items()}
             for data in (point_data, cell_data)
         )
-        saved = meshio.Mesh(
-            np.asarray(frame.positions, np.float64),
-            [("tetra" if self.setting.mesh.order == 1 else "tetra10", self.setting.mesh.elements)],
-            point_data=point_data | {"fixed": held} | self._held(dtype),
-            cell_data={name: [value] for name, value in cell_data.items()},
-        )
+        point_data |= {"fixed": held} | self._held(dtype)
+        cell_data = {name: [value] for name, value in cell_data.items()}
+        cells = [("tetra" if self.setting.mesh.order == 1 else "tetra10", self.setting.mesh.elements)]
+        saved = meshio.Mesh(np.asarray(frame.positions, np.float64), cells, point_data, cell_data)
         saved.write(path, file_format="vtu", binary=True)
         self._write_obstacles(frame)
         parts = {0: path} | ({1: self._obstacles[-1]} if self._obstacles else {})

@@ -1,6 +1,6 @@
 """Green's strain E = (F^T F - 1) / 2 of F = 1 + H, and symmetric tensors as six numbers."""
 
-from diffsim_ti.materials.calculus.tensor import Tensor, add_to_diagonal
+from diffsim_ti.materials.calculus.tensor import Tensor, add_to_diagonal, sum_of
 from diffsim_ti.runtime import let, traced
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # of a symmetric tensor
@@ -16,12 +16,7 @@ def green_strain(H, half) -> Tensor:
 @traced
 def green_strain_differential(H, dH, half) -> Tensor:
     """sym(F^T dH)"""
-    return symmetric(add_to_diagonal(H, 1).transpose() @ dH, half)
-
-
-@traced
-def symmetric(A, half) -> Tensor:
-    """(A + A^T) / 2"""
+    A = add_to_diagonal(H, 1).transpose() @ dH
     return (A + A.transpose()) * half
 
 
@@ -32,16 +27,17 @@ def six(A) -> list:
 
 
 @traced
+def hooke(e, mu, lam):
+    """mu |e|^2 + lam/2 tr(e)^2 of a symmetric tensor's six numbers."""
+    trace, size = sum_of(e[:3]), sum_of(x * x for x in e[:3]) + 2 * sum_of(x * x for x in e[3:])
+    return mu * size + lam / 2 * trace * trace
+
+
+@traced
 def of_six(numbers) -> Tensor:
     """The symmetric tensor of six numbers."""
     place = {pair: k for k, pair in enumerate(PAIRS)}
     return Tensor(numbers[place[min(i, j), max(i, j)]] for i in range(3) for j in range(3))
-
-
-@traced
-def adjoint_of_six(A) -> list:
-    """Adjoints of the six numbers, for the adjoint A of the tensor, which is symmetric."""
-    return [A[i, j] if i == j else let(2 * A[i, j]) for i, j in PAIRS]
 
 
 @traced

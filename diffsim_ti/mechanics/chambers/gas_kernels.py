@@ -1,8 +1,13 @@
 """Kernels of gases in chambers in explicit passes: volumes first, then corner forces p(V) dV/dx, and their derivatives.
 
 A launch has two loops: sums over the triangles of each chamber, in parts of a fixed order, then all triangles, each of which
-adds the parts up for itself. Triangle t writes corners `first + 3 t + a`, which vertices gather with those of tetrahedra;
-those of lids (mesh/enclosure.py) have no force, but adjoints.
+adds the parts up for itself. Triangle t writes corners `first + 3 t + a`, which vertices gather with those of tetrahedra.
+
+V = -1/6 sum over triangles of `weight` y_0 . (y_1 x y_2), y the places of the corners (mesh/enclosure.py). What the gas does
+at corner a of a triangle is -p/6 `push` n_a. Of flat faces n_a = (y_1 - y_0) x (y_2 - y_0), a third of the triangle's own
+area for each corner, and lids have no push. Of curved ones, whose triangles are weighted, n_a = y_b x y_c, so that the force
+is p dV/dy_a. Summed over all triangles both are exact for what moves freely, and nothing is left of the place from where the
+volume is counted.
 """
 
 from dataclasses import dataclass
@@ -11,25 +16,28 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, at, cross, let, traced
 from diffsim_ti.state.pass_table import pass_at
+from diffsim_ti.terms.gas_law import gas_law
 
 A = ti.template()
-CHAMBERS = dict.fromkeys(("triangles", "own", "chamber", "begins", "anchor", "first_row"), "ints") | dict(
-    point="vectors", volume="scalars", felt="scalars"
+CHAMBERS = dict.fromkeys(("triangles", "chamber", "begins", "anchor", "first_row"), "ints") | dict(
+    point="vectors", volume="scalars", felt="scalars", weight="scalars", push="scalars"
 )
 SCENE = dict(rest="vectors", follower="vectors2")
 TABLE = dict(ints="ints", floats="scalars")
 NUMBERS = dict.fromkeys(("num_triangles", "num_sums", "pass_", "window", "slot", "first"), "int")
+law = ti.func(gas_law)
 
 
 @dataclass(frozen=True)
 class ChamberKernels(StepNumbers):
-    """parts: sums that each chamber's triangles are cut into."""
+    """parts: sums that each chamber's triangles are cut into. curved: whether faces are."""
 
     parts: int
     parallel: bool
     shape: bool
+    curved: bool
 
     @ti.func
     def sixth(self):
@@ -46,6 +54,10 @@ class ChamberKernels(StepNumbers):
             y = (scene.rest[i] - scene.rest[o]) + (u[s, i] - u[s, o])
         return y
 
+    @traced
+    def places(self, t, state, scene, chambers, plan) -> list:
+        return [let(self.place(t, a, state.u, plan.slot, scene, chambers)) for a in range(3)]
+
     @ti.func
     def change(self, t, a: A, tangent: A, chambers: A):
         """Its change."""
@@ -55,13 +67,53 @@ class ChamberKernels(StepNumbers):
             dy = dy - (tangent.rest[o] + tangent.u[0, o])
         return dy
 
+    @traced
+    def changes(self, t, tangent, chambers) -> list:
+        return [let(self.change(t, a, tangent, chambers)) for a in range(3)]
+
+    @traced
+    def pulls(self, t, adjoint, chambers) -> list:
+        """Adjoints of the forces at its corners."""
+        return [let(at(adjoint.w, 0, at(chambers.triangles, 3 * t + a))) for a in range(3)]
+
+    @traced
+    def swept(self, y) -> list:
+        """-6 times the derivatives of a triangle's share of the volume by its corners."""
+        return [let(cross(y[(a + 1) % 3], y[(a + 2) % 3])) for a in range(3)]
+
+    @traced
+    def swept_jvp(self, y, dy) -> list:
+        """Their change, which is symmetric."""
+        pairs = (((a + 1) % 3, (a + 2) % 3) for a in range(3))
+        return [let(cross(dy[b], y[c]) + cross(y[b], dy[c])) for b, c in pairs]
+
+    @traced
+    def normals(self, y) -> list:
+        """n_a of the three corners."""
+        return self.swept(y) if self.curved else [let(cross(y[1] - y[0], y[2] - y[0]))] * 3
+
+    @traced
+    def normals_jvp(self, y, dy) -> list:
+        if self.curved:
+            return self.swept_jvp(y, dy)
+        e, f, de, df = (let(x[a] - x[0]) for x in (y, dy) for a in (1, 2))
+        return [let(cross(de, f) + cross(e, df))] * 3
+
+    @traced
+    def normals_vjp(self, y, w) -> list:
+        """Adjoints of y for those of the normals."""
+        if self.curved:
+            return self.swept_jvp(y, w)
+        e, f, total = let(y[1] - y[0]), let(y[2] - y[0]), let(w[0] + w[1] + w[2])
+        by_e, by_f = let(cross(f, total)), let(cross(total, e))
+        return [let(self.vector(0) - (by_e + by_f)), by_e, by_f]
+
     @ti.func
-    def pull(self, t, adjoint: A, chambers: A):
-        """Sum of the adjoints of the forces at its corners."""
-        w = adjoint.w[0, chambers.triangles[3 * t]]
-        for a in ti.static((1, 2)):
-            w += adjoint.w[0, chambers.triangles[3 * t + a]]
-        return w
+    def dots(self, x: A, y: A):
+        """Sum of the inner products of what the corners have."""
+        return x[0].dot(y[0]) + x[1].dot(y[1]) + x[2].dot(y[2])
+
+    # ---- sums over a chamber -----------------------------------------------------------------------------------------
 
     @ti.func
     def sums(self, q, what: A, scene: A, at: A, more: A, chambers: A, plan: A):
@@ -70,14 +122,12 @@ class ChamberKernels(StepNumbers):
         begin, end = chambers.begins[c] + q % self.parts, chambers.begins[c + 1]
         for k in range((end - begin + self.parts - 1) // self.parts):
             t = begin + k * self.parts
-            y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
-            volume += y[0].dot(self.cross(y[1], y[2]))
+            y = self.places(t, at, scene, chambers, plan)
+            volume += chambers.weight[t] * y[0].dot(cross(y[1], y[2]))
             if ti.static(what == "jvp"):
-                for a in ti.static(range(3)):
-                    felt += self.change(t, a, more, chambers).dot(self.cross(y[(a + 1) % 3], y[(a + 2) % 3]))
+                felt += chambers.weight[t] * self.dots(self.changes(t, more, chambers), self.swept(y))
             if ti.static(what == "vjp"):
-                if chambers.own[t] > 0:
-                    felt += self.pull(t, more, chambers).dot(self.cross(y[1] - y[0], y[2] - y[0]))
+                felt += chambers.push[t] * self.dots(self.pulls(t, more, chambers), self.normals(y))
         chambers.volume[q] = self.sixth() * volume
         chambers.felt[q] = self.sixth() * felt
 
@@ -88,112 +138,76 @@ class ChamberKernels(StepNumbers):
             total += parts[c * self.parts + k]
         return total
 
-    # ---- the law -----------------------------------------------------------------------------------------------------
+    @ti.func
+    def numbers(self, c, now: A, rows: A, chambers: A):
+        """(p_0, p_out, V_0, n) of chamber c; p_0 is the mean of both kicks."""
+        at = chambers.first_row[c]
+        return self.mean(at, now, rows), rows[0, at + 1][0], rows[0, at + 2][0], rows[0, at + 3][0]
 
     @ti.func
-    def filling(self, at, now: A, rows: A):
-        """p_0, the mean of both kicks."""
-        p = ti.cast(0, self.fp)
-        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
-            ends = rows[self.row(force), at]
-            p += weight * (ends[0] + self.share(force, now) * (ends[1] - ends[0]))
-        return p
-
-    @ti.func
-    def law(self, at, V, now: A, rows: A):
-        """(p - p_out, absolute p, (V_0 / V)^n, log(V_0 / V), V_0, n)"""
-        outside, V0, n = rows[0, at + 1][0], rows[0, at + 2][0], rows[0, at + 3][0]
-        log = ti.log(V0 / V)
-        grown = ti.exp(n * log)
-        absolute = self.filling(at, now, rows) * grown
-        return absolute - outside, absolute, grown, log, V0, n
-
-    @ti.func
-    def law_jvp(self, at, swelling, now: A, absolute, grown, log, V0, n, rows: A):
-        """Change of p - p_out for dV / V and changes of the chamber's numbers."""
-        dp = grown * self.filling(at, now, rows) - n * absolute * swelling
-        dp += absolute * (n / V0 * rows[0, at + 2][0] + log * rows[0, at + 3][0])
-        return dp - rows[0, at + 1][0]
+    def law_at(self, c, now: A, scene: A, chambers: A):
+        """`gas_law` of chamber c."""
+        p0, outside, V0, n = self.numbers(c, now, scene.follower, chambers)
+        return law(p0, outside, V0, n, self.whole(c, chambers.volume))
 
     # ---- loops -------------------------------------------------------------------------------------------------------
 
     @ti.func
-    def all_forces(self, chambers: A, scene: A, at: A, out: A, table: A, plan: A):
+    def sum_up(self, what: A, scene: A, at: A, more: A, chambers: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for q in range(plan.num_sums):
-            self.sums(q, "value", scene, at, at, chambers, plan)
+            self.sums(q, what, scene, at, more, chambers, plan)
+
+    @ti.func
+    def all_forces(self, chambers: A, scene: A, at: A, out: A, table: A, plan: A):
+        self.sum_up("value", scene, at, at, chambers, plan)
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
-            c, f = chambers.chamber[t], self.vector(0)
-            if chambers.own[t] > 0:
-                now = pass_at(table, plan.pass_ - plan.window)
-                y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
-                V = self.whole(c, chambers.volume)
-                p, absolute, grown, log, V0, n = self.law(chambers.first_row[c], V, now, scene.follower)
-                f = self.sixth() * p * self.cross(y[1] - y[0], y[2] - y[0])
+            now = pass_at(table, plan.pass_ - plan.window)
+            p = self.law_at(chambers.chamber[t], now, scene, chambers)[0]
+            factor, normals = (
+                self.sixth() * p * chambers.push[t],
+                self.normals(self.places(t, at, scene, chambers, plan)),
+            )
             for a in ti.static(range(3)):
-                out.corner[plan.first + 3 * t + a] = f
+                out.corner[plan.first + 3 * t + a] = factor * normals[a]
 
     @ti.func
     def all_jvp(self, chambers: A, scene: A, at: A, tangent: A, out: A, table: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for q in range(plan.num_sums):
-            self.sums(q, "jvp", scene, at, tangent, chambers, plan)
+        self.sum_up("jvp", scene, at, tangent, chambers, plan)
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
-            c, df = chambers.chamber[t], self.vector(0)
-            if chambers.own[t] > 0:
-                now, first = pass_at(table, plan.pass_ - plan.window), chambers.first_row[c]
-                y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
-                dy = [self.change(t, a, tangent, chambers) for a in ti.static(range(3))]
-                V, dV = self.whole(c, chambers.volume), self.whole(c, chambers.felt)
-                p, absolute, grown, log, V0, n = self.law(first, V, now, scene.follower)
-                dp = self.law_jvp(first, dV / V, now, absolute, grown, log, V0, n, tangent.follower)
-                e, f, de, de2 = y[1] - y[0], y[2] - y[0], dy[1] - dy[0], dy[2] - dy[0]
-                df = self.sixth() * (p * (self.cross(de, f) + self.cross(e, de2)) + dp * self.cross(e, f))
+            now, c = pass_at(table, plan.pass_ - plan.window), chambers.chamber[t]
+            p, by_p0, by_outside, by_V0, by_n, slope = self.law_at(c, now, scene, chambers)
+            dp0, d_outside, dV0, dn = self.numbers(c, now, tangent.follower, chambers)
+            dp = by_p0 * dp0 + by_outside * d_outside + by_V0 * dV0 + by_n * dn + slope * self.whole(c, chambers.felt)
+            y, factor = self.places(t, at, scene, chambers, plan), self.sixth() * chambers.push[t]
+            normals, changes = self.normals(y), self.normals_jvp(y, self.changes(t, tangent, chambers))
             for a in ti.static(range(3)):
-                out.corner[plan.first + 3 * t + a] = df
+                out.corner[plan.first + 3 * t + a] = factor * (p * changes[a] + dp * normals[a])
 
     @ti.func
     def all_vjp(self, chambers: A, scene: A, at: A, adjoint: A, table: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for q in range(plan.num_sums):
-            self.sums(q, "vjp", scene, at, adjoint, chambers, plan)
+        self.sum_up("vjp", scene, at, adjoint, chambers, plan)
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
-            c, first = chambers.chamber[t], chambers.first_row[chambers.chamber[t]]
-            now = pass_at(table, plan.pass_ - plan.window)
-            y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
-            V, felt = self.whole(c, chambers.volume), self.whole(c, chambers.felt)
-            p, absolute, grown, log, V0, n = self.law(first, V, now, scene.follower)
-            by_V = self.sixth() * (ti.cast(-1, self.fp) * felt * n * absolute / V)
-            by0, by1 = by_V * self.cross(y[1], y[2]), by_V * self.cross(y[2], y[0])
-            by2 = by_V * self.cross(y[0], y[1])
-            if chambers.own[t] > 0:
-                w, e, f = self.pull(t, adjoint, chambers), y[1] - y[0], y[2] - y[0]
-                by_e, by_f = self.sixth() * p * self.cross(f, w), self.sixth() * p * self.cross(w, e)
-                by0 = by0 - (by_e + by_f)
-                by1 = by1 + by_e
-                by2 = by2 + by_f
-            for a, by in ti.static(enumerate((by0, by1, by2))):
+            now, c = pass_at(table, plan.pass_ - plan.window), chambers.chamber[t]
+            p, by_p0, by_outside, by_V0, by_n, slope = self.law_at(c, now, scene, chambers)
+            felt = self.whole(c, chambers.felt)  # the adjoint of p
+            y = self.places(t, at, scene, chambers, plan)
+            by_V, by_n_a = self.sixth() * chambers.weight[t] * (felt * slope), self.sixth() * chambers.push[t] * p
+            swept, turned = self.swept(y), self.normals_vjp(y, self.pulls(t, adjoint, chambers))
+            for a in ti.static(range(3)):
+                by = by_V * swept[a] + by_n_a * turned[a]
                 adjoint.corner[plan.first + 3 * t + a] = by
                 if ti.static(self.shape):
                     adjoint.chamber_rest[3 * t + a] = adjoint.chamber_rest[3 * t + a] + by
             if t == chambers.begins[c]:
-                self.add_numbers(4 * c, felt, absolute, grown, log, V0, n, now, adjoint)
-
-    @ti.func
-    def add_numbers(self, k, felt, absolute, grown, log, V0, n, now: A, adjoint: A):
-        """Adds the adjoints of a gas's numbers, of which that of its pressure is `felt`."""
-        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
-            share, r, ends = self.share(force, now), self.row(force), self.vector(0)
-            by = weight * felt * grown
-            ends[0], ends[1] = by * (1 - share), by * share
-            adjoint.chamber_felt[r, k] = adjoint.chamber_felt[r, k] + ends
-        for d, by in ti.static(((1, ti.cast(-1, self.fp)), (2, absolute * n / V0), (3, absolute * log))):
-            one = self.vector(0)
-            one[0] = felt * by
-            adjoint.chamber_felt[0, k + d] = adjoint.chamber_felt[0, k + d] + one
+                self.add_mean(4 * c, felt * by_p0, now, adjoint.chamber_felt)
+                for d, by in ti.static(((1, by_outside), (2, by_V0), (3, by_n))):
+                    one = self.vector(0)
+                    one[0] = felt * by
+                    adjoint.chamber_felt[0, 4 * c + d] = adjoint.chamber_felt[0, 4 * c + d] + one
 
     # ---- kernels -----------------------------------------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
 """The tangent and the adjoint of the stage that holds volumes (held_volumes.py), along recorded passes."""
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes, Walls, along, slopes
 from diffsim_ti.mechanics.chambers.record import ChamberRecord
+from diffsim_ti.mechanics.stage import Passes, Stage
 
 
 @dataclass
@@ -38,13 +40,12 @@ class HeldPass:
         return self.now.alpha * (self.now.pre + self.now.post)
 
 
-def recorded(held: HeldVolumes, j: int, slot: int, num_passes: int, save_every: int, shows: bool = False) -> HeldPass:
-    """Pass j from a slot on; shows: its velocity between kicks is looked at also where it is no frame's."""
-    ws, kept = held.ws, held.kept.get(slot + 1)
-    now, history = ws.numbers_of(j, num_passes), ws.record
+def recorded(held: HeldVolumes, at: Passes, shows: bool = False) -> HeldPass:
+    """A pass of the record; shows: its velocity between kicks is looked at also where it is no frame's."""
+    ws, kept, now, history, slot, j = held.ws, held.kept.get(at.end), at.now, at.history, at.slot, at.j
     u, v = held.rows(history.u, slot), held.rows(history.v, slot)
-    walls, ends = held.walls(u), held.rest + held.rows(history.u, slot + 1)
-    one = HeldPass(j, now, walls, ends, None if kept is None else kept[2], held.frame(j, save_every, now))
+    walls, ends = held.walls(u), held.rest + held.rows(history.u, at.end)
+    one = HeldPass(j, now, walls, ends, None if kept is None else kept[2], held.frame(j, at.save_every, now))
     if one.frame >= 0 or (shows and now.pre > 0):
         a, gravity = ws.arrays.values, ws.arrays.features().gravity
         weight = a.parameters[gravity:][:3] if gravity >= 0 else np.zeros(3)
@@ -54,91 +55,109 @@ def recorded(held: HeldVolumes, j: int, slot: int, num_passes: int, save_every: 
     return one
 
 
-class HeldTangent:
-    """Of a run; at: what holds the changes u and v of the state and of frames; change: those of all else."""
+class HeldTangent(Stage):
+    """Of a run, which holds the changes of the state and of frames, and those of all else."""
 
-    def __init__(self, at, held: HeldVolumes, change):
-        self.at, self.held, self.change = at, held, change
-        self.chambers = ChamberRecord(held.ws.solver, held.places)
-        self.rest, mass = change.rest[held.nodes], held.ws.arrays.values.mass[held.nodes, None]
-        self.inverse = -change.mass[held.nodes, None] / mass**2
+    def __init__(self, held: HeldVolumes, run):
+        self.held, self.change = held, run.tangent
+        run.chamber_record = self.chambers = ChamberRecord(held.ws.solver, held.places)
+        self.rest, mass = self.change.rest[held.nodes], held.ws.arrays.values.mass[held.nodes, None]
+        self.inverse = -self.change.mass[held.nodes, None] / mass**2
 
-    def before(self) -> None:
-        """A pass comes next."""
-        self.dx = self.rest + self.held.rows(self.at.u, 0)
+    @contextmanager
+    def tangent(self, at: Passes):
+        dx = self.rest + self.held.rows(at.run.u, 0)
+        with self.held.alone(at.history, at.end):
+            yield
+        self._after(at, dx)
 
-    def after(self, j: int, slot: int, num_passes: int, save_every: int, rate_dot: float) -> None:
-        """Pass j from a slot on is through, without the stage."""
-        held, at, one = self.held, self.at, recorded(self.held, j, slot, num_passes, save_every)
+    def _after(self, at: Passes, dx: np.ndarray) -> None:
+        """The rest of a pass is done, whose beginning changed by dx."""
+        held, run, j, one = self.held, at.run, at.j, recorded(self.held, at)
         walls, rows = one.walls, self.change.follower
         if one.s is not None:
-            du, dv = held.rows(at.u, 0), held.rows(at.v, 0)
-            G, pushed = walls.gradients(one.ends), walls.pushed_jvp(one.s, self.dx, self.inverse)
+            du, dv = held.rows(run.u, 0), held.rows(run.v, 0)
+            G, pushed = walls.gradients(one.ends), walls.pushed_jvp(one.s, dx, self.inverse)
             ds = np.linalg.solve(slopes(G, walls.d), held.targets(rows, j) - along(G, self.rest + du + pushed))
             way = np.tensordot(ds, walls.d, 1) + pushed
-            held.put(at.u, 0, du + way)
-            by_ratio = rate_dot * one.ratio_by_rate * np.tensordot(one.s, walls.d, 1)
-            held.put(at.v, 0, dv + one.ratio * way + by_ratio)
-            by_rate = one.now.alpha_by_rate / one.now.alpha * rate_dot
-            self.chambers.note(j, save_every, (ds - by_rate * one.s) / one.per_pressure)
+            held.put(run.u, 0, du + way)
+            by_ratio = run.rate_dot * one.ratio_by_rate * np.tensordot(one.s, walls.d, 1)
+            held.put(run.v, 0, dv + one.ratio * way + by_ratio)
+            by_rate = one.now.alpha_by_rate / one.now.alpha * run.rate_dot
+            self.chambers.note(j, at.save_every, (ds - by_rate * one.s) / one.per_pressure)
         if one.frame >= 0:
-            dv, pushed = held.rows(at.frames.frames_v, one.frame), walls.pushed_jvp(one.q, self.dx, self.inverse)
-            left = held.rates(rows, j) - along(walls.turned(self.dx), one.shown) - along(walls.g, dv + pushed)
+            dv, pushed = held.rows(run.frames.frames_v, one.frame), walls.pushed_jvp(one.q, dx, self.inverse)
+            left = held.rates(rows, j) - along(walls.turned(dx), one.shown) - along(walls.g, dv + pushed)
             dq = np.linalg.solve(slopes(walls.g, walls.d), left)
-            held.put(at.frames.frames_v, one.frame, dv + np.tensordot(dq, walls.d, 1) + pushed)
+            held.put(run.frames.frames_v, one.frame, dv + np.tensordot(dq, walls.d, 1) + pushed)
 
 
-class HeldAdjoint:
-    """Of a run: sums over passes; at: what holds the adjoints u and v of the state and of frames."""
+class HeldAdjoint(Stage):
+    """Of a run, which holds the adjoints of the state and of frames: sums over passes."""
 
-    def __init__(self, at, held: HeldVolumes):
-        self.at, self.held, self.chambers = at, held, ChamberRecord(held.ws.solver, held.places)
+    in_kicks = True  # where the velocity that a state shows is not yet tangent
+
+    def __init__(self, held: HeldVolumes, run):
+        self.held, self.drag = held, run.features.drag
+        run.chamber_record = self.chambers = ChamberRecord(held.ws.solver, held.places)
 
     def clear(self) -> None:
-        """A reverse sweep begins."""
         n, values = len(self.held.nodes), self.held.ws.arrays.values
         self.rest, self.inverse, self.by_rate = np.zeros((n, 3)), np.zeros((n, 1)), 0.0
         self.follower, self.halted = np.zeros_like(values.follower), None
 
-    def start(self, j: int, slot: int, num_passes: int, save_every: int, halts: bool) -> None:
-        """Go back through the stage of pass j from a slot on; all of the adjoint after it is in `at`.
+    @contextmanager
+    def adjoint(self, at: Passes):
+        if at.kick:
+            self._go_before_state(at.run)
+            yield
+            return
+        at.run.complete()
+        self._start(at)
+        with self.held.alone(at.history, at.end):
+            yield
+        if self.halted is not None:
+            self._halt(self.halted, at.run)
+        self.end(at.run)
 
-        halts: stop at the state that the pass shows, whose velocity is tangent.
-        """
-        held, at, schedule = self.held, self.at, self.held.ws.solver.schedule
-        one = recorded(held, j, slot, num_passes, save_every, halts)
+    def _start(self, at: Passes) -> None:
+        """Go back through the stage, which is the last thing that a pass does. Where the sweep stops at the state that the
+        pass shows, its velocity is tangent."""
+        held, run, j, save_every, schedule = self.held, at.run, at.j, at.save_every, self.held.ws.solver.schedule
+        halts = j == at.halt
+        one = recorded(held, at, halts)
         walls, self.by_x, rows = one.walls, np.zeros_like(self.rest), self.follower
         if one.s is not None:
-            u_adj, v_adj = held.rows(at.u, 0), held.rows(at.v, 0)
+            u_adj, v_adj = held.rows(run.u, 0), held.rows(run.v, 0)
             by_pressure = self.chambers.adjoint(j, save_every) / one.per_pressure
             G, way_adj = walls.gradients(one.ends), u_adj + one.ratio * v_adj
             mu = np.linalg.solve(slopes(G, walls.d).T, along(walls.d, way_adj) + by_pressure)
             z = -np.tensordot(mu, G, 1)
             self._push(walls, one.s, way_adj + z)
             self.rest += z
-            held.put(at.u, 0, u_adj + z)
+            held.put(run.u, 0, u_adj + z)
             schedule.add_pressure(rows, j, schedule.end(j), self._of_all(mu))
             self.by_rate += one.ratio_by_rate * float(one.s @ along(walls.d, v_adj))
             self.by_rate -= one.now.alpha_by_rate / one.now.alpha * float(by_pressure @ one.s)
         self.halted = one if halts and one.q is not None else None
         if one.frame >= 0 and not halts:
-            frame_adj = held.rows(at.frames.frames_v, one.frame)
-            held.put(at.frames.frames_v, one.frame, frame_adj + self._show(one, frame_adj))
+            frame_adj = held.rows(run.frames.frames_v, one.frame)
+            held.put(run.frames.frames_v, one.frame, frame_adj + self._show(one, frame_adj))
 
-    def _halt(self, one: HeldPass) -> None:
+    def _halt(self, one: HeldPass, run) -> None:
         """From the state between the kicks of a pass to that with a tangent velocity, of which all later ones are functions
         likewise."""
-        held, at = self.held, self.at
-        of_frame = held.rows(at.frames.frames_v, one.frame) if one.frame >= 0 else 0.0
-        self._push(one.walls, one.q, of_frame - held.rows(at.v, 0))
+        held = self.held
+        of_frame = held.rows(run.frames.frames_v, one.frame) if one.frame >= 0 else 0.0
+        self._push(one.walls, one.q, of_frame - held.rows(run.v, 0))
 
-    def go_before_state(self) -> None:
+    def _go_before_state(self, run) -> None:
         """Back from there."""
         if self.halted is not None:
-            held, at, self.by_x = self.held, self.at, np.zeros_like(self.rest)
-            v_adj = held.rows(at.v, 0)
-            held.put(at.v, 0, v_adj + self._show(self.halted, v_adj))
-            self._add_places()
+            held, self.by_x = self.held, np.zeros_like(self.rest)
+            v_adj = held.rows(run.v, 0)
+            held.put(run.v, 0, v_adj + self._show(self.halted, v_adj))
+            self.end(run)
         self.halted = None
 
     def _show(self, one: HeldPass, frame_adj: np.ndarray) -> np.ndarray:
@@ -164,18 +183,12 @@ class HeldAdjoint:
         out[self.held.columns] = by_target
         return out
 
-    def end(self) -> None:
-        """The rest of the pass is reversed: add what its beginning was to the stage."""
-        if self.halted is not None:
-            self._halt(self.halted)
-        self._add_places()
-
-    def _add_places(self) -> None:
+    def end(self, run) -> None:
+        """Add what the beginning of the pass was to the stage."""
         self.rest += self.by_x
-        self.held.put(self.at.u, 0, self.held.rows(self.at.u, 0) + self.by_x)
+        self.held.put(run.u, 0, self.held.rows(run.u, 0) + self.by_x)
 
-    def collect(self, out: Derived, drag: int) -> None:
-        """Add the adjoints of numbers."""
+    def collect(self, out: Derived) -> None:
         nodes = self.held.nodes
         out.follower += self.follower
         by_mass = np.zeros(len(out.displacement))
@@ -184,5 +197,5 @@ class HeldAdjoint:
         rest = np.zeros_like(out.displacement)
         rest[nodes] = self.rest
         out.rest = out.rest + rest
-        if drag >= 0:
-            out.parameters[drag] += self.by_rate
+        if self.drag >= 0:
+            out.parameters[self.drag] += self.by_rate

@@ -11,13 +11,14 @@ Leimkuhler, Reich 2004, Simulating Hamiltonian Dynamics, 7.2, doi:10.1017/CBO978
 """
 
 import weakref
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from diffsim_ti.mechanics.chambers.pressures import rows_of
+from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.runtime.slots import VertexRows
 from diffsim_ti.terms import Chamber, FilledChamber
@@ -97,7 +98,7 @@ def along(G: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.tensordot(G, x, ([1, 2], [0, 1]))
 
 
-class HeldVolumes:
+class HeldVolumes(Stage):
     """Those of a run's scene; `pressures` [Pa] of the last pass and of frames, `work` [J] on the body so far."""
 
     def __init__(self, workspace):
@@ -112,10 +113,6 @@ class HeldVolumes:
         self._own = VertexRows(workspace.arrays, self.nodes)
         self.rows, self.put = self._own.get, self._own.put
         self.kept = {}  # of recorded passes, by the slot they led to: places and velocities before the stage, and s
-        self.clear()
-
-    def clear(self) -> None:
-        """A run begins."""
         self.last, self.of_frames, self.work = np.zeros(len(self.places)), {}, 0.0
 
     def spread(self, pressures: np.ndarray) -> np.ndarray:
@@ -156,14 +153,15 @@ class HeldVolumes:
 
     # ---- in passes ---------------------------------------------------------------------------------------------------
 
-    def before_pass(self, history, slot: int) -> None:
-        """A pass begins at a slot."""
-        self._begin = self.rows(history.u, slot), self.rows(history.v, slot)
+    @contextmanager
+    def do(self, at: Passes):
+        u, before = self.rows(at.history.u, at.slot), self.rows(at.history.v, at.slot)
+        yield
+        self._after(at, u, before)
 
-    def after_pass(self, history, slot: int, plan: tuple, recording: bool) -> None:
-        """Pass j of `plan`, (j, number of passes, steps between frames), led to a slot."""
-        (u, before), (j, num_passes, save_every) = self._begin, plan
-        now, given = self.ws.numbers_of(j, num_passes), self.ws.arrays.rows["follower"]
+    def _after(self, at: Passes, u: np.ndarray, before: np.ndarray) -> None:
+        """The rest of a pass, which began with displacements u and velocities `before`, is done."""
+        history, slot, j, now, given = at.history, at.end, at.j, at.now, self.ws.arrays.rows["follower"]
         walls, self.kept[slot] = self.walls(u), None
         u_next, v_next = self.rows(history.u, slot), self.rows(history.v, slot)
         if not np.all(np.isfinite(u_next)):  # the guard of the run will say so
@@ -171,17 +169,17 @@ class HeldVolumes:
         if now.alpha > 0:
             s = walls.meet(self.rest + u_next, self.targets(given, j))
             if s is None:
-                raise self._lost(j, num_passes, u_next, given)
+                raise self._lost(j, at.num_passes, u_next, given)
             way, self.last = np.tensordot(s, walls.d, 1), s / (now.alpha * (now.pre + now.post))
             self.put(history.u, slot, u_next + way)
             self.put(history.v, slot, v_next + now.decay / now.alpha * way)
-            if recording:
+            if at.stride:
                 self.kept[slot] = u_next, v_next, s
             self._count_work(now, before, v_next / now.decay, way / now.alpha, walls)
-            counted = int(self.ws.solver.schedule.shown(j + 1, save_every))
+            counted = int(self.ws.solver.schedule.shown(j + 1, at.save_every))
             if counted >= 0:
                 self.of_frames[counted] = self.last
-        frame = self.frame(j, save_every, now)
+        frame = self.frame(j, at.save_every, now)
         if frame >= 0:
             shown = self.rows(self.ws.frames.frames_v, frame)
             self.put(self.ws.frames.frames_v, frame, shown + self.tangent_part(walls, shown, self.rates(given, j))[0])

@@ -10,6 +10,7 @@ from diffsim_ti.mechanics.chambers.pressures import ChamberPressure, rows_of
 from diffsim_ti.mechanics.interaction import add_at
 from diffsim_ti.mechanics.pressure.interaction import Pressing
 from diffsim_ti.terms import FilledChamber, GasChamber
+from diffsim_ti.terms.gas_law import gas_law
 
 WORKS = "gases and filled chambers"
 
@@ -49,18 +50,15 @@ class Gases(Pressing):
         if shape:
             add_at(out.rest, self.vertices, found["chamber_rest"])
 
-    @property
-    def stiff_over_time(self):
-        return self.terms
-
     def added_omega2(self, values, derived):
-        """At rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices, of each chamber."""
+        """At rest: -dp/dV sum |dV/dx|^2 / m of the free vertices, of each chamber."""
         free, out = np.delete(np.arange(self.mesh.num_vertices), self.scene.fixed), 0.0
         for chamber in self.terms:
             names = self.scene.input_names(chamber)
             p = np.max(values[names[chamber.plain]])
             V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
-            out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
+            slope = gas_law(p, 0.0, V, values[names["gas_exponent"]], V)[-1]
+            out -= float(slope * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
         return out
 
 

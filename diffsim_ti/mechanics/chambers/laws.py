@@ -3,6 +3,7 @@
 import numpy as np
 
 from diffsim_ti.terms import FilledChamber
+from diffsim_ti.terms.gas_law import gas_law
 
 
 class Gas:
@@ -17,23 +18,21 @@ class Gas:
         """Numbers of a pass; share: of the load."""
         self.numbers, self.share = numbers, share
 
-    def _absolute(self, V: float) -> float:
-        p0, _, V0, n = self.numbers
-        return p0 * (V0 / V) ** n if V > 0 else np.inf
+    def _law(self, V: float) -> np.ndarray:
+        """p and its derivatives by the numbers and V; infinite where no volume is left."""
+        return self.share * np.array(gas_law(*self.numbers.tolist(), float(V))) if V > 0 else np.full(6, np.inf)
 
     def pressure(self, V: float) -> float:
         """p [Pa]."""
-        return self.share * (self._absolute(V) - self.numbers[1])
+        return float(self._law(V)[0])
 
     def slope(self, V: float) -> float:
         """dp/dV [Pa/m^3]."""
-        return -self.share * self.numbers[3] * self._absolute(V) / V
+        return float(self._law(V)[5])
 
     def by_numbers(self, V: float) -> np.ndarray:
         """Derivatives of p by the numbers."""
-        p0, _, V0, n = self.numbers
-        p = self._absolute(V)
-        return self.share * np.array([p / p0, -1.0, n * p / V0, p * np.log(V0 / V)])
+        return self._law(V)[1:5]
 
     def work(self, V: float, change: float) -> float:
         """Integral of p dV from V to V + change [J]; of a volume that vanishes, minus infinity."""
@@ -41,7 +40,8 @@ class Gas:
             return -np.inf
         m, grown = 1 - self.numbers[3], np.log1p(change / V)
         per_V = grown if abs(m * grown) < 1e-12 else np.expm1(m * grown) / m
-        return self.share * (self._absolute(V) * V * per_V - self.numbers[1] * change)
+        absolute = gas_law(*self.numbers.tolist(), float(V))[0] + self.numbers[1]
+        return self.share * (absolute * V * per_V - self.numbers[1] * change)
 
 
 class Held:

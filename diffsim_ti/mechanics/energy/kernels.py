@@ -8,7 +8,7 @@ import taichi as ti
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, assign, kernels_of, let, traced
+from diffsim_ti.runtime import Bundle, Kernel, assign, kernels_of, let, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed, with_held, with_pass
@@ -29,7 +29,7 @@ class PotentialKernels:
 
     @property
     def fp(self):
-        return PRECISIONS[self.law.precision]
+        return self.law.fp
 
     @cached_property
     def element(self):

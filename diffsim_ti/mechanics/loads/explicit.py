@@ -4,26 +4,60 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.runtime import assign, at, let, number_type, traced, vector_type
 from diffsim_ti.state.features import Features
+from diffsim_ti.state.pass_table import between, kicks
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
 class GivenForces:
-    """Functions of one vertex i."""
+    """Functions of one vertex i, and of lists of numbers for who reads rows of forces in a manner of its own."""
 
     features: Features
     precision: str
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
+    fp, vector = number_type, vector_type
 
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
+    @traced
+    def terms(self, now, has) -> list:
+        """(row, how far in its step, weight) of the forces of a pass: of the two steps that share its kicks, or of all that
+        do not change; no share where they do not change within a step. has: 1, or 0 where there is no force."""
+        F = self.features
+        if not (F.forces_keyed or F.forces_per_step):
+            return [(0, None, has)]
+        return [(r, s if F.forces_keyed else None, let(w * has)) for r, s, w in kicks(now, F.forces_per_step, self.fp)]
+
+    @traced
+    def mean(self, read, now, has=1) -> list:
+        """Numbers of the force of a pass: `read(row, end)` gives those of a row, at the beginning of its step (end = 0) or
+        at its end (1)."""
+        total = None
+        for row, share, weight in self.terms(now, has):
+            own = read(row, 0)
+            if share is not None:
+                own = [between(x, y, share) for x, y in zip(own, read(row, 1))]
+            own = [let(weight * x) for x in own]
+            total = own if total is None else [let(x + y) for x, y in zip(total, own)]
+        return total
+
+    @traced
+    def mean_vjp(self, add, by: list, now, has=1) -> None:
+        """Its transpose: `add(row, end, numbers)`."""
+        for row, share, weight in self.terms(now, has):
+            weights = (weight,) if share is None else (let(weight * (1 - share)), let(weight * share))
+            for end, own in enumerate(weights):
+                add(row, end, [let(own * x) for x in by])
+
+    @traced
+    def place(self, k, end: int):
+        """Of force k in a row."""
+        return 2 * k + end if self.features.forces_keyed else k
+
+    @traced
+    def own_force(self, k, now, forces):
+        return self.mean(lambda row, end: [at(forces, row, self.place(k, end))], now)[0]
 
     @ti.func
     def force(self, i, now: A, scene: A, forces: A):
@@ -31,33 +65,8 @@ class GivenForces:
         f = self.vector(0)
         k = scene.force_slot[i]
         if k >= 0:
-            if ti.static(self.features.forces_keyed):
-                f = now.share0 * self.keyed_force(now.force0, k, now, forces)
-                f += now.share1 * self.keyed_force(now.force1, k, now, forces)
-            else:
-                f = forces[0, k]
-                if ti.static(self.features.forces_per_step):
-                    f = now.share0 * forces[now.force0, k] + now.share1 * forces[now.force1, k]
+            f = self.own_force(k, now, forces)
         return f
-
-    @ti.func
-    def row_of_step(self, step):
-        """The row of forces that holds in a step."""
-        r = 0
-        if ti.static(self.features.forces_per_step):
-            r = step
-        return r
-
-    @ti.func
-    def share_of_step(self, step, now: A):
-        """How far in a step the pass lies: it ends a step before its own."""
-        return ti.select(step == now.row, now.begin, ti.cast(1, self.fp))
-
-    @ti.func
-    def keyed_force(self, step, k, now: A, forces: A):
-        """The force of a step that changes from its beginning to its end."""
-        begin, end = forces[self.row_of_step(step), 2 * k], forces[self.row_of_step(step), 2 * k + 1]
-        return begin + self.share_of_step(step, now) * (end - begin)
 
     @ti.func
     def gathered(self, i, scene: A, plan: A, pulls: A):
@@ -72,17 +81,16 @@ class GivenForces:
             f = f + scene.corner[c]
         return f
 
+    @traced
+    def add_own(self, k, f_adj, now, adjoint) -> None:
+        def add(row, end, numbers):
+            target = at(adjoint.forces, row, self.place(k, end))
+            assign(target, target + numbers[0])
+
+        self.mean_vjp(add, [f_adj], now)
+
     @ti.func
     def add_vjp(self, i, f_adj, now: A, scene: A, adjoint: A):
         k = scene.force_slot[i]
         if k >= 0:
-            if ti.static(self.features.forces_keyed):
-                for step, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
-                    r, share = self.row_of_step(step), self.share_of_step(step, now)
-                    adjoint.forces[r, 2 * k] = adjoint.forces[r, 2 * k] + weight * (1 - share) * f_adj
-                    adjoint.forces[r, 2 * k + 1] = adjoint.forces[r, 2 * k + 1] + weight * share * f_adj
-            elif ti.static(self.features.forces_per_step):
-                adjoint.forces[now.force0, k] = adjoint.forces[now.force0, k] + now.share0 * f_adj
-                adjoint.forces[now.force1, k] = adjoint.forces[now.force1, k] + now.share1 * f_adj
-            else:
-                adjoint.forces[0, k] = adjoint.forces[0, k] + f_adj
+            self.add_own(k, f_adj, now, adjoint)

@@ -1,20 +1,23 @@
 """Changes and adjoints of what faces do in recorded explicit passes (felt_faces.py): pushes, and then friction."""
 
+from contextlib import contextmanager
+
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.felt_faces import Alone, FeltFaces
+from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.pair_friction import ratio_by_rate
 from diffsim_ti.mesh import geometry
 from diffsim_ti.runtime.slots import VertexRows
 
 
-class FaceChanges:
+class FaceChanges(Stage):
     """Changes, or adjoints, of what faces do in recorded passes."""
 
-    def __init__(self, faces: FeltFaces, features):
-        a, self.faces, self.features = faces.a, faces, features
+    def __init__(self, faces: FeltFaces, run):
+        a, self.faces, self.features = faces.a, faces, run.features
         self.shift_dot, self.speed_dot, self.seed, self.begin_dot = (
             runtime.array(a.vector, faces.num_surface) for _ in range(4)
         )
@@ -29,48 +32,56 @@ class FaceChanges:
 
 
 class FeltTangent(FaceChanges):
-    """The tangent of passes; at: what holds the changes u and v of the state, numbers: those of all else."""
+    """The tangent of passes; run: what holds the changes of the state and of all else."""
 
-    def __init__(self, tangent, faces: FeltFaces):
-        super().__init__(faces, tangent.features)
-        self.at, self.of_all = tangent, (tangent, tangent.numbers)
+    @contextmanager
+    def tangent(self, at: Passes):
+        alone, run = self.faces.alone(at), at.run
+        if alone is None:
+            yield
+            return
+        with alone:
+            self._run("begin_jvp", alone, at.numbers, tangent=run)
+            yield
+            before = runtime.fetch_row(run.v, 0) if run.impulses else None
+            self._push(alone, at)
+            if run.impulses:
+                change = runtime.fetch_row(run.v, 0) - before
+                run.impulses.add_jvp(at.numbers, alone.speed, change, run.tangent.mass, alone.pushes)
+            of_friction = self._slide(alone, run)
+            if run.impulses:
+                run.impulses.add_friction(at.numbers, of_friction)
 
-    def start(self, alone: Alone, plan: dict) -> None:
-        """Before the rest of the pass."""
-        self._run("begin_jvp", alone, plan, tangent=self.at)
-
-    def end(self, alone: Alone, plan: dict) -> None:
-        """After it."""
-        alone.go(plan)
+    def _push(self, alone: Alone, at: Passes) -> None:
+        alone.go(at.numbers)
         if self.faces.friction:
             runtime.fill(self.impulse_dot, 0)
-        self._run_parts("jvp", alone, plan, tangent=self.of_all)
+        self._run_parts("jvp", alone, at.numbers, tangent=(at.run, at.run.numbers))
 
-    def slide(self, alone: Alone, change: Derived, rate_dot: float) -> np.ndarray | None:
-        """Then that of friction; the changes of the impulses of each obstacle that rubs, where one does."""
+    def _slide(self, alone: Alone, run) -> np.ndarray | None:
+        """Then friction; the changes of the impulses of each obstacle that rubs, where one does."""
         rub, faces, nodes = alone.rub, self.faces, self.rows.nodes
         if rub is None:
             return None
-        a, u, v = faces.a, self.rows.get(self.at.u, 0), self.rows.get(self.at.v, 0)
+        a, change, u, v = faces.a, run.tangent, self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         dx = runtime.fetch(self.begin_dot).astype(np.float64) + change.rest[nodes]
         inverse_dot = -(faces.friction.inverse**2) * change.mass[nodes, None]
         walls = a.walls.jvp(a.rows["path"], change.path, rub.moment)
         impulses = faces.impulses(self.impulse_dot)
         gained, each = faces.friction.jvp(rub, impulses, v, dx, inverse_dot, change.parameters, walls)
-        self.rows.put(self.at.v, 0, v + gained)
-        by_rate = rate_dot * ratio_by_rate(rub.now) * rub.gained
-        self.rows.put(self.at.u, 0, u + rub.ratio * gained + by_rate)
+        self.rows.put(run.v, 0, v + gained)
+        by_rate = run.rate_dot * ratio_by_rate(rub.now) * rub.gained
+        self.rows.put(run.u, 0, u + rub.ratio * gained + by_rate)
         return each
 
 
 class FeltAdjoint(FaceChanges):
     """The adjoint of passes: sums over them, by faces and surface vertices."""
 
-    def __init__(self, adjoint, faces: FeltFaces):
-        super().__init__(faces, adjoint.features)
-        a, features = faces.a, adjoint.features
-        self.at, self.of_all = adjoint, (adjoint, adjoint.numbers)
-        self.path, self.num_parts = adjoint.path, adjoint.num_parts
+    def __init__(self, faces: FeltFaces, run):
+        super().__init__(faces, run)
+        a, features = faces.a, run.features
+        self.path, self.num_parts = run.path, run.num_parts
         self.sums = runtime.array(a.fp, features.num_parameters, faces.num_faces)
         self.felt = runtime.array(a.vector, 2 * features.moving, faces.num_faces if features.moving else 1)
         self.rest_adj, self.by_areas = runtime.array(a.vector, faces.num_surface), runtime.array(a.fp, faces.num_faces)
@@ -79,21 +90,41 @@ class FeltAdjoint(FaceChanges):
         for x in (self.sums, self.felt, self.rest_adj, self.by_areas):
             runtime.fill(x, 0)
         values = self.faces.a.values
-        self.parameters, self.by_rate = np.zeros_like(values.parameters), 0.0
+        self.parameters, self.by_rate, self.by_mass = np.zeros_like(values.parameters), 0.0, np.zeros_like(values.mass)
         self.path_adj = None if values.path is None else np.zeros_like(values.path)
         self.inverse, self.rest = np.zeros((self.faces.num_surface, 1)), np.zeros((self.faces.num_surface, 3))
 
-    def slide(self, alone: Alone, impulses_adj: np.ndarray | None = None) -> None:
+    @contextmanager
+    def adjoint(self, at: Passes):
+        alone, run = self.faces.alone(at), at.run
+        if alone is None:
+            yield
+            return
+        with alone:
+            run.complete()
+            self._slide(alone, run, run.impulses.seed_friction(at.numbers) if run.impulses else None)
+            by_speed = run.impulses.seed(at.numbers, alone.pushes) if run.impulses else None
+            if by_speed is None:
+                self._push(alone, at)
+            else:
+                runtime.fill(run.v, runtime.fetch(run.v) + by_speed)
+                self._push(alone, at)
+                runtime.fill(run.v, runtime.fetch(run.v) - by_speed)
+                self.by_mass += run.impulses.by_mass(at.numbers, alone.speed, alone.pushes)
+            yield
+            self._run("begin_vjp", alone, at.numbers, adjoint=run)
+
+    def _slide(self, alone: Alone, run, impulses_adj: np.ndarray | None) -> None:
         """Go back through friction, the very last thing; impulses_adj: of those of each obstacle that rubs."""
         rub, faces, self._by_x = alone.rub, self.faces, None
         if rub is None:
             if faces.friction:
                 runtime.fill(self.impulse_dot, 0)
             return
-        p, q = self.rows.get(self.at.u, 0), self.rows.get(self.at.v, 0)
+        p, q = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         by = faces.friction.vjp(rub, q + rub.ratio * p, impulses_adj)
         self.by_rate += ratio_by_rate(rub.now) * float((p * rub.gained).sum())
-        self.rows.put(self.at.v, 0, q + by.v)
+        self.rows.put(run.v, 0, q + by.v)
         felt = np.zeros((faces.num_faces, len(faces.a.contacts), *by.impulses.shape[1:]))
         np.add.at(felt, (rub.face, faces.friction.number[rub.obstacle]), by.impulses)
         runtime.fill(self.impulse_dot, felt.reshape(-1, 3))
@@ -104,22 +135,17 @@ class FeltAdjoint(FaceChanges):
         if self.path_adj is not None:
             faces.a.walls.vjp(faces.a.rows["path"], by.walls, rub.moment, self.path_adj)
 
-    def start(self, alone: Alone, plan: dict) -> None:
-        """Go back through the contact of faces, the last thing that the pass did."""
-        alone.go(plan)
-        plan = plan | dict(steps=1, num_parts=self.num_parts)
-        self._run_parts("vjp", alone, plan, back=True, adjoint=self.of_all, out=self)
+    def _push(self, alone: Alone, at: Passes) -> None:
+        alone.go(at.numbers)
+        plan = at.numbers | dict(steps=1, num_parts=self.num_parts)
+        self._run_parts("vjp", alone, plan, back=True, adjoint=(at.run, at.run.numbers), out=self)
         if self._by_x is not None:
             runtime.fill(self.begin_dot, runtime.fetch(self.begin_dot) + self._by_x)
 
-    def end(self, alone: Alone, plan: dict) -> None:
-        """The rest of the pass is reversed."""
-        self._run("begin_vjp", alone, plan, adjoint=self.at)
-
     def collect(self, out: Derived) -> None:
         """Add the adjoints of parameters, masses, paths and rest positions to a `Derived`."""
-        nodes, mass = self.rows.nodes, np.zeros_like(out.mass)
-        mass[nodes] = -(self.inverse * self.faces.friction.inverse**2)[:, 0]
+        nodes, mass = self.rows.nodes, self.by_mass.copy()
+        mass[nodes] += -(self.inverse * self.faces.friction.inverse**2)[:, 0]
         out.mass = out.mass + mass
         out.parameters[: len(self.parameters)] += self.parameters
         out.rest[nodes] += self.rest

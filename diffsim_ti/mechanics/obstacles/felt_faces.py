@@ -1,5 +1,7 @@
 """Faces of a run of an explicit solver that feel obstacles between their corners."""
 
+from contextlib import contextmanager
+
 import numpy as np
 import taichi as ti
 
@@ -8,6 +10,7 @@ from diffsim_ti.mechanics.obstacles.explicit_face_kernels import face_kernels
 from diffsim_ti.mechanics.obstacles.face_derivatives import face_derivatives
 from diffsim_ti.mechanics.obstacles.face_friction import FaceFriction
 from diffsim_ti.mechanics.obstacles.face_lattice import BENT, lattices, nodes_of_faces, shortened
+from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mesh.curved_triangles import are_felt
 from diffsim_ti.runtime.slots import VertexRows, copy_slot
 from diffsim_ti.terms.obstacles.barrier import beta
@@ -31,7 +34,7 @@ def feels_faces(scene, bend: float = 0.0) -> bool:
     )
 
 
-class FeltFaces:
+class FeltFaces(Stage):
     """Their arrays, and what kernels (explicit_face_kernels.py) do with them, at a slot of a run's states.
 
     A pass is gone in a power of two of parts, `most_parts` at most: in each no face goes farther than TRAVEL widths, and
@@ -90,7 +93,8 @@ class FeltFaces:
         kernel = getattr(kernels(features, a.precision, ws.parallel), name)
         # bound anew with the scene's, or with more room for parts
         launches = ws.kept(("faces", id(self.place)), lambda: (self.place, {}))[1]
-        key = (kernel, id(state.u), *(id(x) for x in records.values()))
+        parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
+        key = (kernel, id(state.u), *map(id, parts))
         if key not in launches:
             own = dict(scene=a, faces=self, state=state, table=ws.table)
             launches[key] = kernel.bind(**own, **records), state, records
@@ -115,15 +119,20 @@ class FeltFaces:
 
     # ---- in passes ---------------------------------------------------------------------------------------------------
 
+    @contextmanager
+    def do(self, at: Passes):
+        self.before_pass(at.history, at.slot)
+        yield
+        self._after(at)
+
     def before_pass(self, history, slot: int) -> None:
         """A pass begins at a slot."""
         copy_slot(history.u, slot, self.begin, 0)
 
-    def after_pass(
-        self, history, slot: int, plan: dict, num_passes: int, recording: bool, asked: bool = False
-    ) -> np.ndarray | None:
-        """The pass led to a slot: go its way again where faces come near, and note what they did; where it is `asked`,
-        the velocity that their pushes have added."""
+    def _after(self, at: Passes) -> None:
+        """The rest of the pass is done: go its way again where faces come near, and note what they did."""
+        history, slot, plan, recording = at.history, at.end, at.numbers, at.stride > 0
+        asked = self.ws.impulses is not None
         self.kept.pop(slot, None)
         self.rub = None
         self.run("approaches", plan, history, slot)
@@ -141,11 +150,12 @@ class FeltFaces:
             u, v = (runtime.fetch_row(x, slot) if recording or asked else None for x in (history.u, history.v))
             self.run("ends", plan, history, slot, n, watch=self.ws.watch)
             pushed = runtime.fetch_row(history.v, slot) - v if asked else None
-            self._slide(history, slot, plan, num_passes)
+            self._slide(history, slot, plan, at.num_passes)
             if recording:
                 self.kept[slot] = n, (u, v), self.pushes, self.rub
-            return pushed
-        return None
+            if asked:
+                self.ws.impulses.add(plan, pushed, self.pushes)
+                self.ws.impulses.add_friction(plan, self.impulses_of_friction())
 
     def _slide(self, history, slot: int, plan: dict, num_passes: int) -> None:
         """Friction of what was pushed."""
@@ -195,9 +205,9 @@ class FeltFaces:
         self.run("begins", plan, history, slot, n)
         self.run_parts("parts_of_pass", plan, history, slot, n)
 
-    def alone(self, history, slot: int) -> "Alone | None":
-        """The recorded pass to a slot without contact within faces, if there was some."""
-        return Alone(self, history, slot) if slot in self.kept else None
+    def alone(self, at: Passes) -> "Alone | None":
+        """The recorded pass without contact within faces, if there was some."""
+        return Alone(self, at.history, at.end) if at.end in self.kept else None
 
     # ---- between passes ----------------------------------------------------------------------------------------------
 

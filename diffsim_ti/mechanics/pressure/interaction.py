@@ -15,6 +15,7 @@ from diffsim_ti.terms import Chamber, Pressure
 class Pressing(Interaction):
     """What presses on the surface as it is: pressures and what fills chambers, whose numbers share rows."""
 
+    # pressures, then numbers of chambers, as each step begins and ends, and 0: (1 or steps, loads and numbers, 3)
     derived = dict(follower="vectors2")
 
     def links(self, own):

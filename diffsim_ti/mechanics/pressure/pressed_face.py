@@ -39,13 +39,6 @@ class PressedFace(PressedTriangle):
         return [tuple(self.times(by[1:, d], y) for d in range(2)) for by in BY]
 
     @traced
-    def product(self, a, b):
-        """a x b"""
-        (a0, a1, a2), (b0, b1, b2) = ([at(v, d) for d in range(3)] for v in (a, b))
-        zero = ti.cast(0, self.fp)
-        return let(self.vector(a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0, zero))
-
-    @traced
     def put(self, t, first, crosses, corner) -> None:
         """Forces of nodes from what points have."""
         for a in range(6):
@@ -53,7 +46,7 @@ class PressedFace(PressedTriangle):
 
     @traced
     def push(self, t, p, scene, state, s, first) -> None:
-        crosses = [let(self.product(e, f) * p) for e, f in self.tangents(t, state.u, scene.rest, s, scene)]
+        crosses = [let(self.cross(e, f) * p) for e, f in self.tangents(t, state.u, scene.rest, s, scene)]
         self.put(t, first, crosses, scene.corner)
 
     @traced
@@ -61,8 +54,8 @@ class PressedFace(PressedTriangle):
         changes = []
         both = zip(self.tangents(t, state.u, scene.rest, s, scene), self.tangents(t, tangent.u, tangent.rest, 0, scene))
         for (e, f), (de, df) in both:
-            turned = self.product(de, f) + self.product(e, df)
-            changes.append(let(turned * p + self.product(e, f) * dp))
+            turned = self.cross(de, f) + self.cross(e, df)
+            changes.append(let(turned * p + self.cross(e, f) * dp))
         self.put(t, first, changes, scene.corner)
 
     @traced
@@ -72,9 +65,9 @@ class PressedFace(PressedTriangle):
         by_s, by_t, felt = [], [], []
         for q, (e, f) in enumerate(self.tangents(t, state.u, scene.rest, s, scene)):
             own = self.times(SHARES[q], w)
-            by_s.append(let(self.product(f, own) * p))
-            by_t.append(let(self.product(own, e) * p))
-            n = self.product(e, f)
+            by_s.append(let(self.cross(f, own) * p))
+            by_t.append(let(self.cross(own, e) * p))
+            n = self.cross(e, f)
             felt += [at(own, d) * at(n, d) for d in range(3)]
         for a in range(6):
             by = let(self.times(BY[:, a, 0], by_s) + self.times(BY[:, a, 1], by_t))
@@ -96,7 +89,7 @@ class PressedFace(PressedTriangle):
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
         p = self.factor(t, now, scene.follower, scene)
         felt = self.push_vjp(t, p, scene, state, s, adjoint, self.first(plan))
-        self.add_felt(t, now, ti.cast(-1.0 / 6.0, self.fp) * felt, adjoint)
+        self.add_mean(t, ti.cast(-1.0 / 6.0, self.fp) * felt, now, adjoint.pressed_felt)
 
 
 def pressed_element(order: int, precision: str, per_step: bool, shape: bool) -> PressedTriangle:

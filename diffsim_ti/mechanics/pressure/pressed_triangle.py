@@ -38,11 +38,7 @@ class PressedTriangle(StepNumbers, ItemForce):
     @ti.func
     def factor(self, t, now: A, rows: A, scene: A):
         """-p / 6, by which the product of edges gives the force of a corner."""
-        load, p = scene.pressed_load[t], ti.cast(0, self.fp)
-        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
-            ends = rows[self.row(force), load]
-            p += weight * (ends[0] + self.share(force, now) * (ends[1] - ends[0]))
-        return p * ti.cast(-1.0 / 6.0, self.fp)  # the mean of both kicks
+        return self.mean(scene.pressed_load[t], now, rows) * ti.cast(-1.0 / 6.0, self.fp)
 
     @ti.func
     def store(self, t, first, force, corner: A):
@@ -77,12 +73,4 @@ class PressedTriangle(StepNumbers, ItemForce):
             adjoint.corner[self.first(plan) + 3 * t + a] = by
             if ti.static(self.shape):
                 adjoint.pressed_rest[3 * t + a] = adjoint.pressed_rest[3 * t + a] + by
-        self.add_felt(t, now, ti.cast(-1.0 / 6.0, self.fp) * w.dot(self.cross(e, f)), adjoint)
-
-    @ti.func
-    def add_felt(self, t, now: A, felt, adjoint: A):
-        """Adds the adjoint of the pressure."""
-        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
-            share, r, ends, by = self.share(force, now), self.row(force), self.vector(0), weight * felt
-            ends[0], ends[1] = by * (1 - share), by * share
-            adjoint.pressed_felt[r, t] = adjoint.pressed_felt[r, t] + ends
+        self.add_mean(t, ti.cast(-1.0 / 6.0, self.fp) * w.dot(self.cross(e, f)), now, adjoint.pressed_felt)

@@ -207,15 +207,14 @@ class BodyStage(BodyTangent):
     # ---- the pass ------------------------------------------------------------------------------------------------------
 
     @ti.func
-    def gather(self, b, j, scene: A, adjoint: A, plan: A):
+    def gather(self, b, scene: A, adjoint: A):
         """What the pass after this one has left at corners of tetrahedra."""
-        if j < plan.num_passes - 1:
-            for m in range(scene.body_first[b], scene.body_first[b + 1]):
-                i = scene.body_vertex[m]
-                adjoint.u[0, i] = adjoint.u[0, i] + self.vertex.element.gather(i, scene, adjoint.corner)
-                if ti.static(self.vertex.reads_rates):
-                    of_rates = self.vertex.element.gather(i, scene, adjoint.rate_corner)
-                    adjoint.v[0, i] = adjoint.v[0, i] + of_rates
+        for m in range(scene.body_first[b], scene.body_first[b + 1]):
+            i = scene.body_vertex[m]
+            adjoint.u[0, i] = adjoint.u[0, i] + self.vertex.element.gather(i, scene, adjoint.corner)
+            if ti.static(self.vertex.reads_rates):
+                of_rates = self.vertex.element.gather(i, scene, adjoint.rate_corner)
+                adjoint.v[0, i] = adjoint.v[0, i] + of_rates
 
     @ti.func
     def spread_vjp(self, b, slot, source: A, q: A, scene: A, adjoint: A):
@@ -284,7 +283,7 @@ class BodyStage(BodyTangent):
     def step_vjp(self, b, j, now: A, scene: A, state: A, adjoint: A, plan: A):
         """Back through the stage: leaves adjoints of u and v before the pass and of forces in adjoint.u, .v and .w."""
         s = j - plan.base
-        self.gather(b, j, scene, adjoint, plan)
+        self.gather(b, scene, adjoint)
         plain_u, v, plain = self.nearest(b, state, s, state.f, s, scene)
         u = self.placed(b, plain_u, scene)
         f = self.with_gravity(plain, scene.parameters)

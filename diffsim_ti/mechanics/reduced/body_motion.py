@@ -18,7 +18,7 @@ body, revisited, doi:10.1007/s10208-004-0118-6.
 
 import taichi as ti
 
-from diffsim_ti.runtime import Bundle, let, traced
+from diffsim_ti.runtime import Bundle, cross, let, traced
 
 VECTOR = ti.types.vector(4, ti.f64)
 A = ti.template()  # columns, a Bundle of x, y, z
@@ -27,11 +27,6 @@ A = ti.template()  # columns, a Bundle of x, y, z
 @traced
 def columns(x, y, z):
     return Bundle(x=let(x), y=let(y), z=let(z))
-
-
-@ti.func
-def cross(a, b):
-    return VECTOR(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x, 0)
 
 
 @ti.func

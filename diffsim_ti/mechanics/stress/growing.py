@@ -3,6 +3,7 @@
 import taichi as ti
 
 from diffsim_ti.runtime import let, traced
+from diffsim_ti.state.pass_table import kicks
 
 
 class Growing:
@@ -20,14 +21,11 @@ class Growing:
     @traced
     def _growth_weights(self, of) -> list:
         """(row, weight of its beginning, of its end) for each part."""
-        one, out = ti.cast(1, self.fp), []
+        one = ti.cast(1, self.fp)
         if not hasattr(of, "now"):
             return [(0, let(one - one), let(one))]
-        now = of.now
-        for force, weight in ((now.force0, now.share0), (now.force1, now.share1)):
-            share = let(ti.select(force == now.row, now.begin, one))
-            out.append((force if self.growth[0] else 0, let(weight * (one - share)), let(weight * share)))
-        return out
+        parts = kicks(of.now, self.growth[0], self.fp)
+        return [(row, let(weight * (one - share)), let(weight * share)) for row, share, weight in parts]
 
     @traced
     def grown(self, item, p: list, of) -> list:

@@ -16,7 +16,10 @@ from diffsim_ti.runtime import LANES, assign, at, let
 
 @dataclass(frozen=True)
 class Items:
-    """Reading and writing of items in a float type; nodes: how many each tetrahedron has."""
+    """Reading and writing of items in a float type; nodes: how many each tetrahedron has.
+
+    `entries(array, slots, first, count, rows, item)` of a subclass: the elements of an array where numbers of an item lie.
+    """
 
     fp: object
     nodes: int = 4
@@ -24,6 +27,26 @@ class Items:
     @cached_property
     def vector(self):
         return ti.types.vector(4, self.fp)
+
+    def numbers(self, array, first: int, count: int, rows: int, item):
+        """`count` numbers from `first` on, of the `rows` that each item has."""
+        return [let(x) for x in self.entries(array, (), first, count, rows, item)]
+
+    def row(self, array, slot, first: int, count: int, rows: int, item):
+        """The same in a slot of an array of slots."""
+        return [let(x) for x in self.entries(array, (slot,), first, count, rows, item)]
+
+    def put(self, array, rows: int, item, first: int, numbers):
+        for target, number in zip(self.entries(array, (), first, len(numbers), rows, item), numbers):
+            assign(target, number)
+
+    def put_row(self, array, slot, first: int, rows: int, item, numbers):
+        for target, number in zip(self.entries(array, (slot,), first, len(numbers), rows, item), numbers):
+            assign(target, number)
+
+    def add(self, array, rows: int, item, numbers, first: int = 0):
+        for target, number in zip(self.entries(array, (), first, len(numbers), rows, item), numbers):
+            assign(target, target + number)
 
     @staticmethod
     def put_force(target, force, add: bool):
@@ -41,20 +64,9 @@ class Block(Items):
     def broadcast(self, number):
         return let(self.lanes(*[number] * LANES))
 
-    def numbers(self, array, first: int, count: int, rows: int, item):
-        """`count` numbers from `first` on, of the `rows` that each block has."""
+    def entries(self, array, slots: tuple, first: int, count: int, rows: int, item):
         begin = let(rows * item + first)
-        return [let(at(array, begin + k if k else begin)) for k in range(count)]
-
-    def row(self, array, slot, first: int, count: int, rows: int, item):
-        """The same in a slot of an array of slots."""
-        begin = let(rows * item + first)
-        return [let(at(array, slot, begin + k if k else begin)) for k in range(count)]
-
-    def put_row(self, array, slot, first: int, rows: int, item, numbers):
-        begin = let(rows * item + first)
-        for k, number in enumerate(numbers):
-            assign(at(array, slot, begin + k), number)
+        return (at(array, *slots, begin + k if k else begin) for k in range(count))
 
     def corners(self, vectors, slot, tets, item):
         """[a][d]: component d of the vector at node a."""
@@ -73,17 +85,6 @@ class Block(Items):
                 force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
                 self.put_force(at(corner, begin + (self.nodes * lane + a)), force, add)
 
-    def put(self, array, rows: int, item, first, numbers):
-        begin = let(rows * item + first)
-        for k, number in enumerate(numbers):
-            assign(at(array, begin + k), number)
-
-    def add(self, array, rows: int, item, numbers, first: int = 0):
-        begin = let(rows * item + first)
-        for k, number in enumerate(numbers):
-            target = at(array, begin + k)
-            assign(target, target + number)
-
 
 class Single(Items):
     """One tetrahedron: item e is tetrahedron e, a lane of its block."""
@@ -95,18 +96,9 @@ class Single(Items):
         """(where the block's numbers from `first` on begin, lane)"""
         return let(rows * (item // LANES) + first), let(item % LANES)
 
-    def numbers(self, array, first: int, count: int, rows: int, item):
+    def entries(self, array, slots: tuple, first: int, count: int, rows: int, item):
         begin, lane = self._place(rows, item, first)
-        return [let(at(at(array, begin + k if k else begin), lane)) for k in range(count)]
-
-    def row(self, array, slot, first: int, count: int, rows: int, item):
-        begin, lane = self._place(rows, item, first)
-        return [let(at(at(array, slot, begin + k if k else begin), lane)) for k in range(count)]
-
-    def put_row(self, array, slot, first: int, rows: int, item, numbers):
-        begin, lane = self._place(rows, item, first)
-        for k, number in enumerate(numbers):
-            assign(at(at(array, slot, begin + k), lane), number)
+        return (at(at(array, *slots, begin + k if k else begin), lane) for k in range(count))
 
     def corners(self, vectors, slot, tets, item):
         begin, lane = self._place(self.nodes * LANES, item)
@@ -119,14 +111,3 @@ class Single(Items):
         begin = let(begin if first is None else begin + first)
         for a in range(self.nodes):
             self.put_force(at(corner, begin + a), self.vector(*forces[a], zero), add)
-
-    def put(self, array, rows: int, item, first, numbers):
-        begin, lane = self._place(rows, item, first)
-        for k, number in enumerate(numbers):
-            assign(at(at(array, begin + k), lane), number)
-
-    def add(self, array, rows: int, item, numbers, first: int = 0):
-        begin, lane = self._place(rows, item, first)
-        for k, number in enumerate(numbers):
-            target = at(at(array, begin + k), lane)
-            assign(target, target + number)

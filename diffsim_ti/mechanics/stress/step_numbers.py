@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.runtime import number_type, traced, vector_type
+from diffsim_ti.state.pass_table import between, kicks
 
 A = ti.template()
 
@@ -16,28 +17,26 @@ class StepNumbers:
     precision: str
     per_step: bool
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
+    fp, vector = number_type, vector_type
 
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
-
-    @ti.func
-    def row(self, force):
-        """The row that a kick of a step takes."""
-        r = 0
-        if ti.static(self.per_step):
-            r = force
-        return r
+    @traced
+    def kicks(self, now) -> list:
+        """(row, how far in its step the pass lies, weight) of the two kicks that a pass is made of."""
+        return kicks(now, self.per_step, self.fp)
 
     @ti.func
-    def share(self, force, now: A):
-        """How far in that step the pass lies: it ends a step before its own."""
-        return ti.select(force == now.row, now.begin, ti.cast(1, self.fp))
+    def mean(self, place, now: A, rows: A):
+        """The mean over both kicks of a number that goes from [0] to [1] of rows[step, place] within each step."""
+        out = ti.cast(0, self.fp)
+        for row, share, weight in ti.static(self.kicks(now)):
+            ends = rows[row, place]
+            out += weight * between(ends[0], ends[1], share)
+        return out
 
     @ti.func
-    def cross(self, a, b):
-        zero = ti.cast(0, self.fp)
-        return self.vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], zero)
+    def add_mean(self, place, by, now: A, adjoint: A):
+        """Adds the adjoint of such a number to adjoint[step, place], `by` being that of its mean."""
+        for row, share, weight in ti.static(self.kicks(now)):
+            ends = self.vector(0)
+            ends[0], ends[1] = weight * by * (1 - share), weight * by * share
+            adjoint[row, place] = adjoint[row, place] + ends

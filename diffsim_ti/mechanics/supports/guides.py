@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.runtime import vector_type
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 GUIDED = dict(guide_slot="ints", guides="vectors")
@@ -21,9 +21,7 @@ class Guides:
     precision: str
     motion: bool
 
-    @property
-    def vector(self):
-        return ti.types.vector(4, PRECISIONS[self.precision])
+    vector = vector_type
 
     @ti.func
     def held(self, i, x, scene: A):

@@ -10,7 +10,8 @@ doi:10.1016/0020-7683(86)90014-4.
 import numpy as np
 
 from diffsim_ti.mechanics.interactions import host_forces
-from diffsim_ti.mesh.sets import pieces
+from diffsim_ti.mesh.geometry import inner_faces
+from diffsim_ti.mesh.sets import components, pieces
 from diffsim_ti.terms.supports import motions_left
 
 MOST = 200  # parts that hang on each other, whose motions are found together
@@ -29,19 +30,8 @@ def free_motions(scene) -> str:
 
 def parts_of(mesh) -> np.ndarray:
     """For each tetrahedron the number of the part, joined by faces, that it belongs to."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    corners, n, m = np.sort(mesh.tetrahedra, 1).astype(np.int64), mesh.num_vertices, mesh.num_tetrahedra
-    keys = [
-        (corners[:, a] * n + corners[:, b]) * n + corners[:, c]
-        for a, b, c in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))
-    ]
-    keys = np.concatenate(keys)
-    order = np.argsort(keys, kind="stable")
-    same = np.flatnonzero(np.diff(keys[order]) == 0)
-    pairs = order[same] % m, order[same + 1] % m
-    return connected_components(coo_matrix((np.ones(len(same), bool), pairs), (m, m)), directed=False)[1]
+    pairs, _ = inner_faces(mesh.tetrahedra, mesh.num_vertices)
+    return components(*pairs.T, mesh.num_tetrahedra)
 
 
 class Rows:

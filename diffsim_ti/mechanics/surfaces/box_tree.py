@@ -14,7 +14,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.runtime import LANES, NUMPY, PRECISIONS, Kernel, kernels_of
+from diffsim_ti.runtime import LANES, NUMPY, Kernel, kernels_of, number_type, vector_type
 
 A = ti.template()
 GROUP = LANES  # primitives in a leaf
@@ -86,13 +86,7 @@ class BoxKernels:
     parallel: bool
     size: int
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
+    fp, vector = number_type, vector_type
 
     @property
     def rounding(self) -> float:

@@ -197,8 +197,8 @@ class CurvedFriction:
         n = len(self.rows.nodes)
         self.by_mass, self.by_rate, self.by_place = np.zeros((n, 1)), 0.0, np.zeros((n, 3))
 
-    def slide_vjp(self, history, slot: int, plan, adjoint, pending: bool) -> None:
-        """As there; the adjoints are complete, nothing is pending."""
+    def slide_vjp(self, history, slot: int, plan, adjoint) -> None:
+        """As there; the adjoints are complete."""
         self.by_place, kept, inner = np.zeros_like(self.by_place), self.kept.get(slot + 1), self.inner
         if kept is None:
             return

@@ -12,7 +12,7 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import Launches
 from diffsim_ti.mechanics.surfaces.curved_friction import friction_of
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
-from diffsim_ti.runtime import PRECISIONS, Kernel, kernels_of
+from diffsim_ti.runtime import Kernel, kernels_of, vector_type
 
 A = ti.template()
 ROWS = dict(start="ints", index="ints", weight="scalars")
@@ -35,9 +35,7 @@ class Transfer:
         own = dict(rows=ROWS, at=dict(source=source, target=target))
         return Kernel(name, body, self.precision, own, dict(count="int") | numbers)
 
-    @property
-    def vector(self):
-        return ti.types.vector(4, PRECISIONS[self.precision])
+    vector = vector_type
 
     @ti.func
     def refine_all(self, rows: A, at: A, plan: A):

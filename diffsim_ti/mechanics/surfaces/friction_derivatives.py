@@ -126,11 +126,9 @@ class FrictionDerivatives(FrictionKernels):
     def pull(self, s, scene: A, at: A, plan: A):
         """Adjoint of the impulse on surface vertex s; adds that of its mass and of the drag."""
         i = scene.surface[s]
-        p, q = at.u_adj[0, i], at.v_adj[0, i]
-        if plan.pending > 0:
-            p += self.gathered(i, at.corner_adj, at)
-            if plan.rates > 0:
-                q += self.gathered(i, at.rate_corner, at)
+        p, q = at.u_adj[0, i] + self.gathered(i, at.corner_adj, at), at.v_adj[0, i]
+        if plan.rates > 0:
+            q += self.gathered(i, at.rate_corner, at)
         inverse, gained = at.inverse_mass[i], at.kept_v[plan.keep, s] - at.v[plan.slot, i]
         by_gained = q + plan.ratio * p
         at.by_rate[s] = at.by_rate[s] + plan.ratio_by_rate * p.dot(gained)
@@ -270,9 +268,9 @@ class FrictionDerivatives(FrictionKernels):
     @cached_property
     def slide_vjp(self) -> Kernel:
         """Adjoint of the velocity before the stage, of the displacement `place[begin]` where the pass began (`by_place`);
-        adds those of all else. pending: whether corners still hold a part of the adjoints u_adj, v_adj after it."""
+        adds those of all else. Corners still hold a part of the adjoints u_adj, v_adj after it."""
         at = self.state | dict(place="vectors2", u_adj="vectors2", v_adj="vectors2", start="ints", corners="ints")
         at |= dict(corner_adj="vectors", rate_corner="vectors", by_place="vectors")
         at |= dict.fromkeys(("by_rate", "by_mass", "by_speed", "by_mu"), "scalars")
-        numbers = dict.fromkeys(("begin", "pending", "rates", "num_rows"), "int") | dict(ratio_by_rate="float")
+        numbers = dict.fromkeys(("begin", "rates", "num_rows"), "int") | dict(ratio_by_rate="float")
         return self.kernel("slide_vjp", self.slide_all_vjp, at, OWN | ADJ | SUMS, **PASS, **numbers)

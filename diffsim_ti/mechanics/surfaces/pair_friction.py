@@ -129,10 +129,10 @@ class PairFriction:
         for array in self.adjoints.values():
             runtime.fill(array, 0)
 
-    def slide_vjp(self, history, slot: int, plan, adjoint, pending: bool) -> None:
+    def slide_vjp(self, history, slot: int, plan, adjoint) -> None:
         """From the adjoints of the state after the pass from a slot to that before the stage; with `alone`.
 
-        adjoint: has u, v and the corners that still hold a part of them, if `pending`. `by_place` has then to be added.
+        adjoint: has u, v and the corners that still hold a part of them. `by_place` has then to be added.
         """
         self._begin(history, slot)
         self.take("weights_adj", "pressing_adj")
@@ -140,7 +140,7 @@ class PairFriction:
         at = self._state(history) | self.adjoints | dict(place=history.u, u_adj=adjoint.u, v_adj=adjoint.v)
         at |= dict(start=self.a.start, corners=self.a.corner_of)
         at |= dict(corner_adj=adjoint.corner, rate_corner=adjoint.rate_corner)
-        own = dict(begin=slot, pending=int(pending), rates=int(adjoint.rate_corner.shape[0] > 1))
+        own = dict(begin=slot, rates=int(adjoint.rate_corner.shape[0] > 1))
         own |= dict(num_rows=self.num_rows, ratio_by_rate=ratio_by_rate(plan))
         self.run(self.derivatives.slide_vjp, at, slot=slot + 1, keep=slot + 1, **own, **self.pass_numbers(plan))
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.runtime import number_type, vector_type
 from diffsim_ti.terms.obstacles import barrier
 
 A = ti.template()
@@ -38,17 +38,11 @@ class Pair:
 
     precision: str
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
+    fp, vec4 = number_type, vector_type
 
     @property
     def vec3(self):
         return ti.types.vector(3, self.fp)
-
-    @property
-    def vec4(self):
-        return ti.types.vector(4, self.fp)
 
     @property
     def flat(self):

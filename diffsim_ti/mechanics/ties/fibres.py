@@ -13,6 +13,7 @@ import taichi as ti
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
 from diffsim_ti.mechanics.ties.pull import across
 from diffsim_ti.runtime import LANES, assign, at, let, traced
+from diffsim_ti.state.pass_table import between
 
 
 @dataclass(frozen=True)
@@ -76,11 +77,10 @@ class FibreBlock(StepNumbers):
     def tension(self, t, now, rows):
         """The mean of both kicks, from rows of steps."""
         out = None
-        for force, weight in ((now.force0, now.share0), (now.force1, now.share1)):
-            r, share = let(self.row(force)), let(self.share(force, now))
+        for r, share, weight in self.kicks(now):
             pulls = [let(at(rows, r, 2 * t + 2 * k)) for k in range(LANES)]
             begin, end = (let(self.lanes(*(at(x, d) for x in pulls))) for d in (0, 1))
-            own = let(weight * (begin + share * (end - begin)))
+            own = let(weight * between(begin, end, share))
             out = own if out is None else let(out + own)
         return out
 
@@ -139,8 +139,8 @@ class FibreBlock(StepNumbers):
                 target = at(adjoint.tie_rest, p + 2 * k if k else p)
                 assign(target, target + self.vector(*(at(x, k) for x in push), zero))
         by_T = let(self.dot(unit, w) * there)
-        for force, weight in ((now.force0, now.share0), (now.force1, now.share1)):
-            r, share, by = let(self.row(force)), let(self.share(force, now)), let(weight * by_T)
+        for r, share, weight in self.kicks(now):
+            by = let(weight * by_T)
             begin, end = let((1 - share) * by), let(share * by)
             for k in range(LANES):
                 target = at(adjoint.tie_felt, r, 2 * t + 2 * k)

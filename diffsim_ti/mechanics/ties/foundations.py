@@ -18,7 +18,7 @@ class FoundationForce(VertexwiseForce):
 
     name = "foundation"
     arrays = dict(foundation_slot="ints")  # place among those on one, or -1
-    derived = dict(foundation="vectors")  # three rows of K each
+    derived = dict(foundation="vectors")  # three rows of K each [N/m]
     adjoints = dict(foundation_felt="vectors")
 
     @traced

@@ -24,7 +24,7 @@ class SpringsAndCables(Interaction):
     that is given, however long it is (by_tension), and whether what is given changes within steps (keyed).
     """
 
-    name, kinds, pulls, least = "ties", (Spring, Cable), True, ("cable_length",)
+    name, kinds, pulls = "ties", (Spring, Cable), True
     derived = TieForce.derived
 
     def __init__(self, scene, terms):
@@ -44,12 +44,10 @@ class SpringsAndCables(Interaction):
         """What each spring, cable or fibre has of its term."""
         return np.repeat(of_terms, [len(term.paths(self.mesh)) for term in self.terms])
 
-    def places(self, tie) -> slice:
-        """Places of a term's own, given by its name or as the scene lists it."""
-        own = np.flatnonzero(
-            self._of_each(np.arange(len(self.terms))) == self.scene.place_among(self.terms, tie, "spring or cable")
-        )
-        return slice(int(own[0]), int(own[-1]) + 1)
+    def places(self, number: int) -> slice:
+        """Places of a term's own among them."""
+        ends = np.cumsum([0, *(len(term.paths(self.mesh)) for term in self.terms)]).tolist()
+        return slice(*ends[number : number + 2])
 
     def links(self, own):
         rows, segments = ([f"{own[t]} {part}" for t in self.terms] for part in ("rows", "segments"))
@@ -66,7 +64,7 @@ class SpringsAndCables(Interaction):
     @property
     def num_fibre_blocks(self) -> int:
         """Eights of fibres, the last ties, where kernels may take them so."""
-        fibres = int(self._of_each([term.of_fibres for term in self.terms]).sum())
+        fibres = sum(len(term.paths(self.mesh)) for term in self.terms if term.of_fibres)
         return (self.scene.law.lanes and runtime.runs_on_cpu()) * (fibres // LANES)
 
     @property
@@ -91,10 +89,6 @@ class SpringsAndCables(Interaction):
         """By tension and slack as each step begins and ends (inputs/ties.py)."""
         ends = values.ties.reshape(len(values.ties), -1, 2, 3)[..., :2]
         return bool((ends == ends[0, :, :, :1]).all())
-
-    @property
-    def stiff_over_time(self):
-        return tuple(term for term in self.terms if isinstance(term, Cable))
 
 
 class Foundations(Interaction):

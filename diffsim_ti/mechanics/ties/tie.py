@@ -12,6 +12,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
 from diffsim_ti.mechanics.ties import pull
+from diffsim_ti.state.pass_table import between
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 tension, tension_jvp, across = (ti.func(f) for f in (pull.tension, pull.tension_jvp, pull.across))
@@ -49,11 +50,10 @@ class TieElement(StepNumbers):
     def numbers(self, t, now: A, rows: A):
         """(a, s, k), the mean of both kicks."""
         out = self.vector(0)
-        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
-            pull, slack = rows[self.row(force), 2 * t], rows[self.row(force), 2 * t + 1]
-            share = self.share(force, now)
-            out[0] += weight * (pull[0] + share * (pull[1] - pull[0]))
-            out[1] += weight * (slack[0] + share * (slack[1] - slack[0]))
+        for r, share, weight in ti.static(self.kicks(now)):
+            pull, slack = rows[r, 2 * t], rows[r, 2 * t + 1]
+            out[0] += weight * between(pull[0], pull[1], share)
+            out[1] += weight * between(slack[0], slack[1], share)
             out[2] += weight * pull[2]
         return out
 
@@ -168,8 +168,7 @@ class TieElement(StepNumbers):
                     adjoint.tie_rest[p] = adjoint.tie_rest[p] + after - e_adj * self.unit(D)
                 self.store(p, before - after, first, scene, adjoint.corner)
                 before = after
-        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
-            share, r = self.share(force, now), self.row(force)
+        for r, share, weight in ti.static(self.kicks(now)):
             by_a, by_s = weight * T_adj, weight * e_adj
             pull = self.vector((1 - share) * by_a, share * by_a, weight * T_adj * pulled[1], zero)
             slack = self.vector((1 - share) * by_s, share * by_s, zero, zero)

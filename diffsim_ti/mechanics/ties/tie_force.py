@@ -27,6 +27,7 @@ class TieForce(ItemForce):
     name, pulls, asks_for_steps = "ties", True, True
     arrays = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_sides"), "ints")
     arrays |= dict(point_weight="scalars")
+    # between points at rest (points, 3) [m]; numbers of each (inputs/ties.py), (1 or steps, 2 ties, 3)
     derived = dict(tie_segments="vectors", ties="vectors2")
     adjoints = dict(tie_felt="vectors2", tie_rest="vectors")
 

@@ -86,20 +86,80 @@ class ExplicitKernels:
         rows = 2 * self.vertex.obstacles.num_obstacles
         return Bundle(**vars(now), into=let(ti.select(now.counted >= 0, now.counted * rows, -1)))
 
-    @traced
-    def pass_of(self, j, table, plan):
-        """Pass j."""
-        return self.counted(pass_at(table, j - plan.window))
+    # ---- which scene a loop's item or vertex k is of, where they are of many (batch/innermost_kernels.py) ---------------
 
     @traced
-    def pass_on(self, j, scene, table, plan):
-        """Pass j on the way forward."""
-        return with_drag(self.vertex, self.pass_of(j, table, plan), scene)
+    def split(self, k, plan) -> tuple:
+        """(item or vertex, number b of its scene)"""
+        return k, 0
 
     @traced
-    def told(self, of, j, table, plan):
-        """The scene, or changes of it, that knows pass j, where tetrahedra grow."""
-        return Bundle(**vars(of), now=pass_at(table, j - plan.window)) if self.vertex.features.growing else of
+    def scene_of(self, b, scene, plan):
+        return scene
+
+    @traced
+    def record_of(self, b, record, plan):
+        """Its state, change or adjoint."""
+        return record
+
+    @traced
+    def numbers_of(self, b, j, table, plan):
+        """Of its pass j."""
+        return pass_at(table, j - plan.window)
+
+    @traced
+    def rated(self, b, tangent, plan):
+        """The numbers of a kernel with the change of its drag rate."""
+        return plan
+
+    @traced
+    def scene_at(self, k, j, scene, state, table, plan) -> tuple:
+        """(item or vertex, b, numbers of pass j, scene, state)"""
+        i, b = self.split(k, plan)
+        return i, b, self.numbers_of(b, j, table, plan), self.scene_of(b, scene, plan), self.record_of(b, state, plan)
+
+    @traced
+    def item(self, e, plan):
+        """Tetrahedron e for functions of these."""
+        return e
+
+    @traced
+    def tetrahedron_at(self, e, j, table, plan) -> tuple:
+        """(tetrahedron e, numbers of pass j if they are asked for)"""
+        asked = self.element.has_state or self.vertex.features.growing
+        now = self.numbers_of(self.split(e, plan)[1], j, table, plan) if asked else Bundle()
+        return self.item(e, plan), now
+
+    @traced
+    def tetrahedra_of(self, record, now):
+        """The scene for functions of tetrahedra, which knows its pass where they grow."""
+        return Bundle(**vars(record), now=now) if self.vertex.features.growing else record
+
+    changed = tetrahedra_of  # changes of it
+
+    @traced
+    def on(self, now, scene):
+        """A pass at vertices on the way forward."""
+        return with_drag(self.vertex, self.counted(now), scene)
+
+    @traced
+    def back(self, now, j, plan):
+        """The same on the way back."""
+        return self.counted(self.vertex.obstacles.noting(reversed_pass(now, j, plan), plan))
+
+    @traced
+    def after(self, plan):
+        """Number of tetrahedra and of what else writes to corners."""
+        return self.items.after(plan)
+
+    @traced
+    def num_vertices(self, plan):
+        return plan.num_vertices
+
+    @traced
+    def num_parts(self, plan):
+        """Of sums of adjoints of a path."""
+        return plan.num_parts
 
     @ti.func
     def turn_of_first(self, item, table: A):
@@ -129,25 +189,33 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra(e, j, scene, state, table, plan)
             else:
-                now, s = pass_at(table, j - plan.window), (j - plan.base) * plan.stride
-                self.items.forces(e - plan.num_items, now, scene, state, s, plan)
+                self.act(e - plan.num_items, j, scene, state, table, plan)
         else:
             self.tetrahedra(e, j, scene, state, table, plan)
 
     @ti.func
     def tetrahedra(self, e, j, scene: A, state: A, table: A, plan: A):
-        s = (j - plan.base) * plan.stride
-        of = self.told(scene, j, table, plan)
-        self.element.forces(e, of, state, s, scene.corner)
+        item, now = self.tetrahedron_at(e, j, table, plan)
+        of, s = self.tetrahedra_of(scene, now), (j - plan.base) * plan.stride
+        self.element.forces(item, of, state, s, scene.corner)
         if ti.static(self.element.has_state):
-            now = pass_at(table, j - plan.window)
-            self.element.move_on(e, of, state, s, s + plan.stride, self.onwards(now))
+            self.element.move_on(item, of, state, s, s + plan.stride, self.onwards(now))
+
+    @ti.func
+    def act(self, k, j, scene: A, state: A, table: A, plan: A):
+        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+        self.items.forces(i, now, own, at_, (j - plan.base) * plan.stride, plan)
+
+    @ti.func
+    def at_vertex(self, k, j, scene: A, state: A, table: A, plan: A):
+        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+        self.vertex.step(i, j, self.on(now, own), own, at_, plan)
 
     @ti.func
     def passes(self, scene: A, state: A, table: A, plan: A):
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
-            num_items, num_vertices = self.items.after(plan), plan.num_vertices  # both bounds are read by one task
+            num_items, num_vertices = self.after(plan), self.num_vertices(plan)  # both bounds are read by one task
             for e in range(num_items):
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
@@ -155,18 +223,17 @@ class ExplicitKernels:
             for i in range(num_vertices):
                 turn = self.turn_of_second(i, table, plan)
                 if turn < plan.count:
-                    j = plan.first + turn
-                    self.vertex.step(i, j, self.pass_on(j, scene, table, plan), scene, state, plan)
+                    self.at_vertex(i, plan.first + turn, scene, state, table, plan)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
-                    now = self.pass_on(plan.first, scene, table, plan)
+                    now = self.on(self.numbers_of(0, plan.first, table, plan), scene)
                     self.bodies.step(b, plan.first, now, scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
                 for e in range(self.items.after(plan)):
                     self.elements(e, j, scene, state, table, plan)
-                now = self.pass_on(j, scene, table, plan)
+                now = self.on(self.numbers_of(0, j, table, plan), scene)
                 for i in range(plan.num_vertices):
                     self.vertex.step(i, j, now, scene, state, plan)
                 if ti.static(self.reduced):
@@ -186,24 +253,33 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
             else:
-                now, s = pass_at(table, j - plan.window), j - plan.base
-                self.items.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan)
+                self.act_jvp(e - plan.num_items, j, scene, state, tangent, table, plan)
         else:
             self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
 
     @ti.func
     def tetrahedra_jvp(self, e, j, scene: A, state: A, tangent: A, table: A, plan: A):
-        s = j - plan.base
-        of, dots = self.told(scene, j, table, plan), self.told(tangent, j, table, plan)
-        self.element.forces_jvp(e, of, state, s, tangent, scene.corner, dots)
+        item, now = self.tetrahedron_at(e, j, table, plan)
+        of, dots, s = self.tetrahedra_of(scene, now), self.changed(tangent, now), j - plan.base
+        self.element.forces_jvp(item, of, state, s, tangent, scene.corner, dots)
         if ti.static(self.element.has_state):
-            now = pass_at(table, j - plan.window)
-            self.element.move_on_jvp(e, of, state, s, tangent, dots, self.onwards(now))
+            self.element.move_on_jvp(item, of, state, s, tangent, dots, self.onwards(now))
+
+    @ti.func
+    def act_jvp(self, k, j, scene: A, state: A, tangent: A, table: A, plan: A):
+        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+        self.items.forces_jvp(i, now, own, at_, j - plan.base, self.record_of(b, tangent, plan), plan)
+
+    @ti.func
+    def at_vertex_jvp(self, k, j, scene: A, state: A, tangent: A, table: A, plan: A):
+        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+        change, rated = self.record_of(b, tangent, plan), self.rated(b, tangent, plan)
+        self.vertex.step_jvp(i, j, self.counted(now), own, at_, change, rated)
 
     @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
         if ti.static(self.parallel):
-            num_items, num_vertices = self.items.after(plan), plan.num_vertices
+            num_items, num_vertices = self.after(plan), self.num_vertices(plan)
             for e in range(num_items):
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
@@ -211,18 +287,17 @@ class ExplicitKernels:
             for i in range(num_vertices):
                 turn = self.turn_of_second(i, table, plan)
                 if turn < plan.count:
-                    j = plan.first + turn
-                    self.vertex.step_jvp(i, j, self.pass_of(j, table, plan), scene, state, tangent, plan)
+                    self.at_vertex_jvp(i, plan.first + turn, scene, state, tangent, table, plan)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
-                    now = self.pass_of(plan.first, table, plan)
+                    now = self.counted(self.numbers_of(0, plan.first, table, plan))
                     self.bodies.step_jvp(b, plan.first, now, scene, state, tangent, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
                 for e in range(self.items.after(plan)):
                     self.elements_jvp(e, j, scene, state, tangent, table, plan)
-                now = self.pass_of(j, table, plan)
+                now = self.counted(self.numbers_of(0, j, table, plan))
                 for i in range(plan.num_vertices):
                     self.vertex.step_jvp(i, j, now, scene, state, tangent, plan)
                 if ti.static(self.reduced):
@@ -244,57 +319,64 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
             else:
-                now, s = pass_at(table, j - plan.window), j - plan.base
-                self.items.forces_vjp(e - plan.num_items, now, scene, state, s, adjoint, plan)
+                self.act_vjp(e - plan.num_items, j, scene, state, adjoint, table, plan)
         else:
             self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
 
     @ti.func
     def tetrahedra_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        s, of = j - plan.base, self.told(scene, j, table, plan)
+        item, now = self.tetrahedron_at(e, j, table, plan)
+        of, s = self.tetrahedra_of(scene, now), j - plan.base
         if ti.static(self.element.has_state):
-            now = reversed_pass(pass_at(table, j - plan.window), j, plan)
-            on = self.onwards(now)
-            self.element.move_on_vjp(e, of, state, s, on, adjoint.corner, adjoint, self.vertex.features.shape)
+            on = self.onwards(reversed_pass(now, j, plan))
+            self.element.move_on_vjp(item, of, state, s, on, adjoint.corner, adjoint, self.vertex.features.shape)
         self.element.forces_vjp(
-            e, of, state, s, adjoint.w, adjoint.corner, adjoint, self.vertex.features.shape, self.element.has_state
+            item, of, state, s, adjoint.w, adjoint.corner, adjoint, self.vertex.features.shape, self.element.has_state
         )
 
-    @traced
-    def pass_back(self, j, table, plan):
-        """Pass j on the way back."""
-        now = reversed_pass(pass_at(table, j - plan.window), j, plan)
-        return self.counted(self.vertex.obstacles.noting(now, plan))
+    @ti.func
+    def act_vjp(self, k, j, scene: A, state: A, adjoint: A, table: A, plan: A):
+        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+        self.items.forces_vjp(i, now, own, at_, j - plan.base, self.record_of(b, adjoint, plan), plan)
+
+    @ti.func
+    def at_vertex_vjp(self, k, j, scene: A, state: A, adjoint: A, table: A, plan: A):
+        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+        self.vertex.step_vjp(i, j, self.back(now, j, plan), own, at_, self.record_of(b, adjoint, plan), plan)
+
+    @ti.func
+    def fold(self, k, first, last, adjoint: A, table: A, plan: A):
+        """Sum adjoints of paths over vertices."""
+        p, b = self.split(k, plan)
+        by = self.record_of(b, adjoint, plan)
+        self.vertex.obstacles.fold_part(p, plan.num_vertices, first, last, by, table, plan)
 
     @ti.func
     def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
         """The gather of K w is left to the next call (or to `finish_vjp`), so that each pass has two loops, as forward."""
         moving = ti.static(self.vertex.features.moving)
         if ti.static(self.parallel):
-            num_items, num_vertices, parts = self.items.after(plan), plan.num_vertices, moving * plan.num_parts
+            num_items, num_vertices, parts = self.after(plan), self.num_vertices(plan), moving * self.num_parts(plan)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
-                    now = self.pass_back(plan.first, table, plan)
+                    now = self.back(self.numbers_of(0, plan.first, table, plan), plan.first, plan)
                     self.bodies.step_vjp(b, plan.first, now, scene, state, adjoint, plan)
             for i in range(num_vertices):
                 turn = self.turn_of_first(i, table)
                 if turn < plan.count:
-                    j = plan.first + plan.count - 1 - turn
-                    now = self.pass_back(j, table, plan)
-                    self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
+                    self.at_vertex_vjp(i, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
             for e in range(num_items):
                 turn = self.turn_of_second(e, table, plan)
                 if turn < plan.count:
                     self.elements_vjp(e, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
             if ti.static(moving > 0):
                 for p in range(parts):
-                    last = plan.first + plan.count - 1
-                    self.vertex.obstacles.fold_part(p, plan.num_vertices, plan.first, last, adjoint, table, plan)
+                    self.fold(p, plan.first, plan.first + plan.count - 1, adjoint, table, plan)
         else:
             ti.loop_config(serialize=True)
             for back in range(plan.count):
                 j = plan.first + plan.count - 1 - back
-                now = self.pass_back(j, table, plan)
+                now = self.back(self.numbers_of(0, j, table, plan), j, plan)
                 if ti.static(self.reduced):
                     for b in range(plan.num_bodies):
                         self.bodies.step_vjp(b, j, now, scene, state, adjoint, plan)
@@ -304,16 +386,16 @@ class ExplicitKernels:
                     self.elements_vjp(e, j, scene, state, adjoint, table, plan)
                 if ti.static(moving > 0):
                     for p in range(moving * plan.num_parts):
-                        self.vertex.obstacles.fold_part(p, plan.num_vertices, j, j, adjoint, table, plan)
+                        self.fold(p, j, j, adjoint, table, plan)
 
     @cached_property
     def step_vjp(self) -> Kernel:
-        """The adjoint of passes first + count - 1 .. first; `num_passes` is that of the run.
+        """The adjoint of passes first + count - 1 .. first.
 
         halt: the pass at whose state the sweep stops, between its two kicks; kick: only the kick before the state.
         steps: those for which there is room in `felt`; num_parts: sums over vertices that are made for each path.
         """
-        numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
+        numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
         own = adjoints(self.with_record(CHANGE) | ADJOINT | OF_STEPS, self.vertex.features) | self.corners
         own |= dict(w="vectors2", felt="vectors2") | self.items.adjoint
         arrays = dict(state=self.with_record(RECORDED), adjoint=own)
@@ -321,18 +403,21 @@ class ExplicitKernels:
 
     @ti.func
     def gather_rest(self, scene: A, adjoint: A, plan: A):
+        num_vertices = self.num_vertices(plan)
         ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            adjoint.u[0, i] = adjoint.u[0, i] + self.element.gather(i, scene, adjoint.corner)
+        for k in range(num_vertices):
+            i, b = self.split(k, plan)
+            by = self.record_of(b, adjoint, plan)
+            by.u[0, i] = by.u[0, i] + self.element.gather(i, scene, by.corner)
             if ti.static(self.vertex.reads_rates):
-                adjoint.v[0, i] = adjoint.v[0, i] + self.element.gather(i, scene, adjoint.rate_corner)
+                by.v[0, i] = by.v[0, i] + self.element.gather(i, scene, by.rate_corner)
 
     @cached_property
     def finish_vjp(self) -> Kernel:
         """Add the gather that the first pass of the run has left."""
         gathered = dict(u="vectors2") | (dict(v="vectors2") if self.vertex.reads_rates else {})
         own = dict(scene={name: SCENE[name] for name in ("start", "corner_of")}, adjoint=gathered | self.corners)
-        return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
+        return self.kernel("finish_vjp", self.gather_rest, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
         arrays = dict(scene=SCENE | self.items.arrays) | arrays | dict(table=PLAN)
@@ -340,7 +425,10 @@ class ExplicitKernels:
         numbers = NUMBERS | self.items.counts | numbers
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
-        return Kernel(name, body, self.vertex.law.precision, arrays, numbers, 2 * repeated, self.is_short)
+        return self.kernel(name, body, arrays, numbers, 2 * repeated, self.is_short)
+
+    def kernel(self, name: str, body, arrays: dict, numbers: dict, *options) -> Kernel:
+        return Kernel(name, body, self.vertex.law.precision, arrays, numbers, *options)
 
 
 @lru_cache(maxsize=None)

@@ -20,9 +20,50 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.outside_work import add_work_of_pass, work_of_own_forces
+from diffsim_ti.runtime import let, traced
 from diffsim_ti.solvers.explicit.vertex_parts import VertexParts
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+# ---- formulas, of vectors or, component by component, of eight scenes in lanes (batch/free_vertices.py) -------------------
+
+
+@traced
+def kick(v, a, now) -> tuple:
+    """(v_mid, v+) for an acceleration a, or their changes."""
+    v_mid = let(v + now.pre * a)
+    return v_mid, let(v_mid + now.post * a)
+
+
+@traced
+def drift(u, v, now) -> tuple:
+    """(u', v') by a velocity v, or their changes."""
+    return let(u + now.alpha * v), let(now.decay * v)
+
+
+@traced
+def drift_by_rate(u, v, v_plus, rate, now) -> tuple:
+    """Changes of both with what a change of the drag rate adds."""
+    return let(u + now.alpha_by_rate * rate * v_plus), let(v + now.decay_by_rate * rate * v_plus)
+
+
+@traced
+def acceleration_jvp(f, df, dm, inverse):
+    """Change of f / m."""
+    return let(inverse * (df - inverse * dm * f))
+
+
+@traced
+def drift_vjp(p, q, now):
+    """Adjoint of the velocity that drifts, for those of u' and v'."""
+    return let(now.alpha * p + now.decay * q)
+
+
+@traced
+def kick_vjp(v_plus_adj, v_mid_adj, now):
+    """Adjoint of the acceleration."""
+    return let(now.post * v_plus_adj + now.pre_adj * v_mid_adj)
 
 
 @dataclass(frozen=True)
@@ -55,8 +96,7 @@ class KickDrift(VertexParts):
                 a += self.gravity(scene.parameters)
         if ti.static(self.features.guided):
             a = self.guides.free(i, a, scene)
-        v_mid = v + now.pre * a
-        return v_mid, v_mid + now.post * a
+        return kick(v, a, now)
 
     @ti.func
     def lead(self, i, u, v, now: A, scene: A, of: A):
@@ -105,7 +145,7 @@ class KickDrift(VertexParts):
             if now.alpha > 0 and scene.surface[i] > 0:
                 v_plus = self.obstacles.slide_all(i, u, v_plus, now, scene)
         # drift and damping
-        u_next, v_next = u + now.alpha * v_plus, now.decay * v_plus
+        u_next, v_next = drift(u, v_plus, now)
         if ti.static(self.features.num_staged > 0):
             lead = self.lead(i, u, v, now, scene, scene)
             u_next, v_next = self.contact.advance(i, u, v_plus, lead, now, scene, state, plan)
@@ -164,25 +204,25 @@ class KickDrift(VertexParts):
         s, t = j - plan.base, j - plan.base + 1
         u, v, du, dv = state.u[s, i], state.v[s, i], tangent.u[0, i], tangent.v[0, i]
         inverse = scene.inverse_mass[i]
-        da = inverse * (df - inverse * tangent.mass[i] * state.f[s, i])
+        da = acceleration_jvp(state.f[s, i], df, tangent.mass[i], inverse)
         if ti.static(self.features.gravity >= 0):
             if inverse > 0:
                 da += self.gravity(tangent.parameters)
         if ti.static(self.features.guided):
             da = self.guides.free(i, da, scene)
         # kick, frame, kick
-        dv_mid = dv + now.pre * da
+        dv_mid, dv_plus = kick(dv, da, now)
         if now.frame >= 0:
             tangent.frames_u[now.frame, i] = du
             tangent.frames_v[now.frame, i] = dv_mid
-        dv_plus, v_plus = dv_mid + now.post * da, state.v[t, i] / now.decay
+        v_plus = state.v[t, i] / now.decay
         if ti.static(len(self.features.rough) > 0):
             if now.alpha > 0 and scene.surface[i] > 0:
                 _, before = self.kicked(i, v, state.f[s, i], now, scene)
                 dv_plus = self.obstacles.slide_jvp(i, u, before, du, dv_plus, now, scene, tangent)
         # drift and damping
-        du_next = du + now.alpha * dv_plus + now.alpha_by_rate * plan.rate_dot * v_plus
-        dv_next = now.decay * dv_plus + now.decay_by_rate * plan.rate_dot * v_plus
+        du_next, dv_next = drift(du, dv_plus, now)
+        du_next, dv_next = drift_by_rate(du_next, dv_next, v_plus, plan.rate_dot, now)
         if ti.static(self.features.num_staged > 0):
             _, before = self.kicked(i, v, state.f[s, i], now, scene)
             lead, dlead = self.lead(i, u, v, now, scene, scene), self.lead(i, du, dv, now, scene, tangent)
@@ -224,11 +264,9 @@ class KickDrift(VertexParts):
     def go_on_vjp(self, i, j, now: A, scene: A, state: A, adjoint: A, plan: A):
         s, t = j - plan.base, j - plan.base + 1
         u, v = state.u[s, i], state.v[s, i]
-        p, q = adjoint.u[0, i], adjoint.v[0, i]
-        if j < plan.num_passes - 1:
-            p += self.element.gather(i, scene, adjoint.corner)
-            if ti.static(self.reads_rates):
-                q += self.element.gather(i, scene, adjoint.rate_corner)
+        p, q = adjoint.u[0, i] + self.element.gather(i, scene, adjoint.corner), adjoint.v[0, i]
+        if ti.static(self.reads_rates):
+            q += self.element.gather(i, scene, adjoint.rate_corner)
         # prescribed motion: the state after the pass comes from the motion alone
         k, by_u_held, by_v_held = self.prescribed(i, scene), self.vector(0), self.vector(0)
         if ti.static(self.features.guided):
@@ -241,7 +279,7 @@ class KickDrift(VertexParts):
                 adjoint.anchor[k] = adjoint.anchor[k] + p
                 p, q = self.vector(0), self.vector(0)
         # drift and damping
-        v_plus_adj = now.alpha * p + now.decay * q
+        v_plus_adj = drift_vjp(p, q, now)
         if ti.static(not self.features.guided):
             if k >= 0:
                 v_plus_adj = q
@@ -271,7 +309,7 @@ class KickDrift(VertexParts):
         if now.frame >= 0:
             p += adjoint.frames_u[now.frame, i]
             v_mid_adj += adjoint.frames_v[now.frame, i]
-        a_adj = now.post * v_plus_adj + now.pre_adj * v_mid_adj
+        a_adj = kick_vjp(v_plus_adj, v_mid_adj, now)
         if ti.static(self.features.guided):
             a_adj = self.guides.free(i, a_adj, scene)
             p, v_mid_adj = p + by_u_held, v_mid_adj + by_v_held

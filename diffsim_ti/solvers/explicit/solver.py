@@ -20,12 +20,13 @@ from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces, feels_faces
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.obstacles.way import Way
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies
-from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
+from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.monitor.own_work import OwnWork
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
+from diffsim_ti.solvers.explicit.stages import stages_of
 from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.pass_table import PassTable
@@ -151,6 +152,7 @@ class ExplicitWorkspace(Workspace):
         self.check_apart()
         self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
         self.volumes = HeldVolumes(self) if self.scene.holds_volumes else None
+        self.stages = stages_of(self)
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
             stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
@@ -225,16 +227,9 @@ class ExplicitWorkspace(Workspace):
         if self.probe is None:
             self.probe = self.history(2, record=True)
         self.state.copy(0, self.probe, 0)
-        if self.pairs:
-            self.pairs.ensure(self.probe.u, 0)
-            self.pairs.forces(self.probe.u, 0, self.arrays.corner)
-        seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
-        counted = runtime.fetch(self.contact.own_work)  # of passes that are taken alone
-        launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
-        for numbers in self.launches(j, j + 1, num_passes, 0, 1):
-            if self.chambers:
-                self.chambers.forces(self.probe, 0, numbers)
-            launch(**numbers, base=j, stride=1)
+        seen, counted = self.watch.rows(), runtime.fetch(self.contact.own_work)  # of passes that are taken alone
+        at = Passes(self, self, self.probe, j, 1, num_passes, 0, kick=True)
+        at.go("do", self.stages, self.launches(j, j + 1, num_passes, 0, 1))
         self.watch.put(seen)
         runtime.fill(self.contact.own_work, counted)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
@@ -274,7 +269,7 @@ class ExplicitWorkspace(Workspace):
 
     def most_passes(self, work: int) -> int:
         """How many passes a launch may take; work: of a pass, in those of tetrahedra."""
-        if self.parallel or self.pairs or self.faces or self.chambers or self.volumes:
+        if self.parallel or len(self.stages) > 1:
             return self.in_parallel
         return max(1, self.work_per_launch // work)
 
@@ -311,41 +306,6 @@ class ExplicitWorkspace(Workspace):
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
         recording = base is not None
-        history, stride, base, pairs = self.record if recording else self.state, int(recording), base or 0, self.pairs
-        step, states = self.kernels(self.arrays.features()).step, (history, self.frames, self.watch, self.contact)
-        launch = self.bound(step, state=states, table=self.table)
-        if pairs:
-            pairs.ensure(history.u, (first - base) * stride)
-            if recording and pairs.friction:
-                pairs.friction.keep(history.num_slots)
-        most = self.most_passes(self.arrays.num_tetrahedra)
-        for numbers in self.launches(first, last, num_passes, save_every, most):
-            slot = (numbers["first"] - base) * stride
-            if pairs:
-                pairs.forces(history.u, slot, self.arrays.corner)
-                if pairs.friction:
-                    pairs.friction.measure(history.u, slot)
-            if self.chambers:
-                self.chambers.forces(history, slot, numbers)
-            if self.faces:
-                self.faces.before_pass(history, slot)
-            if self.volumes:
-                self.volumes.before_pass(history, slot)
-            launch(**numbers, base=base, stride=stride)
-            if self.faces:
-                asked = self.impulses is not None
-                change = self.faces.after_pass(history, slot + stride, numbers, num_passes, recording, asked)
-                if change is not None:
-                    self.impulses.add(numbers, change, self.faces.pushes)
-                    self.impulses.add_friction(numbers, self.faces.impulses_of_friction())
-            if pairs:
-                if pairs.friction:
-                    now = self.numbers_of(numbers["first"], num_passes)
-                    pairs.friction.slide(history, slot + stride, now, recording)
-            if self.volumes:
-                self.volumes.after_pass(history, slot + stride, (numbers["first"], num_passes, save_every), recording)
-            if pairs:
-                try:
-                    pairs.check_pass(history.u, slot + stride, float(self.solver.schedule.length(numbers["first"])))
-                except Tunnelling as error:
-                    raise self.dated(error, numbers["first"], num_passes) from None
+        history, most = self.record if recording else self.state, self.most_passes(self.arrays.num_tetrahedra)
+        at = Passes(self, self, history, base or 0, int(recording), num_passes, save_every)
+        at.go("do", self.stages, self.launches(first, last, num_passes, save_every, most))

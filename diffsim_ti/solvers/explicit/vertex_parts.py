@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import taichi as ti
-
 from diffsim_ti.mechanics.loads.explicit import GivenForces
 from diffsim_ti.mechanics.obstacles.contact_stage import ContactStage
 from diffsim_ti.mechanics.obstacles.obstacle_stages import ObstacleStages
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.mechanics.supports.guides import Guides
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.runtime import number_type, vector_type
 from diffsim_ti.state.features import Features
 
 
@@ -22,13 +20,11 @@ class VertexParts:
     features: Features
     lanes: bool
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.law.precision]
+    fp, vector = number_type, vector_type
 
     @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
+    def precision(self) -> str:
+        return self.law.precision
 
     @cached_property
     def element(self):
@@ -46,16 +42,16 @@ class VertexParts:
 
     @cached_property
     def obstacles(self) -> ObstacleStages:
-        return ObstacleStages(self.features, self.law.precision)
+        return ObstacleStages(self.features, self.precision)
 
     @cached_property
     def contact(self) -> ContactStage:
-        return ContactStage(self.features, self.law.precision)
+        return ContactStage(self.features, self.precision)
 
     @cached_property
     def given(self) -> GivenForces:
-        return GivenForces(self.features, self.law.precision)
+        return GivenForces(self.features, self.precision)
 
     @cached_property
     def guides(self) -> Guides:
-        return Guides(self.law.precision, self.features.motion)
+        return Guides(self.precision, self.features.motion)

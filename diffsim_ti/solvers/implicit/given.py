@@ -67,16 +67,12 @@ class GivenInPasses(Workspace):
 
     def growth_of(self, rows: np.ndarray, j: int, stage: Stage) -> np.ndarray:
         """What tetrahedra have grown by in pass j, of rows (steps, 2, m); linear in these."""
-        schedule, share = self.solver.schedule, self.share_at_stage(j, stage)
-        begin, end = rows[schedule.load_row(rows, j)]
-        return self.load_share(j, stage) * (begin + share * (end - begin))
+        return self.load_share(j, stage) * self.solver.schedule.growth(rows, j, self.share_at_stage(j, stage))
 
     def growth_vjp(self, rows_adj: np.ndarray, j: int, stage: Stage, adjoint: np.ndarray) -> None:
         """Add the adjoint of rows for that of `growth_of`."""
-        schedule, share = self.solver.schedule, self.share_at_stage(j, stage)
-        row, by = rows_adj[schedule.load_row(rows_adj, j)], self.load_share(j, stage) * adjoint
-        row[0] += (1 - share) * by
-        row[1] += share * by
+        by = self.load_share(j, stage) * adjoint
+        self.solver.schedule.add_growth(rows_adj, j, self.share_at_stage(j, stage), by)
 
     def grow(self, j: int, stage: Stage) -> None:
         """Set what tetrahedra have grown by in pass j."""

@@ -1,4 +1,4 @@
-"""The rest shape of ten-node tetrahedra, whose edges may be curved, and the points of all tetrahedra."""
+"""The rest shape of tetrahedra, of ten nodes with edges that may be curved, and their points."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,33 +12,40 @@ if TYPE_CHECKING:
     from diffsim_ti.mesh import TetrahedralMesh
 
 
-class CurvedShape(Link):
-    """Of rest positions X: X itself and, at each of the four points of an element, B = D^-1, D = dX/dxi, whose rows are
-    grad xi, shape (m, 4, 3, 3), and the share V = w det D / 6 of the volume, shape (m, 4); and the elements' volumes, by a
-    rule that is exact for curved edges.
+class RestShape(Link):
+    """Of rest positions X: X itself and, at each of the points of an element, B = D^-1, D = dX/dxi, whose rows are grad xi,
+    and the share V = w det D / 6 of the volume. Of tetrahedra of four nodes, whose edges are the columns of D, these have
+    shapes (m, 3, 3) and (m,); of ten nodes, whose edges may be curved, (m, 4, 3, 3) and (m, 4), and there are the elements'
+    volumes too, by a rule that is exact for them.
 
     dB = -B dD B and dV = V tr(B dD). Raises ValueError for an element that is turned inside out at a point.
     """
 
-    reads, writes = ("rest_positions",), ("rest", "gradients", "volumes", "element volumes")
+    reads = ("rest_positions",)
 
-    def __init__(self, elements: np.ndarray):
-        self.elements = elements
-        xi, weights = quadrature(3)  # det D is a cubic
-        self.by_xi = QUADRATIC.derivatives(QUADRATIC.points), QUADRATIC.derivatives(xi)
-        self.weights = QUADRATIC.weights, weights
+    def __init__(self, mesh: "TetrahedralMesh"):
+        self.elements, self.element = mesh.elements, mesh.reference
+        rules = [(self.element.points, self.element.weights)]
+        if self.element.order == 2:
+            rules.append(quadrature(3))  # det D is a cubic
+        self.rules = [(self.element.derivatives(xi), weights) for xi, weights in rules]
+        self.writes = ("rest", "gradients", "volumes", "element volumes")[: 2 + len(rules)]
         self._last = None  # X and what derivatives need of it
 
     def value(self, X):
-        (B, V), (_, whole) = self._inverse(X)
-        return X, B, V, whole.sum(1)
+        (B, V), *whole = self._inverse(X)
+        return X, *self._of_points(B, V), *(W.sum(1) for _, W in whole)
+
+    def _of_points(self, *arrays):
+        """Without the axis of points where each element has one."""
+        return [x[:, 0] for x in arrays] if self.element.order == 1 else arrays
 
     def _inverse(self, X):
         """(D^-1, w det D / 6) at the points of stresses and at those of the volume."""
         if self._last is not None and self._last[0] is X:
             return self._last[1]
         out = []
-        for by_xi, weights in zip(self.by_xi, self.weights):
+        for by_xi, weights in self.rules:
             D = self._edges(X, by_xi)
             volumes = weights * np.linalg.det(D) / 6
             if not np.all(volumes > 0):
@@ -56,19 +63,21 @@ class CurvedShape(Link):
         return np.einsum("eai,qak->eqik", X[self.elements], by_xi, optimize=True)
 
     def jvp(self, x, dx):
-        (B, V), (C, W) = self._inverse(*x)
-        dD, dE = (self._edges(dx[0], by_xi) for by_xi in self.by_xi)
-        whole = (W * np.einsum("eqij,eqji->eq", C, dE)).sum(1)
-        return dx[0], -B @ dD @ B, V * np.einsum("eqij,eqji->eq", B, dD), whole
+        changes = []
+        for (B, V), (by_xi, _) in zip(self._inverse(*x), self.rules):
+            dD = self._edges(dx[0], by_xi)
+            changes.append((-B @ dD @ B, V * np.einsum("eqij,eqji->eq", B, dD)))
+        return dx[0], *self._of_points(*changes[0]), *(dW.sum(1) for _, dW in changes[1:])
 
     def vjp(self, x, y_adj):
-        (B, V), (C, W) = self._inverse(*x)
-        rest_adj, gradients_adj, volumes_adj, whole_adj = y_adj
-        Bt, Ct = np.swapaxes(B, 2, 3), np.swapaxes(C, 2, 3)
-        by_D = -Bt @ gradients_adj @ Bt + (V * volumes_adj)[..., None, None] * Bt
-        by_E = (W * whole_adj[:, None])[..., None, None] * Ct
+        (B, V), *whole = self._inverse(*x)
+        rest_adj, gradients_adj, volumes_adj, *whole_adj = y_adj
+        Bt = np.swapaxes(B, 2, 3)
+        by_D = [-Bt @ gradients_adj.reshape(B.shape) @ Bt + (V * volumes_adj.reshape(V.shape))[..., None, None] * Bt]
+        for (C, W), adjoint in zip(whole, whole_adj):
+            by_D.append((W * adjoint[:, None])[..., None, None] * np.swapaxes(C, 2, 3))
         X_adj = np.array(rest_adj)
-        for by, by_xi in zip((by_D, by_E), self.by_xi):
+        for by, (by_xi, _) in zip(by_D, self.rules):
             np.add.at(X_adj, self.elements, np.einsum("eqik,qak->eai", by, by_xi, optimize=True))
         return (X_adj,)
 

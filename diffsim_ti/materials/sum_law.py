@@ -1,0 +1,90 @@
+"""The sum of two laws."""
+
+from dataclasses import dataclass
+
+from diffsim_ti.materials.calculus.tensor import sum_of
+from diffsim_ti.materials.law import Law
+from diffsim_ti.runtime import let, traced
+
+
+@dataclass(frozen=True)
+class SumLaw(Law):
+    """A law `base`, and one that a subclass adds to it: `added`, whose coefficients come first; it may have a state."""
+
+    base: Law | None = None
+
+    @property
+    def added(self) -> Law:
+        """What is added."""
+        raise NotImplementedError
+
+    @property
+    def coefficient_names(self):
+        return (*self.added.coefficient_names, *self.base.coefficient_names)
+
+    @property
+    def state_names(self):
+        return self.added.state_names
+
+    @property
+    def lanes(self):
+        return self.base.lanes
+
+    @traced
+    def _parts(self, q):
+        """(what the added law takes, what the base takes)"""
+        first, last = len(self.added.coefficient_names), len(self.coefficient_names)
+        return [*q[:first], *q[last:]], q[first:last]
+
+    @traced
+    def _terms(self, q) -> list:
+        """(law, what it takes) of all that acts; of one alone the base."""
+        own, p = self._parts(q)
+        return [(self.added, own), (self.base, p)]
+
+    @traced
+    def _joined(self, H, *of_terms):
+        """Derivatives by q, from those of the terms."""
+        first, (*of_added, of_base) = len(self.added.coefficient_names), of_terms
+        (of_added,) = of_added or [[let(H[0, 0] * 0)] * first]
+        return [*of_added[:first], *of_base, *of_added[first:]]
+
+    @traced
+    def energy_density(self, H, q):
+        return sum_of(law.energy_density(H, p) for law, p in self._terms(q))
+
+    @traced
+    def energy_by_coefficients(self, H, q):
+        return self._joined(H, *(law.energy_by_coefficients(H, p) for law, p in self._terms(q)))
+
+    @traced
+    def stress(self, H, q):
+        return sum_of(law.stress(H, p) for law, p in self._terms(q))
+
+    @traced
+    def stress_differential(self, H, dH, q):
+        return sum_of(law.stress_differential(H, dH, p) for law, p in self._terms(q))
+
+    @traced
+    def stress_change(self, H, q, dq):
+        both = zip(self._terms(q), self._terms(dq))
+        return sum_of(law.stress_change(H, p, dp) for (law, p), (_, dp) in both)
+
+    @traced
+    def stress_differential_and_products(self, H, dH, q):
+        of_terms = [law.stress_differential_and_products(H, dH, p) for law, p in self._terms(q)]
+        return sum_of(dP for dP, _ in of_terms), self._joined(H, *(products for _, products in of_terms))
+
+    @traced
+    def next_state_at(self, H, q, h):
+        return self.added.next_state_at(H, self._parts(q)[0], h)
+
+    @traced
+    def next_state_jvp(self, H, dH, q, dq, h):
+        return self.added.next_state_jvp(H, dH, self._parts(q)[0], self._parts(dq)[0], h)
+
+    @traced
+    def next_state_vjp(self, H, q, h, z_adj):
+        by_H, by_added = self.added.next_state_vjp(H, self._parts(q)[0], h, z_adj)
+        zero = let(H[0, 0] * 0)
+        return by_H, self._joined(H, by_added, [zero] * len(self.base.coefficient_names))

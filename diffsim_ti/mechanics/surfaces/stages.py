@@ -1,0 +1,97 @@
+"""Contact of surfaces with themselves and each other in explicit steps: its forces, and friction after the drift."""
+
+from contextlib import contextmanager
+
+from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.stage import Passes, Stage
+from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs, Tunnelling
+
+
+class SurfaceForces(Stage):
+    """Forces of near pairs before the kick; after the step none of them may have gone through each other."""
+
+    in_kicks = True
+
+    def __init__(self, pairs: SurfacePairs):
+        self.pairs, self.a = pairs, pairs.a
+
+    @contextmanager
+    def do(self, at: Passes):
+        if at.launch is None:  # the first pass: after each of them `check_pass` keeps the list
+            self.pairs.ensure(at.history.u, at.slot)
+        self.pairs.forces(at.history.u, at.slot, self.a.corner)
+        yield
+        if at.kick:
+            return
+        try:
+            self.pairs.check_pass(at.history.u, at.end, float(at.ws.solver.schedule.length(at.j)))
+        except Tunnelling as error:
+            raise at.ws.dated(error, at.j, at.num_passes) from None
+
+    @contextmanager
+    def tangent(self, at: Passes):
+        pairs, run, place = self.pairs, at.run, (at.history.u, at.slot)
+        pairs.ensure(*place)
+        if pairs.friction:  # which needs the forces, and their corners are those of the product
+            pairs.friction.begin_jvp(at.history, at.slot, run.u, run.numbers)
+        change = run.tangent.parameters[self.a.parameters_of_self_contact]
+        pairs.product(*place, run.u, self.a.corner, run.numbers.rest, change)
+        yield
+
+    @contextmanager
+    def adjoint(self, at: Passes):
+        yield
+        self.pairs.ensure(at.history.u, at.slot)
+        self.pairs.vjp(at.history.u, at.slot, at.run.w, at.run.corner)
+
+    def clear(self) -> None:
+        self.pairs.clear_sums()
+
+    def collect(self, out: Derived) -> None:
+        out.parameters[self.a.parameters_of_self_contact], rest = self.pairs.collect()
+        out.rest = rest + out.rest
+
+
+class SurfaceFriction(Stage):
+    """Friction of the pairs, on the velocities after the drift."""
+
+    def __init__(self, pairs: SurfacePairs):
+        self.friction, self.a = pairs.friction, pairs.a
+
+    @contextmanager
+    def do(self, at: Passes):
+        if at.stride:
+            self.friction.keep(at.history.num_slots)
+        self.friction.measure(at.history.u, at.slot)
+        yield
+        self.friction.slide(at.history, at.end, at.now, recording=at.stride > 0)
+
+    @contextmanager
+    def tangent(self, at: Passes):
+        now, run = at.now, at.run
+        if not now.alpha > 0:
+            yield
+            return
+        with self.friction.alone(at.history, at.end):
+            yield
+            self.friction.slide_jvp(at.history, at.end, now, run.rate_dot, run.u, run.v, run.numbers)
+
+    @contextmanager
+    def adjoint(self, at: Passes):
+        now = at.now
+        if not now.alpha > 0:
+            yield
+            return
+        if not self.friction.takes_pending:
+            at.run.complete()
+        with self.friction.alone(at.history, at.end):
+            self.friction.slide_vjp(at.history, at.slot, now, at.run)
+            yield
+        self.friction.add_place(at.run)
+
+    def collect(self, out: Derived) -> None:
+        by_mass, by_rate = self.friction.collect_pass()
+        out.mass = out.mass + by_mass
+        drag = self.a.features().drag
+        if drag >= 0:
+            out.parameters[drag] += by_rate

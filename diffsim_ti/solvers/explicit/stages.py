@@ -1,0 +1,58 @@
+"""The stages of an explicit step: one list that forward, tangent and reverse go through."""
+
+from contextlib import nullcontext
+
+from diffsim_ti.mechanics.chambers.held_volume_derivatives import HeldAdjoint, HeldTangent
+from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes
+from diffsim_ti.mechanics.obstacles.felt_derivatives import FeltAdjoint, FeltTangent
+from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces
+from diffsim_ti.mechanics.stage import Passes, Stage
+from diffsim_ti.mechanics.surfaces.stages import SurfaceForces, SurfaceFriction
+
+# stages whose tangents and adjoints have buffers: what makes these of them for a run
+BUFFERED = dict(
+    tangent={HeldVolumes: HeldTangent, FeltFaces: FeltTangent},
+    adjoint={HeldVolumes: HeldAdjoint, FeltFaces: FeltAdjoint},
+)
+
+
+class KickDrift(Stage):
+    """What one launch does (kernels.py), for as many passes as it takes: tetrahedra and interactions, vertices, reduced
+    sets."""
+
+    in_kicks = True
+
+    def do(self, at: Passes):
+        return self._launch(at, "step", at.ws.arrays.features())
+
+    def tangent(self, at: Passes):
+        return self._launch(at, "step_jvp", at.run.features, "tangent", rate_dot=at.run.rate_dot)
+
+    def adjoint(self, at: Passes):
+        more = dict(halt=at.halt, kick=int(at.kick), steps=at.run.steps, num_parts=at.run.num_parts)
+        return self._launch(at, "step_vjp", at.run.features, "adjoint", **more)
+
+    @staticmethod
+    def _launch(at: Passes, name: str, features, record: str = "", **more):
+        """record: what the kernel calls the changes or adjoints of a run."""
+        if at.launch is None:
+            ws, run = at.ws, at.run
+            own = {record: (run, run.numbers, run.frames, run.impulses)} if record else {}
+            states = at.history, ws.frames, ws.watch, ws.contact
+            at.launch = ws.bound(getattr(ws.kernels(features), name), state=states, **own, table=ws.table)
+        at.launch(**at.numbers, base=at.base, stride=at.stride, **more)
+        return nullcontext()
+
+
+def stages_of(ws) -> list[Stage]:
+    """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
+    forces = SurfaceForces(ws.pairs) if ws.pairs else None
+    friction = SurfaceFriction(ws.pairs) if ws.pairs and ws.pairs.friction else None
+    every = forces, ws.volumes, friction, ws.chambers, ws.faces, KickDrift()
+    return [stage for stage in every if stage]
+
+
+def with_buffers(way: str, stages: list[Stage], run) -> list:
+    """The same with the buffers that a tangent or an adjoint has for them."""
+    makers = BUFFERED[way]
+    return [makers[type(stage)](stage, run) if type(stage) in makers else stage for stage in stages]
