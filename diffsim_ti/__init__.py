@@ -110,17 +110,8 @@ __version__ = "0.2.0"
 __all__ = ["init", "TetrahedralMesh", "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated"]
 __all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "Ogden", "FibreReinforced", "KelvinVoigt"]
 __all__ += ["Prony", "Gravity", "Drag", "ExternalForce", "Traction", "Pressure", "GasChamber", "FilledChamber"]
-__all__ += [
-    "BodyForce",
-    "Spring",
-    "RotatingFrame",
-    "SurfaceDrag",
-    "Cable",
-    "Anchor",
-    "ElasticFoundation",
-    "Growth",
-    "Muscle",
-]
+__all__ += ["BodyForce", "Spring", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
+__all__ += ["Growth", "Muscle"]
 __all__ += ["SelfContact", "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "Pose"]
 __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", "ImplicitEulerSolver"]
 __all__ += ["ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Rollout", "Frames", "Batch"]
