@@ -86,8 +86,8 @@ class Output(ABC):
             return np.zeros(shape)
         if frames.law_state is None:
             raise ValueError(
-                f"these frames do not have what {law.title} remembers ({', '.join(law.state_names)}): pass the output to "
-                "Rollout(..., outputs=[...]) before the run"
+                f"these frames do not have what {law.title} remembers: pass {type(self).__name__} to "
+                "Rollout(..., outputs=[...]), which then notes it"
             )
         return frames.law_state.reshape(shape)
 
