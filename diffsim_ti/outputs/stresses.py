@@ -48,7 +48,7 @@ class TetrahedronStress:
         p, z_adj, S = self._numbers(derived.coefficients, z), np.zeros_like(z), z.shape[-1]
         by_H, by_p = self.law.vjp(H.reshape(-1, 3, 3), P_adj.reshape(-1, 3, 3), p)
         by_p, by_z = np.split(by_p, [self.law.K - S], 1)
-        for into, rows in zip(z_adj, by_z.reshape(len(z), -1, self.points, S)):
+        for into, rows in zip(z_adj, by_z.reshape(len(z), len(self.read), self.points, S)):
             np.add.at(into, self.read, rows)
         self._add_coefficients(by_p.reshape(len(H), -1, self.law.K - S).sum(0), derived, adjoint)
         return by_H.reshape(H.shape), z_adj
