@@ -147,8 +147,7 @@ class Reaction(Output):
             w[:, self.vertices] = seed if self.per_vertex else seed[:, None]
         w[:, self.vertices] = -self._onto(w[:, self.vertices])
         derived, adjoint = self.body.load(frames.inputs), self.body.adjoint()
-        rest, by_loads, by_held = np.zeros(positions.shape[1:]), derived.zeros(), []
-        by_states = []
+        rest, by_loads, by_held, by_states = np.zeros(positions.shape[1:]), derived.zeros(), [], []
         for k in range(len(w)):
             x = self._place(frames, k)
             by_u, by_v, by_z = self.body.vjp(w[k], adjoint)

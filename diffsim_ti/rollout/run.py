@@ -38,8 +38,8 @@ class Run:
 
 
 class Seed(Protocol):
-    """Gradients of a loss by the frames' positions and velocities, wherever they lie; of what
-    else was noted (outputs/output.py), by name, on the host."""
+    """Gradients of a loss by the frames' positions and velocities, wherever they lie; of what else was
+    noted (outputs/output.py), by name, on the host."""
 
     noted: dict[str, np.ndarray | None]
 
