@@ -67,7 +67,7 @@ def test_volumes_and_their_rates(kind):
 
 
 def test_faces_of_the_same_run():
-    """Checkpoints, clip and a second sweep give the same bits or nearly so; a simulator goes the same way, and a tape back."""
+    """Checkpoints, clip and a second sweep give the same bits or nearly so; a simulator and a tape go the same way."""
     scene = pumped(pitted)
     plain, parts, clipped = (
         rollout_of(EXPLICIT[1], scene, **o) for o in ({}, dict(checkpoint_every=2), dict(clip=1e30))

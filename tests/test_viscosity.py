@@ -246,7 +246,9 @@ def gates(r: ds.Rollout, round_off: float, *inputs: str) -> None:
 )
 def test_gradients_by_every_number(name, solver):
     body = swung(MATERIALS[name](), fixed="xmin", motion=lambda t: [0, 0.3 * t, 0])
-    results = dict(prony=[ds.ElasticEnergy(), ds.Stress()], both=[ds.Reaction("xmin")])  # which know the state of the law
+    results = dict(
+        prony=[ds.ElasticEnergy(), ds.Stress()], both=[ds.Reaction("xmin")]
+    )  # which know the state of the law
     r = ds.Rollout(made(solver, body, 4e-3), 3, save_every=1, outputs=results.get(name, ()), gradients="all")
     own = [x for x in body.material.inputs if x != "poissons_ratio"]
     gates(r, 1e-12 if solver.explicit else 1e-10, *own, "initial_positions", "rest_positions")
