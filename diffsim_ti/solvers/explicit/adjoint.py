@@ -13,6 +13,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.held_volume_derivatives import HeldAdjoint
 from diffsim_ti.mechanics.obstacles.felt_derivatives import FeltAdjoint
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
+from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.mechanics.workspace import FrameArrays
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint
@@ -45,6 +46,7 @@ class ExplicitAdjoint:
         self.path = runtime.array(a.vector, a.path.shape[0], moving * self.num_parts)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.z = a.law_states(1)  # of the state of the law
+        self.law_frames = LawFrames(workspace) if workspace.law_frames else None
         self._made_for = self._shapes(workspace)
         self.of_interactions = {name: runtime.array(a.vector, *shape) for name, shape in self._made_for.items()}
         vars(self).update(self.of_interactions)
@@ -132,6 +134,8 @@ class ExplicitAdjoint:
         launch = self._bound(num_passes)
         for numbers in self.ws.launches(stop, last, num_passes, save_every, most, backwards=True):
             self._launch(launch, numbers, base, num_passes, save_every, halt, kick=0)
+            if self.law_frames:
+                self.law_frames.add_to(self.z, numbers["shown"])
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
         """Go back through the half kick that leads to the state which pass j shows."""

@@ -10,6 +10,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.held_volume_derivatives import HeldTangent
 from diffsim_ti.mechanics.obstacles.felt_derivatives import FeltTangent
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
+from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.mechanics.workspace import FrameArrays
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.numbers import Tangent
@@ -26,6 +27,7 @@ class ExplicitTangent:
         self.v = runtime.upload(tangent.velocity[None], a.vector)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
+        self.law_frames = LawFrames(workspace) if workspace.law_frames else None
         self.faces = FeltTangent(self, workspace.faces) if workspace.faces else None
         self.held = HeldTangent(self, workspace.volumes, tangent) if workspace.volumes else None
         self.chamber_record = self.held.chambers if self.held else None
@@ -54,6 +56,8 @@ class ExplicitTangent:
                 ws.pairs.product(history.u, slot, self.u, a.corner, self.numbers.rest, of_contact)
             if ws.chambers:
                 ws.chambers.jvp(history, slot, numbers, self.u, self.numbers)
+            if self.law_frames:
+                self.law_frames.note(numbers["shown"], self.z)
             if self.held:
                 self.held.before()
             with ws.volumes.alone(history, slot + 1) if self.held else nullcontext():
@@ -98,6 +102,8 @@ class ExplicitTangent:
         """Copy the current tangent to a frame."""
         copy_slot(self.u, 0, self.frames.frames_u, frame)
         copy_slot(self.v, 0, self.frames.frames_v, frame)
+        if self.law_frames:
+            self.law_frames.note(frame, self.z)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities, float64."""
