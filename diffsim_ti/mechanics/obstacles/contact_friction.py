@@ -136,7 +136,7 @@ class ContactFriction(HeldBack):
     @ti.func
     def slide_jvp_of(self, g: A, k, i, u, du, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
         """Velocity after the friction of one obstacle, and its change."""
-        row, numbers = ROWS * (g.number + k), g.first + k * g.size + g.force.count
+        row, first = ROWS * (g.number + k), g.first + k * g.size
         pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
         if pushed.x > 0:
             plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
@@ -145,7 +145,8 @@ class ContactFriction(HeldBack):
                 self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent),
                 state.stage[row + SEED, i],
             )
-            dmu, deps = tangent.parameters[numbers + 2], tangent.parameters[numbers + 3]
+            dmu = tangent.parameters[first + g.force.index.friction]
+            deps = tangent.parameters[first + g.force.index.friction_speed]
             dafter = stage.slide_jvp(
                 self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
             )

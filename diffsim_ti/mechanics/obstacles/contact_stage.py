@@ -307,14 +307,14 @@ class ContactStage(ContactFriction):
                 by_place, by_own, by = stage.push_vjp(
                     g.force, scene.parameters, first, X, u, own, plan.contact_damping, by_n, by_push
                 )
-                for m in ti.static(range(g.force.count + 2)):
+                for m in ti.static(range(g.force.index.width + 1)):
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
                 by_wall = -now.h * by_own
                 move_adj += by_own
                 if ti.static(g.force.friction):
-                    at = first + g.force.count + 2
-                    adjoint.sums[at, i] = adjoint.sums[at, i] + pushed.z
-                    adjoint.sums[at + 1, i] = adjoint.sums[at + 1, i] + pushed.w
+                    at_mu, at_eps = first + g.force.index.friction, first + g.force.index.friction_speed
+                    adjoint.sums[at_mu, i] = adjoint.sums[at_mu, i] + pushed.z
+                    adjoint.sums[at_eps, i] = adjoint.sums[at_eps, i] + pushed.w
                     by_wall += state.stage[row + WALL, i]
                 by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
                 u_adj += by_u

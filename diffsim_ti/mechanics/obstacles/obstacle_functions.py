@@ -195,7 +195,7 @@ class ObstacleFunctions:
             seen, width = g.force.outlook(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
             s, dwidth = seen[3] / width, ti.cast(0, self.fp)
             if ti.static(what == "jvp"):
-                dwidth = more.parameters[first + g.force.count + 1]
+                dwidth = more.parameters[first + g.force.index.width]
             slope, ds = barrier.slope(s, self.fp), (t[3] - s * dwidth) / width
             of_distance = slope * t[3] + (barrier.value(s, self.fp) - s * slope) * dwidth
             t = barrier.curvature(s, self.fp) * ds * seen + slope * t
@@ -209,7 +209,7 @@ class ObstacleFunctions:
             x, y, w = self.row_of(X, a), self.row_of(u, a), self.row_of(by, a)
             if ti.static(g.force.hollow):
                 seen, width = g.force.outlook(scene.parameters, first, x, y), g.force.width(scene.parameters, first)
-                s, at_w = seen[3] / width, first + g.force.count + 1
+                s, at_w = seen[3] / width, first + g.force.index.width
                 slope, of_value = barrier.slope(s, self.fp), w[3]
                 by_s = barrier.curvature(s, self.fp) * self.dot3(seen, w) / width
                 more = (barrier.value(s, self.fp) - s * slope) * of_value - s * by_s

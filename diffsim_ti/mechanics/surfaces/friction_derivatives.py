@@ -12,6 +12,7 @@ from diffsim_ti.mechanics.surfaces.friction_kernels import OWN, PASS, FrictionKe
 from diffsim_ti.mechanics.surfaces.listed_pair import behind, first_of, three
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
+from diffsim_ti.terms.self_contact import SelfContact
 
 A = ti.template()
 DOT = dict(weights_dot="vectors", pressing_dot="vectors", load_dot="scalars")
@@ -33,11 +34,11 @@ class FrictionDerivatives(FrictionKernels):
             r1, r2, r3 = self.changes_at_rest(p, scene, at.rest_dot)
             rest = scene.rest_weights[p]
             d_rest = three(scene.rest_plane[p]).dot(rest[1] * r1 + rest[2] * r2 + rest[3] * r3)
-            dk, dw = self.numbers_jvp(
-                p, scene, at.parameters_dot[self.first], at.parameters_dot[self.first + 1], d_rest
-            )
+            d_stiffness, d_width = self.of_term(at.parameters_dot)
+            dk, dw = self.numbers_jvp(p, scene, d_stiffness, d_width, d_rest)
             d_weights, dn, dN = self.pressed_jvp(kind, p, y1, y2, y3, dy1 + r1, dy2 + r2, dy3 + r3, dk, dw, scene, plan)
-            mu, d_mu = self.mu(p, scene), at.parameters_dot[self.first + 3 + self.row(p, scene)]
+            mu = self.mu(p, scene)
+            d_mu = at.parameters_dot[self.first + SelfContact.index.friction + self.row(p, scene)]
             scene.weights_dot[p] = d_weights
             scene.pressing_dot[p] = self.vec4(dn[0], dn[1], dn[2], mu * dN + d_mu / mu * scene.pressing[p][3])
 
@@ -85,7 +86,7 @@ class FrictionDerivatives(FrictionKernels):
         d_loads, d_mass = self.at_corners(p, scene, scene.load_dot), self.of_corners(p, scene, at.mass_dot)
         d_lightness = 0 - lightness * lightness * d_mass
         dc = plan.h * ((changes * loads + sizes * d_loads).dot(lightness) + (sizes * loads).dot(d_lightness))
-        df = B * (ds - f * dc - y * at.parameters_dot[self.first + 2])
+        df = B * (ds - f * dc - y * at.parameters_dot[self.first + SelfContact.index.friction_speed])
         L, dL = plan.h * scene.pressing[p][3], plan.h * scene.pressing_dot[p][3]
         r = (L * kappa) * t
         dr = (dL * kappa) * t + L * ((df - kappa * ds) * e + kappa * dt)

@@ -24,6 +24,7 @@ from diffsim_ti.mechanics.surfaces.listed_pair import three
 from diffsim_ti.mechanics.surfaces.pressed_pair import PressedPair
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
+from diffsim_ti.terms.self_contact import SelfContact
 
 A = ti.template()
 SIGNS = ((1, -1, -1, -1), (1, 1, -1, -1))  # of the weights of the corners
@@ -67,12 +68,12 @@ class FrictionKernels(PressedPair):
     def mu(self, p, scene: A):
         k, out = self.row(p, scene), ti.cast(0, self.fp)
         if k >= 0:
-            out = scene.parameters[self.first + 3 + k]
+            out = scene.parameters[self.first + SelfContact.index.friction + k]
         return out
 
     @ti.func
     def speed(self, scene: A):
-        return scene.parameters[self.first + 2]
+        return scene.parameters[self.first + SelfContact.index.friction_speed]
 
     @ti.func
     def size(self, kind: A, w):

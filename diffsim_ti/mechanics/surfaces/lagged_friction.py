@@ -5,6 +5,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
+from diffsim_ti.terms.self_contact import SelfContact
 
 
 class LaggedFriction(PairFriction):
@@ -37,7 +38,7 @@ class LaggedFriction(PairFriction):
 
     @property
     def speed(self) -> float:
-        return float(self.a.values.parameters[self.pairs.first + 2])
+        return float(self.a.values.parameters[self.pairs.first + SelfContact.index.friction_speed])
 
     def _sliding(self, u: np.ndarray) -> tuple:
         """(velocities of the corners, their difference across the gap, t, |t|, t / |t|, f / |t|, df / d|t|)"""
@@ -105,7 +106,7 @@ class LaggedFriction(PairFriction):
         self.changes(self.pairs.next, 0, self.pairs.step, numbers)
         d_pressing = whole(self.own.pressing_dot)[self.felt].astype(np.float64)
         dw, dn, dL = whole(self.own.weights_dot)[self.felt].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
-        d_speed = float(runtime.fetch(numbers.parameters)[self.pairs.first + 2])
+        d_speed = float(runtime.fetch(numbers.parameters)[self.pairs.first + SelfContact.index.friction_speed])
         v, relative, t, s, e, kappa, slope = self._sliding(u)
         dv = (self.per_gamma * (du - dx))[self.corners]
         d_relative = np.einsum("pk,pkd->pd", self.w, dv) + np.einsum("pk,pkd->pd", dw, v)

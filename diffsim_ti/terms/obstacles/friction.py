@@ -40,7 +40,7 @@ def normal_force(g, n, push):
     return [x / size for x in n], push * size
 
 
-def slide(g, n, push, v, wall, mu, h_over_m, eps):
+def slide(g, n, push, v, wall, h_over_m, mu, eps):
     """Velocity after friction: push n the barrier's force, v and wall the velocities of vertex and obstacle.
 
     Everything is a number of the graph `g`, or a list of three.

@@ -21,7 +21,7 @@ def _record(force, parameters, first, X, u, v, wall, time, total):
     """(graph, the obstacle's numbers, leaves of u, v, wall, [time, total], h mu N, impulse)"""
     g, p, moved, d, n = force.record(parameters, first, X, u)
     before, walls = ([g.leaf(at(x, d)) for d in range(3)] for x in (v, wall))
-    time, total, mu, eps = g.leaf(time), g.leaf(total), p[force.count + 2], p[force.count + 3]
+    time, total, (mu, eps) = g.leaf(time), g.leaf(total), force.rough(p)
     n, push = friction.normal_force(g, n, force.push(g, p, d))
     t, speed = friction.tangential(g, n, before, walls)
     load = time * mu * push
@@ -34,7 +34,7 @@ def load(force, parameters, first, X, u, time):
     """h mu N [N s]; time: h, on the area of the vertex where the stiffness is per area."""
     g, p, _, d, n = force.record(parameters, first, X, u)
     _, push = friction.normal_force(g, n, force.push(g, p, d))
-    return let((g.leaf(time) * p[force.count + 2] * push).value)
+    return let((g.leaf(time) * p[force.index.friction] * push).value)
 
 
 @traced
@@ -50,7 +50,7 @@ def load_jvp(force, parameters, first, X, u, time, parameters_dot, du, dtime):
     _, push = friction.normal_force(g, n, force.push(g, p, d))
     time = g.leaf(time)
     dots = [(time, dtime), *((q, at(parameters_dot, first + k)) for k, q in enumerate(p)), *changes(moved, du)]
-    return g.forward(dots, [time * p[force.count + 2] * push])[0]
+    return g.forward(dots, [time * p[force.index.friction] * push])[0]
 
 
 @traced

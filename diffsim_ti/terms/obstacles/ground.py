@@ -78,8 +78,8 @@ class GroundForce(TurningGroundForce):
     @ti.func
     def scaled(self, parameters: ti.template(), first, X, u):
         """(d / width, stiffness, width)"""
-        width = parameters[first + 2]
-        return ((X.y - parameters[first]) + u.y) / width, parameters[first + 1], width
+        width = parameters[first + self.index.width]
+        return ((X.y - parameters[first]) + u.y) / width, parameters[first + self.index.stiffness], width
 
     @ti.func
     def force(self, parameters: ti.template(), first, X, u, v):
