@@ -7,6 +7,7 @@ would lead it to or from the obstacle is left out, as if it were across the norm
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import taichi as ti
 
@@ -17,15 +18,19 @@ from diffsim_ti.mechanics.obstacles.contact_impulses import (
     seed_of_friction,
 )
 from diffsim_ti.mechanics.obstacles.held_back import HeldBack
-from diffsim_ti.mechanics.obstacles.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
+from diffsim_ti.mechanics.obstacles.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
 from diffsim_ti.terms.obstacles import stage
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class ContactFriction(HeldBack):
+class ContactFriction(ObstacleStages):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
+
+    @cached_property
+    def held_back(self) -> HeldBack:
+        return HeldBack(self.features, self.precision)
 
     @ti.func
     def led_normal(self, i, n, scene: A):
@@ -126,7 +131,7 @@ class ContactFriction(HeldBack):
         """Velocity after friction."""
         after = self.slide_all(i, v, ratio, scene, state)
         x, _ = self.crowding(i, v, after, z, now, state)
-        c, slope = self.share_and_slope(x)
+        c, slope = self.held_back.share_and_slope(x)
         if slope < 0:
             after = v + c * (after - v)
         return after
@@ -172,7 +177,7 @@ class ContactFriction(HeldBack):
         """Velocity after friction, and its change."""
         after, change = self.slide_all_jvp(i, u, du, v, dv, ratio, dratio, now, scene, state, tangent)
         x, number = self.crowding(i, v, after, z, now, state)
-        c, slope = self.share_and_slope(x)
+        c, slope = self.held_back.share_and_slope(x)
         dc, start, dstart = ti.cast(0, self.fp), v, dv
         if slope < 0:
             way, dway, dx = after - v, change - dv, ti.cast(0, self.fp)
@@ -180,7 +185,7 @@ class ContactFriction(HeldBack):
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    dx = self.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
+                    dx = self.held_back.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
             dc = slope * dx
             after, change = v + c * way, dv + c * dway + dc * way
         if ti.static(self.features.recorded):
@@ -235,7 +240,7 @@ class ContactFriction(HeldBack):
         """(adjoints of v before friction, of h / m, of the move z, of alpha, of u); notes or adds those of all else."""
         after, by_z, by_u = self.slide_all(i, v, ratio, scene, state), self.vector(0), self.vector(0)
         x, number = self.crowding(i, v, after, z, now, state)
-        c, slope = self.share_and_slope(x)
+        c, slope = self.held_back.share_and_slope(x)
         way_adj, own, by_alpha = v_adj, self.vector(0), ti.cast(0, self.fp)
         if slope < 0:
             way = after - v
@@ -246,7 +251,7 @@ class ContactFriction(HeldBack):
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    of_e, of_z, of_u = self.adjoint_of_x(
+                    of_e, of_z, of_u = self.held_back.adjoint_of_x(
                         g, k, i, i, u, z, now.alpha * way, x, by_x, now, scene, adjoint, adjoint
                     )
                     way_adj += now.alpha * of_e

@@ -17,6 +17,7 @@ import numpy as np
 
 from diffsim_ti.common import rotations
 from diffsim_ti.state.walls import Moment
+from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
 
 TINY = 1e-300
 
@@ -151,7 +152,7 @@ class FaceFriction:
         S = self._gather(rub, (np.abs(w) * L[:, None])[..., None])
         lightness = inverse[rub.corners, 0]
         c = (np.abs(w) * S[rub.corners, 0] * lightness).sum(1)
-        kappa, f, y, B = slip(speed, c, eps)
+        kappa, f, y, B = slip(speed, c, eps, TINY, ARRAYS)
         r = -(L * kappa)[:, None] * t
         of_push = dict(mu=mu, size=size, n=n, w=w, L=L, at=at)
         of_motion = dict(v=v, x=x, wall=wall, relative=relative, t=t, speed=speed)
@@ -258,17 +259,6 @@ class FaceFriction:
             parameters=parameters,
             walls=walls_adj,
         )
-
-
-def slip(s: np.ndarray, c: np.ndarray, eps: np.ndarray) -> tuple:
-    """(f / |t|, f, y, B) for |t| = s, with df = B (ds - f dc - y d eps), as of surfaces that rub."""
-    sticks = s < eps + c
-    both = eps + 2 * c
-    keep = 2 * eps / (both + np.sqrt(np.maximum(both * both - 4 * c * np.minimum(s, eps + c), 0)))
-    y = np.where(sticks, keep * s / eps, 1.0)
-    kappa = np.where(sticks, keep / eps * (2 - y), 1 / np.maximum(s, TINY))
-    B = np.where(sticks, 2 * (1 - y) / (eps + 2 * c * (1 - y)), 0.0)
-    return kappa, np.where(sticks, y * (2 - y), 1.0), y, B
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -48,6 +48,11 @@ class ObstacleFunctions:
         """X: a rest position relative to an obstacle at a place; of one that turns seven numbers (obstacle_force.py)."""
         return self.turned.seen(rest, place) if g.force.turns else rest - place
 
+    @ti.func
+    def normal(self, plane):
+        """n of (n, d)."""
+        return self.vector(plane.x, plane.y, plane.z, ti.cast(0, self.fp))
+
     @property
     def num_obstacles(self) -> int:
         return sum(group.count for group in self.features.groups)

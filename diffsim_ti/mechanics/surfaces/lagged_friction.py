@@ -5,7 +5,10 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
+from diffsim_ti.terms.obstacles.friction import ARRAYS, dissipated, slip
 from diffsim_ti.terms.self_contact import SelfContact
+
+TINY = 1e-300
 
 
 class LaggedFriction(PairFriction):
@@ -46,9 +49,8 @@ class LaggedFriction(PairFriction):
         relative = np.einsum("pk,pkd->pd", self.w, v)
         t = self._across(relative)
         s = np.linalg.norm(t, axis=1)
-        y, safe = s / eps, np.maximum(s, 1e-300)
-        kappa, slope = np.where(y < 1, (2 - y) / eps, 1 / np.maximum(s, eps)), np.where(y < 1, 2 * (1 - y) / eps, 0.0)
-        return v, relative, t, s, t / safe[:, None], kappa, slope
+        kappa, _, _, slope = slip(s, 0, eps, TINY, ARRAYS)
+        return v, relative, t, s, t / np.maximum(s, TINY)[:, None], kappa, slope
 
     def _across(self, x: np.ndarray) -> np.ndarray:
         return x - self.n * _dot(self.n, x)
@@ -60,9 +62,7 @@ class LaggedFriction(PairFriction):
 
     def energies(self, u: np.ndarray) -> np.ndarray:
         """Of each pair [J]: what sliding so would dissipate."""
-        s, eps = self._sliding(u)[3], self.speed
-        y = np.minimum(s / eps, 1)
-        return self.L / self.per_gamma * np.where(s < eps, eps * y * y * (1 - y / 3), s - eps / 3)
+        return self.L / self.per_gamma * dissipated(self._sliding(u)[3], self.speed, ARRAYS)
 
     def _pulls(self, u: np.ndarray) -> np.ndarray:
         _, _, t, _, _, kappa, _ = self._sliding(u)
