@@ -146,10 +146,8 @@ class ContactFriction(ObstacleStages):
         if pushed.x > 0:
             plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
             X = self.seen_now(g, k, scene.rest[i], now, scene)
-            dwall, change = (
-                self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent),
-                state.stage[row + SEED, i],
-            )
+            dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+            change = state.stage[row + SEED, i]
             dmu = tangent.parameters[first + g.force.index.friction]
             deps = tangent.parameters[first + g.force.index.friction_speed]
             dafter = stage.slide_jvp(

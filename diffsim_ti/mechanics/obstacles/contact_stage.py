@@ -62,10 +62,8 @@ class ContactStage(ObstacleStages):
                     for k in range(g.count):
                         first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
                         wall = self.wall(g, k, X, u, now, scene)
-                        plane, width = (
-                            g.force.outlook(scene.parameters, first, X, u),
-                            g.force.width(scene.parameters, first),
-                        )
+                        plane = g.force.outlook(scene.parameters, first, X, u)
+                        width = g.force.width(scene.parameters, first)
                         if turn == 0:
                             y = plane.w + self.normal(plane).dot(move - now.h * wall)
                             near = near or ti.min(plane.w, y) < width

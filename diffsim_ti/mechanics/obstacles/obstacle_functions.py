@@ -83,6 +83,45 @@ class ObstacleFunctions:
             for d in ti.static(range(3)):
                 adjoint.sums[row + d, i] = adjoint.sums[row + d, i] + by_X[d]
 
+    # ---- the force of a barrier on vertex i, whatever says where obstacles are; X: as `seen` has it ---------------------
+
+    @ti.func
+    def force(self, g: A, k, i, X, u, v, scene: A):
+        return self.on_area(g, i, g.force.force(scene.parameters, g.first + k * g.size, X, u, v), scene)
+
+    @ti.func
+    def force_jvp(self, g: A, k, i, X, u, v, moved, dv, scene: A, tangent: A):
+        """Its change; moved: that of the place as the obstacle sees it."""
+        first = g.first + k * g.size
+        df = g.force.force_jvp(scene.parameters, first, X, u, v, moved, dv)
+        by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
+        for m in ti.static(range(g.size)):
+            df += by[m] * tangent.parameters[first + m]
+        df = self.on_area(g, i, df, scene)
+        if ti.static(g.force.per_area):
+            df += tangent.surface[i] * g.force.force(scene.parameters, first, X, u, v)
+        return df
+
+    @ti.func
+    def force_vjp(self, g: A, k, i, X, u, v, w, scene: A, adjoint: A):
+        """(adjoints of the place as the obstacle sees it, of v) for the adjoint w; adds those of numbers and area."""
+        first = g.first + k * g.size
+        if ti.static(g.force.per_area and self.features.shape):
+            self.add_to_area(g, i, g.force.force(scene.parameters, first, X, u, v).dot(w), adjoint)
+        w = self.on_area(g, i, w, scene)
+        by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
+        for m in ti.static(range(g.size)):
+            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
+        by_place, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
+        return by_place, by_v
+
+    @ti.func
+    def add_to_numbers(self, g: A, k, i, by: A, adjoint: A):
+        """Add the adjoints of an obstacle's numbers."""
+        for m in ti.static(range(g.size)):
+            row = g.first + k * g.size + m
+            adjoint.sums[row, i] = adjoint.sums[row, i] + by[m]
+
     # ---- points within a face, whose nodes are the rows of a matrix, its corners the first three ------------------------
 
     @ti.func

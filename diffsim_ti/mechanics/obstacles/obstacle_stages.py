@@ -251,8 +251,7 @@ class ObstacleStages(ObstacleFunctions):
         """f and the force of all obstacles on vertex i."""
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
-                X = self.seen_now(g, k, scene.rest[i], now, scene)
-                f += self.on_area(g, i, g.force.force(scene.parameters, g.first + k * g.size, X, u, v), scene)
+                f += self.force(g, k, i, self.seen_now(g, k, scene.rest[i], now, scene), u, v, scene)
         return f
 
     @ti.func
@@ -260,15 +259,9 @@ class ObstacleStages(ObstacleFunctions):
         """df and its change."""
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
-                first = g.first + k * g.size
                 X = self.seen_now(g, k, scene.rest[i], now, scene)
                 moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
-                df += self.on_area(g, i, g.force.force_jvp(scene.parameters, first, X, u, v, moved, dv), scene)
-                by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
-                for m in ti.static(range(g.size)):
-                    df += self.on_area(g, i, by[m], scene) * tangent.parameters[first + m]
-                if ti.static(g.force.per_area):
-                    df += tangent.surface[i] * g.force.force(scene.parameters, first, X, u, v)
+                df += self.force_jvp(g, k, i, X, u, v, moved, dv, scene, tangent)
         return df
 
     @ti.func
@@ -276,19 +269,11 @@ class ObstacleStages(ObstacleFunctions):
         """u_adj, v_adj and the adjoints of u and v for that of the force; adds those of all else."""
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
-                first = g.first + k * g.size
                 X = self.seen_now(g, k, scene.rest[i], now, scene)
-                w = self.on_area(g, i, f_adj, scene)
-                by_place, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
+                by_place, by_v = self.force_vjp(g, k, i, X, u, v, f_adj, scene, adjoint)
                 by_u = self.spread(g, k, i, X, u, by_place, self.vector(0), now, scene, adjoint, adjoint)
                 u_adj += by_u
                 v_adj += by_v
-                by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
-                for m in ti.static(range(g.size)):
-                    adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
-                if ti.static(g.force.per_area and self.features.shape):
-                    pushed = g.force.force(scene.parameters, first, X, u, v)
-                    self.add_to_area(g, i, pushed.dot(f_adj), adjoint)
                 self.add_to_rest(i, by_u, adjoint)
         return u_adj, v_adj
 
@@ -298,11 +283,10 @@ class ObstacleStages(ObstacleFunctions):
         work, v = ti.cast(0, self.fp), v_plus
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
-                first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 wall = self.wall(g, k, X, u, now, scene)
                 if ti.static(g.path >= 0):
-                    force = self.on_area(g, i, g.force.force(scene.parameters, first, X, u, v_plus), scene)
-                    work += now.h * force.dot(wall)
+                    work += now.h * self.force(g, k, i, X, u, v_plus, scene).dot(wall)
                 if ti.static(g.force.friction):
                     if scene.inverse_mass[i] > 0:
                         after = self.slide(g, k, i, u, v, now, scene)
@@ -379,8 +363,7 @@ class ObstacleStages(ObstacleFunctions):
                     by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
                     v_adj = by_v
                     u_adj += by_u
-                    for m in ti.static(range(g.size)):
-                        adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+                    self.add_to_numbers(g, k, i, by, adjoint)
                     if ti.static(self.features.density):
                         row = ti.static(self.features.sums().first("mass"))
                         adjoint.sums[row, i] = adjoint.sums[row, i] - h_over_m * inverse * by_ratio

@@ -62,30 +62,7 @@ class ObstaclePotential(ObstacleFunctions):
         assign(at(adjoint.walls, row, i), at(adjoint.walls, row, i) + self.turned.long(by_theta))
         return by_u, by_t
 
-    # ---- the barrier -------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def energy(self, i, u, scene: A, pass_: A):
-        """Energy of the barriers [J]."""
-        value = ti.cast(0, self.fp)
-        for g in ti.static(self.features.groups):
-            for k in range(g.count):
-                X = self.rest_now(g, k, i, scene, pass_)
-                value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
-        return value
-
-    @ti.func
-    def product(self, i, u, w, scene: A, pass_: A):
-        """Change of the barriers' force for a change w of the displacement."""
-        f, zero = self.vector(0), self.vector(0)
-        for g in ti.static(self.features.groups):
-            for k in range(g.count):
-                X = self.rest_now(g, k, i, scene, pass_)
-                change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
-                f += self.on_area(g, i, change, scene)
-        return f
-
-    # ---- with friction -----------------------------------------------------------------------------------------------
+    # ---- friction ----------------------------------------------------------------------------------------------------
     # Of obstacles that reach into faces, points within them push as well: N and its direction are then the size and the
     # direction of `pass_.pressed`, all that an obstacle pushes a vertex with where the pass begins.
 
@@ -186,8 +163,7 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def push(self, g: A, k, i, u, scene: A, pass_: A):
-        X = self.rest_now(g, k, i, scene, pass_)
-        return g.force.force(scene.parameters, g.first + k * g.size, X, u, self.vector(0))
+        return self.force(g, k, i, self.rest_now(g, k, i, scene, pass_), u, self.vector(0), scene)
 
     @ti.func
     def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
@@ -201,33 +177,35 @@ class ObstaclePotential(ObstacleFunctions):
         dv = plan.per_gamma * w
         return g.force.rub_product(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, dv)
 
+    # ---- barrier and friction; `rough`: whether friction counts -------------------------------------------------------
+
     @ti.func
-    def whole_energy(self, i, u, scene: A, pass_: A, plan: A):
+    def total_energy(self, i, u, scene: A, pass_: A, plan: A, rough: A):
         """Energy of the barriers and the potential of friction [J]."""
         value = ti.cast(0, self.fp)
         for g in ti.static(self.features.groups):
             for k in range(g.count):
                 X = self.rest_now(g, k, i, scene, pass_)
                 value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
-                if ti.static(g.force.friction):
+                if ti.static(rough and g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
                         lost = self.lost(g, k, i, u, scene, pass_, plan)
                         value += self.on_rubbed_area(g, i, lost, scene) / plan.per_gamma
         return value
 
     @ti.func
-    def whole_force(self, i, u, scene: A, pass_: A, plan: A):
+    def total_force(self, i, u, scene: A, pass_: A, plan: A):
         f = self.vector(0)
         for g in ti.static(self.features.groups):
             for k in range(g.count):
-                f += self.on_area(g, i, self.push(g, k, i, u, scene, pass_), scene)
+                f += self.push(g, k, i, u, scene, pass_)
                 if ti.static(g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
                         f += self.on_rubbed_area(g, i, self.drag(g, k, i, u, scene, pass_, plan), scene)
         return f
 
     @ti.func
-    def whole_product(self, i, u, w, scene: A, pass_: A, plan: A):
+    def total_product(self, i, u, w, scene: A, pass_: A, plan: A, rough: A):
         """Change of the force for a change w of the displacement."""
         f, zero = self.vector(0), self.vector(0)
         for g in ti.static(self.features.groups):
@@ -235,7 +213,7 @@ class ObstaclePotential(ObstacleFunctions):
                 X = self.rest_now(g, k, i, scene, pass_)
                 change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
                 f += self.on_area(g, i, change, scene)
-                if ti.static(g.force.friction):
+                if ti.static(rough and g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
                         f += self.on_rubbed_area(g, i, self.drag_product(g, k, i, u, w, scene, pass_, plan), scene)
         return f
@@ -244,16 +222,9 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def push_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A):
-        first, zero, X = g.first + k * g.size, self.vector(0), self.rest_now(g, k, i, scene, pass_)
+        zero, X = self.vector(0), self.rest_now(g, k, i, scene, pass_)
         moved = self.moved(g, k, 0, X, u, du + tangent.rest[i], scene, tangent)
-        f = g.force.force_jvp(scene.parameters, first, X, u, zero, moved, zero)
-        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
-        for m in ti.static(range(g.size)):
-            f += by[m] * tangent.parameters[first + m]
-        f = self.on_area(g, i, f, scene)
-        if ti.static(g.force.per_area):
-            f += tangent.surface[i] * self.push(g, k, i, u, scene, pass_)
-        return f
+        return self.force_jvp(g, k, i, X, u, zero, moved, zero, scene, tangent)
 
     @ti.func
     def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
@@ -289,16 +260,9 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def push_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A):
-        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
-        if ti.static(g.force.per_area and self.features.shape):
-            self.add_to_area(g, i, self.push(g, k, i, u, scene, pass_).dot(w), adjoint)
-        w = self.on_area(g, i, w, scene)
-        X = self.rest_now(g, k, i, scene, pass_)
-        by_place, _ = g.force.force_vjp(scene.parameters, first, X, u, zero, w)
+        n, zero, X = 3 * (g.number + k), self.vector(0), self.rest_now(g, k, i, scene, pass_)
+        by_place, _ = self.force_vjp(g, k, i, X, u, zero, w, scene, adjoint)
         by_u, by_t = self.spread(g, k, 0, i, X, u, by_place, scene, adjoint)
-        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
-        for m in ti.static(range(g.size)):
-            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
         self.add_to_rest(i, by_u, adjoint)
         adjoint.walls[n, i] = by_t
         adjoint.walls[n + 1, i] = zero
@@ -315,8 +279,7 @@ class ObstaclePotential(ObstacleFunctions):
         by_felt, by_v, by_wall, by = g.force.rub_vjp(
             scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, w
         )
-        for m in ti.static(range(g.size)):
-            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+        self.add_to_numbers(g, k, i, by, adjoint)
         if ti.static(self.reaches(g)):
             adjoint.pressed[g.number + k, i] = by_felt
         if ti.static(g.force.turns or not self.reaches(g)):

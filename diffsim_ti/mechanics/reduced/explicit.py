@@ -20,7 +20,7 @@ from diffsim_ti.mechanics.obstacles.outside_work import add_work_of_pass
 from diffsim_ti.mechanics.reduced import body_motion as motion
 from diffsim_ti.mechanics.reduced.body_friction import BodyFriction
 from diffsim_ti.mechanics.reduced.body_motion import VECTOR
-from diffsim_ti.mechanics.reduced.body_sums import INVERSE, BodySums
+from diffsim_ti.mechanics.reduced.body_sums import INVERSE, MOMENTS, BodySums
 from diffsim_ti.runtime import Bundle, at, let, traced
 from diffsim_ti.state.bodies import NUMBERS, PAIRS
 
@@ -273,7 +273,7 @@ class Bodies(BodySums):
         for k in ti.static(range(6)):
             r = ti.static(PAIRS[k][0])
             c = ti.static(PAIRS[k][1])
-            out += -ti.static(1.0 if r == c else 2.0) * z[r] * z[c] * tangent.body_numbers[b * NUMBERS + 10 + k]
+            out += -ti.static(1.0 if r == c else 2.0) * z[r] * z[c] * tangent.body_numbers[b * NUMBERS + MOMENTS + k]
         return out
 
     @ti.func

@@ -233,32 +233,37 @@ class FrictionKernels(ListedPair):
         """The state in a slot and that in a row of `kept`."""
         return self.kernel("swap", self.swap_all, STATE, keep="int")
 
+    @ti.func
+    def each_pressing(self, act: A, scene: A, at: A, plan: A):
+        """act(kind, p, scene, at, plan) of all pairs that press."""
+        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
+            ti.loop_config(serialize=not self.parallel)
+            for p in range(first_of(kind, plan), behind(kind, plan)):
+                if scene.pressing[p][3] > 0:
+                    act(kind, p, scene, at, plan)
+
     # ---- derivatives of what presses ---------------------------------------------------------------------------------
 
     @ti.func
     def measure_pair_jvp(self, kind: A, p, scene: A, at: A, plan: A):
-        if scene.pressing[p][3] > 0:
-            y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
-            dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
-            r1, r2, r3 = self.changes_at_rest(p, scene, at.rest_dot)
-            rest = scene.rest_weights[p]
-            d_rest = three(scene.rest_plane[p]).dot(rest[1] * r1 + rest[2] * r2 + rest[3] * r3)
-            d_stiffness, d_width = self.of_term(at.parameters_dot)
-            dk, dw = self.numbers_jvp(p, scene, d_stiffness, d_width, d_rest)
-            d_weights, dn, dN = self.pair.pressed_jvp(
-                kind, p, y1, y2, y3, dy1 + r1, dy2 + r2, dy3 + r3, dk, dw, scene, plan
-            )
-            mu = self.mu(p, scene)
-            d_mu = at.parameters_dot[self.first + SelfContact.index.friction + self.row(p, scene)]
-            scene.weights_dot[p] = d_weights
-            scene.pressing_dot[p] = self.vec4(dn[0], dn[1], dn[2], mu * dN + d_mu / mu * scene.pressing[p][3])
+        y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
+        dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
+        r1, r2, r3 = self.changes_at_rest(p, scene, at.rest_dot)
+        rest = scene.rest_weights[p]
+        d_rest = three(scene.rest_plane[p]).dot(rest[1] * r1 + rest[2] * r2 + rest[3] * r3)
+        d_stiffness, d_width = self.of_term(at.parameters_dot)
+        dk, dw = self.numbers_jvp(p, scene, d_stiffness, d_width, d_rest)
+        d_weights, dn, dN = self.pair.pressed_jvp(
+            kind, p, y1, y2, y3, dy1 + r1, dy2 + r2, dy3 + r3, dk, dw, scene, plan
+        )
+        mu = self.mu(p, scene)
+        d_mu = at.parameters_dot[self.first + SelfContact.index.friction + self.row(p, scene)]
+        scene.weights_dot[p] = d_weights
+        scene.pressing_dot[p] = self.vec4(dn[0], dn[1], dn[2], mu * dN + d_mu / mu * scene.pressing[p][3])
 
     @ti.func
     def measure_all_jvp(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                self.measure_pair_jvp(kind, p, scene, at, plan)
+        self.each_pressing(self.measure_pair_jvp, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             if scene.rubs[s] > 0:
@@ -305,11 +310,7 @@ class FrictionKernels(ListedPair):
 
     @ti.func
     def slide_all_jvp(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                if scene.pressing[p][3] > 0:
-                    self.slide_pair_jvp(kind, p, scene, at, plan)
+        self.each_pressing(self.slide_pair_jvp, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             if scene.rubs[s] > 0:
@@ -432,11 +433,7 @@ class FrictionKernels(ListedPair):
 
     @ti.func
     def measure_all_vjp(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                if scene.pressing[p][3] > 0:
-                    self.measure_pair_vjp(kind, p, scene, at, plan)
+        self.each_pressing(self.measure_pair_vjp, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             at.by_place[s] = self.vec4(0)
@@ -452,11 +449,7 @@ class FrictionKernels(ListedPair):
 
     @ti.func
     def all_pairs_vjp(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                if scene.pressing[p][3] > 0:
-                    self.slide_pair_vjp(kind, p, scene, at, plan)
+        self.each_pressing(self.slide_pair_vjp, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             if scene.rubs[s] > 0:

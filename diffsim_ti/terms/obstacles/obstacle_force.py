@@ -11,7 +11,7 @@ from diffsim_ti.differentiation import Graph
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import assign, at, let, traced
 from diffsim_ti.terms.obstacles import barrier, friction
-from diffsim_ti.terms.obstacles.turning import changes, cross, length_of, rotation_matrix
+from diffsim_ti.terms.obstacles.turning import all_changes, changes, cross, length_of, rotation_matrix
 from diffsim_ti.terms.term import VertexForce
 
 
@@ -136,9 +136,8 @@ class ObstacleForce(VertexForce):
     def outlook_jvp(self, parameters, first, X, u, du, parameters_dot=None):
         """Its change for changes of the place and, where given, of the obstacle's numbers."""
         g, p, moved, d, n = self.record(parameters, first, X, u)
-        dots = changes(moved, du)
-        if parameters_dot is not None:
-            dots += [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
+        known = p if parameters_dot is not None else ()
+        dots = all_changes(known, parameters_dot, first, (moved, du))
         return let(ti.types.vector(4, self.fp)(*g.forward(dots, [*n, d])))
 
     @traced
@@ -257,10 +256,8 @@ class ObstacleForce(VertexForce):
     def slide_jvp(self, parameters, first, X, u, v, wall, h_over_m, parameters_dot, du, dv, dwall, dh_over_m):
         """Its change."""
         g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
-        dots = [(ratio, dh_over_m)] + [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
-        for leaves, change in ((moved, du), (before, dv), (walls, dwall)):
-            dots += changes(leaves, change)
-        return self.vector_of(g.forward(dots, after))
+        dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (walls, dwall))
+        return self.vector_of(g.forward([(ratio, dh_over_m), *dots], after))
 
     @traced
     def slide_vjp(self, parameters, first, X, u, v, wall, h_over_m, w):
@@ -277,9 +274,7 @@ class ObstacleForce(VertexForce):
         X, u = felt
         if X is None:
             g = Graph(self.fp, parameters)
-            p, place = (
-                [g.leaf(x) for x in xs] for xs in (self._numbers(parameters, first), [at(u, d) for d in range(3)])
-            )
+            p, place = [g.leaf(x) for x in self._numbers(parameters, first)], [g.leaf(at(u, d)) for d in range(3)]
             push = g.sqrt(g.dot(place, place))
             n = [x / push for x in place]
         else:
@@ -318,9 +313,7 @@ class ObstacleForce(VertexForce):
     def rub_jvp(self, parameters, first, felt, v, wall, parameters_dot, du, dv, dwall):
         """Its change for changes of everything."""
         g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
-        dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
-        for leaves, change in ((moved, du), (speed, dv), (walls, dwall)):
-            dots += changes(leaves, change)
+        dots = all_changes(p, parameters_dot, first, (moved, du), (speed, dv), (walls, dwall))
         return self.vector_of(g.forward(dots, f))
 
     @traced

@@ -11,7 +11,7 @@ import taichi as ti
 from diffsim_ti.differentiation import Graph
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.obstacles import friction, secant
-from diffsim_ti.terms.obstacles.turning import changes
+from diffsim_ti.terms.obstacles.turning import all_changes
 
 
 @traced
@@ -83,9 +83,7 @@ def _three(values):
 def push_jvp(force, parameters, first, X, u, move, damping, parameters_dot, du, dmove):
     """Change of (n, P)"""
     g, p, moved, leaves, n, pushed = _record_push(force, parameters, first, X, u, move, damping)
-    dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
-    for own, change in ((moved, du), (leaves, dmove)):
-        dots += changes(own, change)
+    dots = all_changes(p, parameters_dot, first, (moved, du), (leaves, dmove))
     *dn, dp = g.forward(dots, [*n, pushed])
     return _vector(force.fp, dn, dp)
 
