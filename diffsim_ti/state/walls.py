@@ -16,6 +16,12 @@ from diffsim_ti.state.schedule import Schedule
 MORE = 6  # rows of an obstacle that turns
 
 
+def _at_share(s: np.ndarray, phi: np.ndarray, share: float) -> np.ndarray:
+    """Modified Rodrigues parameters of R(share phi) R, from those of R; in kernels turning.py."""
+    turn = rotations.quaternion(share * phi)
+    return rotations.rodrigues(rotations.product(turn, rotations.from_rodrigues(s)))
+
+
 @dataclass(frozen=True)
 class Moment:
     """Pass j, the shares of its step at which forces are taken and at which it begins, and tau [s]."""
@@ -55,10 +61,9 @@ class Walls:
             self._translations(out, path, at)
             for row, c in self.turning:
                 s = at.schedule.row_of(path, at.j)
-                phi, start = path[s, c + 2], rotations.from_rodrigues(path[s, c + 1])
+                phi = path[s, c + 2]
                 for m, share in enumerate((at.at_stage, at.begin)):
-                    turn = rotations.quaternion(share * phi)
-                    out[row + m] = rotations.rodrigues(rotations.product(turn, start))
+                    out[row + m] = _at_share(path[s, c + 1], phi, share)
                 out[row + 2] = phi / at.schedule.step_length(at.j)
                 out[row + 5, 0] = at.tau
         return out
@@ -96,8 +101,7 @@ class Walls:
         """Where they are when the share of a drift is done."""
         out = places + share * drift
         for at in self.place_of.values():
-            start = rotations.from_rodrigues(places[at])
-            out[at] = rotations.rodrigues(rotations.product(rotations.quaternion(share * drift[at]), start))
+            out[at] = _at_share(places[at], drift[at], share)
         return out
 
     def way_at(

@@ -68,9 +68,8 @@ class ObstacleStages(ObstacleFunctions):
 
     @ti.func
     def turn_at(self, g: A, k, share, now: A, path: A):
-        c = self.column(g, k)
-        start = turning.from_rodrigues(self.turned.short(path[now.row, c + 1]), self.fp)
-        return turning.product(turning.quaternion(share * self.turned.short(path[now.row, c + 2]), self.fp), start)
+        start, phi = path[now.row, self.column(g, k) + 1], path[now.row, self.column(g, k) + 2]
+        return turning.at_share(self.turned.short(start), self.turned.short(phi), share, self.fp)
 
     @traced
     def place(self, g, k, now, path):

@@ -124,6 +124,12 @@ def product(p, q):
 
 
 @ti.func
+def at_share(s, phi, share, fp: ti.template()):
+    """R(share phi) R, a unit quaternion, of the modified Rodrigues parameters s of R."""
+    return product(quaternion(share * phi, fp), from_rodrigues(s, fp))
+
+
+@ti.func
 def turned(q, sign: ti.template(), x, fp: ti.template()):
     """R x, or with sign -1 R^T x."""
     v = ti.Vector([sign * q[1], sign * q[2], sign * q[3]])
