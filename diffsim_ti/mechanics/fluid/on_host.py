@@ -4,6 +4,7 @@ derivatives. dragged_triangle.py has the formulas."""
 import numpy as np
 
 from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+from diffsim_ti.terms.surface_drag import SurfaceDrag
 
 
 def _dot(a, b):
@@ -40,8 +41,14 @@ class Fluid:
 
     def _numbers(self, parameters):
         """(rho / 12, c_t, c_n - c_t, stream) of each triangle."""
-        rows = parameters[self.first[:, None] + np.arange(6)]
-        return rows[:, :1] / 12, rows[:, 2:3], rows[:, 1:2] - rows[:, 2:3], rows[:, 3:]
+        rows, index = parameters[self._rows], SurfaceDrag.index
+        rho, c_n, c_t = (rows[:, [k]] for k in (index.density, index.normal, index.tangential))
+        return rho / 12, c_t, c_n - c_t, rows[:, index.stream :]
+
+    @property
+    def _rows(self):
+        """Where the numbers of each triangle stand, shape (m, numbers)."""
+        return self.first[:, None] + np.arange(SurfaceDrag.index.end)
 
     def _mean(self, v):
         return v[self.triangles].mean(1)
@@ -111,7 +118,7 @@ class Fluid:
         by_k, by_c, by_rho = along * over * across, L * straight, -size * _dot(w, B) / 12
         numbers = np.zeros(num_parameters)
         if num_parameters:
-            np.add.at(numbers, self.first[:, None] + np.arange(6), np.hstack([by_rho, by_k, by_c - by_k, -by_v]))
+            np.add.at(numbers, self._rows, np.hstack([by_rho, by_k, by_c - by_k, -by_v]))
         return triangle_normals_vjp(x, self.triangles, 2 * by_N), self._to_vertices(by_v / 3), numbers
 
     def work(self, x: np.ndarray, step: np.ndarray) -> float:
