@@ -315,7 +315,7 @@ class DifferentiableSimulator:
             solver = self._core_solver(scene, 1)
             self._ratio = solver.stable_dt(tight=True).dt / stability.element_limit(scene).dt
         omega2 = (2 / (self._ratio * bound)) ** 2
-        omega2 += self._contact_rigidity(scene, values) * barrier.reference_curvature()
+        omega2 += self._contact_rigidity(scene, values) * barrier.REFERENCE_CURVATURE
         needed = math.ceil(self.solver.dt * math.sqrt(omega2) / 2 / 0.8)
         if needed > self._substeps:
             warnings.warn(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import taichi as ti
 from chamber_meshes import hollow_cube
 from test_chambers import assert_outputs_transposed, assert_tangents, hollow, pitted
 from test_every_adjoint import assert_transposed
@@ -66,7 +67,7 @@ def test_volumes_and_their_rates(kind):
 
 
 def test_faces_of_the_same_run():
-    """Checkpoints, clip and a second sweep give the same bits or nearly so; a simulator goes the same way."""
+    """Checkpoints, clip and a second sweep give the same bits or nearly so; a simulator and a tape go the same way."""
     scene = pumped(pitted)
     plain, parts, clipped = (
         rollout_of(EXPLICIT[1], scene, **o) for o in ({}, dict(checkpoint_every=2), dict(clip=1e30))
@@ -78,6 +79,19 @@ def test_faces_of_the_same_run():
         found = other.vjp(other.forward(), **seeds)
         for name, wanted in expected.items():
             assert np.abs(found[name] - wanted).max() <= gate * np.abs(wanted).max(), name
+    pressure, total = plain.field("chamber_pressure"), ti.field(ti.f64, (), needs_grad=True)
+
+    @ti.kernel
+    def add(x: ti.template()):
+        for f in x:
+            total[None] += x[f]
+
+    with ti.ad.Tape(total):
+        plain.run()
+        add(pressure)
+    taped, expected = plain.gradients, plain.vjp(plain.forward(), chamber_pressure=np.ones(4))
+    for name, wanted in expected.items():
+        np.testing.assert_array_equal(taped[name], wanted, err_msg=name)
     simulator = ds.Simulator(plain.solver)
     for k in range(1, 4):
         simulator.step()

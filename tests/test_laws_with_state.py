@@ -21,6 +21,8 @@ SOLVERS = (*EXPLICIT, ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpoint
 every_solver = pytest.mark.parametrize("solver", SOLVERS)
 MESH = ds.TetrahedralMesh.create_cube(2, 1.0)
 MU, LAM, G, TAU = 4e3, 6e3, 3e3, 0.02
+# what reads the state of each frame
+RESULTS = dict(save_every=1, outputs=(ds.Reaction("xmin"), ds.ElasticEnergy(), ds.Stress(at="vertices")))
 
 
 def rubber(each: bool = False) -> RelaxingRubber:
@@ -56,9 +58,9 @@ def test_tables_of_passes_may_be_shorter_than_a_run(solver, monkeypatch):
     found = []
     for size in (1024, 4):
         monkeypatch.setattr(PassTable, "size", size)
-        run = rollout(scene(), solver)
+        run = rollout(scene(), solver, **RESULTS)
         frames = run.forward()
-        found.append([frames.positions, *run.vjp(frames, positions=np.cos(frames.positions)).values()])
+        found.append([frames.positions, frames.law_state, *gradients(run).values()])
     for one, other in zip(*found):
         np.testing.assert_array_equal(one, other)
 
@@ -176,24 +178,37 @@ def gates(r: ds.Rollout, round_off: float, *inputs: str) -> None:
 @pytest.mark.parametrize("each", [False, True], ids=["uniform", "each"])
 @pytest.mark.parametrize("solver", EXPLICIT)
 def test_gradients_by_every_number(solver, each):
-    gates(rollout(scene(rubber(each)), solver), 1e-12)
+    gates(rollout(scene(rubber(each)), solver, **RESULTS), 1e-12)
 
 
 @pytest.mark.parametrize(
     "solver, each", [(ds.ImplicitEulerSolver, False), (ds.BDF2Solver, True), (ds.ImplicitMidpointSolver, True)]
 )
 def test_gradients_through_implicit_steps(solver, each):
-    gates(
-        rollout(scene(rubber(each)), solver), 1e-10, "mu", "g", "tau", "rest_positions", "initial_positions", "density"
-    )
+    r = rollout(scene(rubber(each)), solver, **RESULTS)
+    gates(r, 1e-10, "mu", "g", "tau", "rest_positions", "initial_positions", "density")
 
 
 def test_gradients_in_float32():
-    gates(rollout(scene(precision="f32")), 1e-5)
+    gates(rollout(scene(precision="f32"), **RESULTS), 1e-5)
+
+
+def test_scenes_of_a_batch_have_their_own():
+    """One after the other: side by side, frames note nothing besides states."""
+    solver = ds.SemiImplicitSolver(scene(), dt=2e-3)
+    batch, one = ds.Batch(solver, 3, 2, **RESULTS), ds.Rollout(solver, 3, **RESULTS)
+    g = np.array([G, 2 * G])
+    found = batch.vjp(frames := batch.forward(g=g), reaction=np.ones((2, 4, 3)))["g"]
+    for b in range(2):
+        alone = one.forward(g=g[b])
+        np.testing.assert_array_equal(frames["stress"][b], alone["stress"])
+        assert found[b] == one.vjp(alone, reaction=np.ones((4, 3)))["g"] != 0
+    with pytest.raises(ValueError, match="side by side: an output reads law_state of frames"):
+        ds.Batch(solver, 3, 2, lanes=True, **RESULTS)
 
 
 def test_gradients_with_one_launch_for_each_pass():
-    gates(rollout(scene(rubber(each=True)), ds.VelocityVerletSolver, parallel=True), 1e-12)
+    gates(rollout(scene(rubber(each=True)), ds.VelocityVerletSolver, parallel=True, **RESULTS), 1e-12)
 
 
 def test_gradients_beside_contact():
@@ -233,7 +248,7 @@ class Variant(RelaxingRubber):
 
 
 def test_gradients_of_a_law_that_also_reads_the_velocity():
-    gates(rollout(scene(Variant(ViscousToo))), 1e-12)
+    gates(rollout(scene(Variant(ViscousToo)), save_every=1, outputs=ds.Reaction()), 1e-12)
 
 
 @cache
@@ -243,13 +258,14 @@ def seeds(r: tuple) -> tuple:
 
 def gradients(r: ds.Rollout, **options) -> dict:
     frames = r.forward(**options)
-    return r.vjp(frames, *seeds(frames.positions.shape))
+    by_outputs = {name: seeds(frames[name].shape)[0] for name in r.computed}
+    return r.vjp(frames, *seeds(frames.positions.shape), **by_outputs)
 
 
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver])
 def test_lanes_change_nothing(solver):
     """Eight tetrahedra at a time and one at a time agree to round-off."""
-    pair = [gradients(rollout(scene(Variant(law)), solver)) for law in (RelaxingLaw, OneByOne)]
+    pair = [gradients(rollout(scene(Variant(law)), solver, **RESULTS)) for law in (RelaxingLaw, OneByOne)]
     for name, one in pair[0].items():
         np.testing.assert_allclose(one, pair[1][name], rtol=0, atol=1e-11 * np.abs(one).max(), err_msg=name)
 
@@ -257,7 +273,7 @@ def test_lanes_change_nothing(solver):
 @pytest.mark.parametrize("solver", [*EXPLICIT, ds.BDF2Solver])
 @pytest.mark.parametrize("options", [dict(checkpoint_every=2), dict(memory=0.008)], ids=str)
 def test_what_is_kept_changes_no_bit(solver, options):
-    whole, other = (rollout(scene(), solver, 7, **own) for own in ({}, options))
+    whole, other = (rollout(scene(), solver, 7, **RESULTS, **own) for own in ({}, options))
     assert whole.checkpoints.num_segments == 1 and other.checkpoints.num_segments > 2
     want, got = gradients(whole), gradients(other)
     for name in want:
@@ -303,21 +319,23 @@ def test_clip_scales_all_that_the_past_has_done(solver):
 
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver])
 def test_a_tape_finds_the_same_gradients(solver):
-    r = rollout(scene(rubber(each=True)), solver)
+    r = rollout(scene(rubber(each=True)), solver, **RESULTS)
     shape = (r.num_frames, MESH.num_vertices, 3)
     w = ti.Vector.field(3, ti.f64, shape[:2])
     w.from_numpy(seeds(shape)[0])
     loss, tau = ti.field(ti.f64, (), needs_grad=True), r.field("tau")
 
     @ti.kernel
-    def compute(x: ti.template()):
+    def compute(x: ti.template(), energy: ti.template()):
         for f, i in x:
             loss[None] += w[f, i].dot(x[f, i])
+        for f in energy:
+            loss[None] += (f + 1) * energy[f]
 
     with ti.ad.Tape(loss):
         r.run()
-        compute(r.positions)
-    want = r.vjp(r.forward(), seeds(shape)[0])
+        compute(r.positions, r.field("elastic_energy"))
+    want = r.vjp(r.forward(), seeds(shape)[0], elastic_energy=np.arange(4.0) + 1)
     np.testing.assert_allclose(tau.grad.to_numpy(), want["tau"], rtol=1e-12)
 
 
@@ -325,12 +343,13 @@ def test_torch_finds_the_same_gradients():
     torch = pytest.importorskip("torch")
     from diffsim_ti.torch_bridge.rollout_node import rollout_frames
 
-    r = rollout(scene(rubber(each=True)))
+    r = rollout(scene(rubber(each=True)), **RESULTS)
     names = ("mu", "lam", "g", "tau", "density", "rest_positions")
     tensors = {name: torch.tensor(r.values[name], requires_grad=True) for name in names}
-    positions, velocities = rollout_frames(r, **tensors)[:2]
-    w, z = map(torch.from_numpy, seeds(tuple(positions.shape)))
-    ((w * positions).sum() + (z * velocities).sum()).backward()
+    frames = rollout_frames(r, **tensors)
+    w, z = map(torch.from_numpy, seeds(tuple(frames.positions.shape)))
+    loss = sum((torch.from_numpy(seeds(tuple(frames[name].shape))[0]) * frames[name]).sum() for name in r.computed)
+    ((w * frames.positions).sum() + (z * frames.velocities).sum() + loss).backward()
     want = gradients(r)
     for name, x in tensors.items():
         np.testing.assert_allclose(x.grad.numpy(), want[name], rtol=1e-10, atol=1e-12 * np.abs(want[name]).max())
@@ -340,17 +359,20 @@ def test_torch_finds_the_same_gradients():
 def test_steps_are_those_of_a_rollout(solver):
     """Also after a reset, and after a step that failed, which leaves the state before it."""
     body = scene(motion=None)
-    r = ds.Rollout(solver(body, dt=2e-3), 3, save_every=1)
-    frames, simulator = r.forward().positions, ds.Simulator(solver(body, dt=2e-3))
+    frames, simulator = ds.Rollout(solver(body, dt=2e-3), 3, **RESULTS).forward(), ds.Simulator(solver(body, dt=2e-3))
     z = []
     for again in range(2):
         for k in range(3):
             z.append(simulator.law_state)
             simulator.step()
-            np.testing.assert_array_equal(simulator.positions, frames[k + 1])
+            np.testing.assert_array_equal(simulator.positions, frames.positions[k + 1])
+            for output in RESULTS["outputs"]:
+                want = frames[output.name][k + 1]
+                np.testing.assert_allclose(simulator.output(output), want, rtol=0, atol=1e-14 * abs(want).max())
         if not again:
             simulator.reset()
     np.testing.assert_array_equal(z[:3], z[3:])
+    np.testing.assert_array_equal(z[:3], frames.law_state[:3])
     known = simulator.law_state
     runtime.fill(simulator.workspace.state.v, np.inf)  # which set_state would refuse
     with pytest.raises(FloatingPointError), np.errstate(invalid="ignore"):
@@ -395,12 +417,14 @@ def test_what_a_law_remembers_can_be_set(order):
     start = dict(positions=one.positions, velocities=one.velocities)
     other.set_state(**start, law_state=z)
     np.testing.assert_array_equal(other.law_state, z)
-    frames = ds.Rollout(solver, 2).forward(law_state=z, **{f"initial_{name}": value for name, value in start.items()})
+    r = ds.Rollout(solver, 2, outputs=ds.Stress())
+    frames = r.forward(law_state=z, **{f"initial_{name}": value for name, value in start.items()})
     without = ds.Rollout(solver, 2).forward(**{f"initial_{name}": value for name, value in start.items()})
     one.run(2), other.run(2)
     for found in (other.positions, frames.positions[-1]):
         np.testing.assert_allclose(found, one.positions, rtol=0, atol=1e-13)
     assert abs(without.positions[-1] - one.positions).max() > 1e-6
+    np.testing.assert_allclose(frames["stress"][-1], one.output(ds.Stress()), rtol=0, atol=1e-9)
 
 
 def test_gradients_of_a_run_from_a_set_state():
@@ -432,10 +456,8 @@ def test_a_state_that_does_not_fit_is_refused():
             simulator.resume(state)
     with pytest.raises(ValueError, match="resume: velocities: expected finite numbers"):
         simulator.resume(simulator.state | dict(velocities=np.zeros(3)))
-    with pytest.raises(ValueError, match="ask Simulator.output"):
-        ds.Rollout(simulator.solver, 1, outputs=[ds.Stress()])
-    with pytest.raises(ValueError, match="ask Simulator.output"):
-        ds.Rollout(simulator.solver, 1, outputs=[ds.Reaction("xmin")])
+    with pytest.raises(ValueError, match=r"do not have what Relaxing remembers: pass Stress to Rollout\("):
+        ds.Stress().settled(simulator.scene).value(ds.Rollout(simulator.solver, 1).forward())
 
 
 # ---- what does not work says so ----------------------------------------------------------------------------------------
@@ -479,7 +501,7 @@ class TwoForOne(FadingLaw):
     [
         (
             lambda: ds.StaticSolver(scene(motion=None)),
-            r"RelaxingLaw has a state \(z_xx, .*\) .* an equilibrium has none",
+            r"Relaxing has a state .* an equilibrium has none: take a solver with inertia",
         ),
         (
             lambda: scene(volume="patches").law,

@@ -1,4 +1,4 @@
-"""What the folder tree promises: imports go one way, nobody reaches into others, no file is long."""
+"""What the folder tree promises: imports go one way, nobody reaches into others, no file is long, no class stands deep."""
 
 import ast
 import re
@@ -111,6 +111,46 @@ def test_files_are_short():
     lengths = {str(path): lines(path.read_text()) for path in MODULES}
     assert {name: length for name, length in lengths.items() if length > 600} == {}
     assert sorted(lengths.values())[len(lengths) // 2] <= 120
+
+
+CLASSES = {
+    (path, node.name): node for path, tree in MODULES.items() for node in tree.body if isinstance(node, ast.ClassDef)
+}
+OF_BATCHES = "elements of a batch are those of one scene with other places of their numbers"
+WITHIN_FACES = "contact within faces goes on from contact at vertices by one formula at a time"
+DEEP = {  # classes that may stand more than three deep, and why
+    **dict.fromkeys("FaceRows FaceForces FaceWalls FaceKernels FaceDerivatives FaceShares".split(), WITHIN_FACES),
+    **dict.fromkeys(
+        "TetrahedronOfEight PatchOfScenes PatchOfEight".split(), "elements of a batch read elements of one scene"
+    ),
+    "PressedFace": "a curved face stores and sums what a flat one does",
+    "Muscle": "to users a muscle is a cable, and a cable a spring",
+    "_AtStart": "a solver of users that checks less",
+}
+
+
+def found_in(path: Path, name: str) -> tuple[Path, str] | None:
+    """Where a class of the package is defined that a module calls by a name; None of other classes."""
+    if (path, name) in CLASSES:
+        return path, name
+    for node in MODULES[path].body:
+        for alias in node.names if isinstance(node, ast.ImportFrom) else []:
+            if name == (alias.asname or alias.name) and (node.module or "").split(".")[0] == "diffsim_ti":
+                place = PACKAGE.joinpath(*node.module.split(".")[1:])
+                return found_in(place.with_suffix(".py") if not place.is_dir() else place / "__init__.py", alias.name)
+    return None
+
+
+def depth(path: Path, name: str) -> int:
+    """How many classes of the package stand from it to the farthest of its bases, itself included."""
+    bases = [found_in(path, base.id) for base in CLASSES[path, name].bases if isinstance(base, ast.Name)]
+    return 1 + max((depth(*base) for base in bases if base), default=0)
+
+
+def test_classes_stand_at_most_three_deep():
+    depths = {place: depth(*place) for place in CLASSES}
+    assert len(depths) > 500 and sum(d == 3 for d in depths.values()) > 30
+    assert {name for (_, name), d in depths.items() if d > 3} == set(DEEP)
 
 
 def test_kernels_are_those_of_runtime():

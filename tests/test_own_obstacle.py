@@ -1,6 +1,6 @@
 """An obstacle's shape of one's own, and a force of one's own: what a user writes outside the package."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -91,6 +91,27 @@ def test_it_is_drawn(scene):
         image = drawing.image(scene.mesh.vertices).astype(float)
     grey = (np.ptp(image, axis=2) < 8) & (image.mean(2) < 200)
     assert grey.sum() > 300
+
+
+MOVED = ([0.0, 1.0], [[0.0] * 6, [0.1, 0.0, 0.0, 0.0, 0.2, 0.0]])  # a pose over time
+TERMS = {
+    "smooth": ds.Ground(-0.1),
+    "rough": ds.Sphere((0.0, -1.0, 0.0), 0.5, friction=0.3),
+    "turning": ds.Box((0.0, -1.0, 0.0), 0.5, path=MOVED),
+    "rough, turning, of a user": Ring((0.0, -1.0, 0.0), 0.1, 0.05, stiffness=200.0, friction=0.3, path=MOVED),
+    "surfaces": ds.SelfContact(friction={("a", "b"): 0.2, ("a", "c"): 0.3}),
+    "fluid": ds.SurfaceDrag(),
+}
+
+
+@pytest.mark.parametrize("term", TERMS.values(), ids=TERMS)
+def test_parameters_that_kernels_read_by_name_stand_where_the_inputs_are(term):
+    inputs = [described for described in term.described if described.value is not None]
+    starts = np.cumsum([0, *(i.value.size for i in inputs)]).tolist()
+    of_term = term if hasattr(term, "index") else replace(term.kernel("f64"), turns=term.turns)
+    named = {name: at for name, at in vars(of_term.index).items() if name not in ("shape", "end")}
+    first = min(named.values())  # what comes before is of the shape
+    assert named == {i.name.removesuffix("_per_area"): at for i, at in zip(inputs, starts) if at >= first}
 
 
 # ---- a force of one's own: a term, its Taichi functions, its host form ---------------------------------------------------

@@ -15,7 +15,7 @@ import taichi as ti
 import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.solvers import SOLVERS as ALL_SOLVERS
-from diffsim_ti.terms.obstacles.ground import TurningGroundForce
+from diffsim_ti.terms.obstacles.ground import GroundForce
 
 SOLVERS = [s for s in ALL_SOLVERS if s.explicit]  # the implicit ones: test_implicit*.py
 ROOT = Path(__file__).parents[1]
@@ -318,8 +318,8 @@ def test_absent_contact_leaves_no_code(solver, monkeypatch):
                 looked_up.append(instance)
             return original.__get__(instance, owner)
 
-    original = TurningGroundForce.__dict__["distance_and_normal"]
-    monkeypatch.setattr(TurningGroundForce, "distance_and_normal", Spy())
+    original = GroundForce.__dict__["distance_and_normal"]
+    monkeypatch.setattr(GroundForce, "distance_and_normal", Spy())
     # J_floor is a compile-time number of the law: a new J_floor means that everything compiles here
     material = ds.StableNeoHookean(1e5, 0.3, J_floor=0.0123 + 1e-4 * SOLVERS.index(solver))
     mesh = ds.TetrahedralMesh.create_box(2)

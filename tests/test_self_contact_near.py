@@ -5,10 +5,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from near_meshes import c_shape, shaken, slit
+from pairs_alone import evaluate_pairs
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
-from diffsim_ti.mechanics.surfaces.evaluate import evaluate_pairs
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, PARALLEL, VERTEX_TRIANGLE
 from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.terms.obstacles.barrier import beta

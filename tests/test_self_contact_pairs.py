@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import taichi as ti
+from pairs_alone import evaluate_pairs
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
@@ -12,7 +13,6 @@ from diffsim_ti.mechanics.surfaces.box_tree import BoxTree, beyond
 from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
 from diffsim_ti.mechanics.surfaces.broad_phase_kernels import bits_from, lowest, sort
 from diffsim_ti.mechanics.surfaces.buffers import BLOCK, Buffers, Launches
-from diffsim_ti.mechanics.surfaces.evaluate import evaluate_pairs
 from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges

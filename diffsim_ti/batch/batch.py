@@ -89,7 +89,9 @@ class Batch:
         self.gradients: dict[str, np.ndarray] = {}
         self.tape_face = BatchTapeFace(self, runs)
         self.steps, self.save_every, self.num_frames = self.one.steps, self.one.save_every, self.one.num_frames
-        self.why_not = why_not(self.solver) or ("an output reads forces of contact" if self.one.sweep.noted else None)
+        self.why_not = why_not(self.solver) or (
+            f"an output reads {' and '.join(self.one.sweep.noted)} of frames" if self.one.sweep.noted else None
+        )
         if lanes and self.why_not:
             raise ValueError(f"scenes cannot be computed side by side: {self.why_not}; leave out lanes=True")
         self.lanes = self.why_not is None if lanes is None else bool(lanes)

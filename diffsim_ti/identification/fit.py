@@ -89,6 +89,8 @@ def identify(
     noises = noise if several and isinstance(noise, list | tuple) else [noise] * len(rollouts)
     given = [measurements(x, s) for x, s in zip(data, noises)] if several else [measurements(data, noise)]
     problem = Problem(rollouts, given, unknowns)
+    if method != "Levenberg-Marquardt" or problem.size > DENSE:
+        problem.check_gradients()
     priors = Priors(prior, problem.unknowns, rollouts[0].scene.mesh)
     further = AT_MOST if starts is None else further_starts(problem, starts)
     most, with_covariance = max_iterations, problem.size <= DENSE if covariance is None else covariance

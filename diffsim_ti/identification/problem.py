@@ -50,6 +50,15 @@ class Problem:
     def _of(self, k: int) -> Iterable[tuple[Free, slice]]:
         return [(free, part) for free, part in zip(self.unknowns, self.parts) if k in free.experiments]
 
+    def check_gradients(self) -> None:
+        """For searches by J^T w."""
+        for k, rollout in enumerate(self.rollouts):
+            for free, _ in self._of(k):
+                if not free.is_offset and free.input not in getattr(rollout, "wanted", (free.input,)):
+                    raise ValueError(
+                        f"{free.label}: the rollout has no gradient by {free.input!r}; name it in gradients="
+                    )
+
     def inputs(self, k: int, t: np.ndarray) -> dict[str, np.ndarray]:
         """Inputs of experiment k, offset of time too."""
         out = {}
@@ -100,10 +109,6 @@ class Problem:
             gradients = rollout.vjp(point.frames[k], **seeds)
             self.simulations += 1
             for free, part in self._of(k):
-                if not free.is_offset and free.input not in gradients:
-                    raise ValueError(
-                        f"{free.label}: the rollout has no gradient by {free.input!r}; name it in gradients="
-                    )
                 by_x = [by_offset] if free.is_offset else free.gathered(k, gradients[free.input])
                 out[part] += free.slopes(point.t[part]) * by_x
         return out

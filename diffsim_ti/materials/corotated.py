@@ -2,15 +2,17 @@
 
 from dataclasses import dataclass
 
-from diffsim_ti.materials.linear_elastic import LinearElasticLaw
+from diffsim_ti.materials.calculus.strains import StrainLaw
+from diffsim_ti.materials.linear_elastic import LinearElasticLaw as Small
 from diffsim_ti.materials.material import Material
 
 
 @dataclass(frozen=True)
-class CorotatedLaw(LinearElasticLaw):
+class CorotatedLaw(StrainLaw):
     """psi = mu q + lam/2 t^2 of eps = S - I."""
 
-    rotates = True
+    rotates, coefficient_names = True, Small.coefficient_names
+    psi, slopes, curvature = Small.psi, Small.slopes, Small.curvature
 
 
 class Corotated(Material):

@@ -63,13 +63,14 @@ class Prony(Around):
     the isotropic part. `Prony(material, shares, times)`: g_i >= 0 [-], of the moduli that last, which are the material's,
     and tau_i > 0 [s], N numbers for all or of shape (num_tetrahedra, N); inputs with gradient, prony_shares and
     prony_times. At once the body is 1 + sum g_i times as stiff, and a held strain relaxes by exp(-t / tau_i). A series given
-    as shares a_i of what is stiff at once has g_i = a_i / (1 - sum a).
+    as shares a_i of what is stiff at once, E_0, has g_i = a_i / (1 - sum a), and the material E = (1 - sum a) E_0.
 
     z_i are numbers of each tetrahedron that a run keeps with its state, moved on exactly for the strain of each substep
     (law.py: of first order in its length). The stress has an energy, and what is lost [W/m^3],
     sum g_i / tau_i (E - z_i) : C : (E - z_i), is never negative; crushed elements have it too. Viscosity goes around it:
     `KelvinVoigt(Prony(...), time=...)`.
-    Statics and volume="patches" do not know it.
+    `Stress`, `Reaction` and `ElasticEnergy` know the state of each frame. Statics and volume="patches" do not know it: what
+    lasts is the material inside.
     Simo, Hughes, Computational Inelasticity, 1998, ch. 10.3, doi:10.1007/b98904.
     Raises ValueError for numbers out of range, and a material that has a state or a viscosity.
     """

@@ -9,6 +9,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import Derived, Mass
+from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.mechanics.surfaces.curved_pairs import pairs_of
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs
 from diffsim_ti.runtime import Kernel
@@ -45,6 +46,7 @@ class Workspace:
     changes = 0  # of the state from outside its passes
     last_multipliers = None  # of held volumes, in implicit steps
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
+    law_frames = None  # what the law remembers in each frame, where an output reads it
 
     def __init__(self, solver, derived: Derived, bend: float = 0.0):
         self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
@@ -172,6 +174,10 @@ class Workspace:
         """What follows the drift of the energy from now on, by `begin` and `take` (monitor/own_work.py); None where that
         cannot be told from what is done to the body."""
 
+    def record_law_states(self) -> None:
+        """From now on note what the law remembers in each frame; the frames are made."""
+        self.law_frames = LawFrames(self)
+
     def record_contacts(self) -> None:
         """From now on note, for each frame, what obstacles do to each vertex; the frames are made."""
         raise NotImplementedError
@@ -233,3 +239,5 @@ class Workspace:
         """Copy the current state to a frame."""
         copy_slot(self.state.u, 0, self.frames[0], frame)
         copy_slot(self.state.v, 0, self.frames[1], frame)
+        if self.law_frames:
+            self.law_frames.note(frame, self.state.z)

@@ -270,7 +270,7 @@ class Guard:
         """
         arrays = self.ws.arrays
         force, first, _ = arrays.obstacles[k]
-        stiffness, width = arrays.stiffness_of(k, [vertex]), float(arrays.values.parameters[first + force.count + 1])
+        stiffness, width = arrays.stiffness_of(k, [vertex]), float(arrays.values.parameters[first + force.index.width])
         self.ws.place_obstacles(self.good_pass)
         offset = arrays.walls.row_of(k, runtime.fetch(arrays.offsets).astype(np.float64))
         position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]

@@ -60,7 +60,8 @@ class BodyForceKernels:
 
     @cached_property
     def jvp(self) -> Kernel:
-        return self._kernel("body_forces_jvp", self.all_jvp, change=STATE, tangent=TANGENT)
+        change = with_state(STATE, self.law)
+        return self._kernel("body_forces_jvp", self.all_jvp, change=change, tangent=TANGENT)
 
     @ti.func
     def all_vjp(self, scene: A, at: A, out: A, seed: A, adjoint: A, plan: A):
@@ -73,7 +74,7 @@ class BodyForceKernels:
 
     @cached_property
     def vjp(self) -> Kernel:
-        own = ADJOINT | dict(rate_corner="vectors")
+        own = with_state(ADJOINT | dict(rate_corner="vectors"), self.law)
         return self._kernel("body_forces_vjp", self.all_vjp, seed=dict(w="vectors2"), adjoint=own)
 
 
@@ -83,17 +84,9 @@ def _kernels(law, features: Features, lanes: bool) -> BodyForceKernels:
 
 
 class BodyForces:
-    """Forces -dE/du [N] of stress, shape (num_vertices, 3), at the states that frames show.
+    """Forces -dE/du [N] of stress, shape (num_vertices, 3), at the states that frames show, for outputs of any law."""
 
-    Raises ValueError for a law with a state of its own, which frames do not have; remembers: it is placed there.
-    """
-
-    def __init__(self, scene, remembers: bool = False):
-        if scene.law.state_names and not remembers:
-            raise ValueError(
-                f"{type(scene.law).__name__} has a state ({', '.join(scene.law.state_names)}) that frames do not keep: this "
-                "output knows laws of the displacement and velocity gradients only"
-            )
+    def __init__(self, scene):
         if scene.term(Growth):
             raise ValueError("forces of the body at frames do not know Growth over time; take Grown(material, growth)")
         self.scene, self.arrays = scene, SceneArrays(scene)
@@ -102,7 +95,7 @@ class BodyForces:
             SimpleNamespace(**{name: runtime.array(a.vector, 1, a.num_vertices) for name in names})
             for names in (("u", "v", "w"), ("u", "v"), ("y", "y_rate"))
         )
-        self.at.z = a.law_states(1)
+        self.at.z, self.change.z, self.out.z = (a.law_states(1) for _ in range(3))
         self.out.corner, self.out.rate_corner = (runtime.array(a.vector, *a.corner.shape) for _ in range(2))
 
     def load(self, values: dict) -> Derived:
@@ -129,8 +122,10 @@ class BodyForces:
         """f."""
         return self._run("forces")
 
-    def jvp(self, du: np.ndarray, dv: np.ndarray, tangent: Tangent) -> np.ndarray:
-        """Its change."""
+    def jvp(self, du: np.ndarray, dv: np.ndarray, tangent: Tangent, dz: np.ndarray | None = None) -> np.ndarray:
+        """Its change; dz: of what the law remembers."""
+        if self.change.z is not None:
+            runtime.fill(self.change.z, self.arrays.to_blocks(dz)[None])
         runtime.fill(self.change.u, du[None])
         runtime.fill(self.change.v, dv[None])
         return self._run("jvp", change=self.change, tangent=tangent)
@@ -145,9 +140,12 @@ class BodyForces:
         out.clear()
         return out
 
-    def vjp(self, w: np.ndarray, adjoint: Adjoint) -> tuple[np.ndarray, np.ndarray]:
-        """(adjoint of u, of v) for that of f; adds those of coefficients, grad N and V."""
+    def vjp(self, w: np.ndarray, adjoint: Adjoint) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """(adjoint of u, of v, of what the law remembers) for that of f; adds those of coefficients, grad N and V."""
         runtime.fill(self.at.w, w[None])
+        if self.out.z is not None:
+            runtime.fill(self.out.z, 0)
         runtime.fill(self.out.y_rate, 0)
         by_u = self._run("vjp", seed=self.at, adjoint=(adjoint, self.out))
-        return by_u, runtime.fetch_row(self.out.y_rate, 0)
+        by_z = None if self.out.z is None else self.arrays.law_state_of(runtime.fetch(self.out.z)[0])
+        return by_u, runtime.fetch_row(self.out.y_rate, 0), by_z

@@ -24,9 +24,11 @@ class ElasticEnergy(Output):
     sets: tetrahedron sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it. The gradient is exact by all inputs.
     With volume="patches" a tetrahedron has pi theta / 2 of its patch's pressure pi in the place of lam theta^2 / 2.
-    Of a law with a state, `Simulator.output` alone knows it. Raises ValueError for laws with rates.
+    Of a law with a state, such as `Prony`, it is what is stored in all its springs. Raises ValueError for laws with rates.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 6.1.
     """
+
+    reads_law_state = True
 
     def __init__(self, sets: Sequence[str | ArrayLike] | None = None, name: str = "elastic_energy"):
         self.sets, self.name = None if sets is None else list(sets), name
@@ -41,7 +43,7 @@ class ElasticEnergy(Output):
         out = copy(self)
         out.scene, out.all = scene, np.arange(mesh.num_tetrahedra)
         out.patched = scene.volume == "patches"
-        out.law, out.reads_law_state = law.base if out.patched else law, bool(law.state_names)
+        out.law = law.base if out.patched else law
         masks = np.ones((1, mesh.num_tetrahedra))
         if self.sets is not None:
             masks = np.zeros((len(self.sets), mesh.num_tetrahedra))
@@ -55,19 +57,18 @@ class ElasticEnergy(Output):
         return (num_frames,) if self.sets is None else (num_frames, len(self.sets))
 
     def _densities(self, frames):
-        """(what kernels read, deformation, psi, P, dpsi/dp, pressures of patches or None), by frames and points: with
-        patches psi is what each point has by itself."""
+        """(what kernels read, deformation, psi, P, dpsi/dp, dpsi/dz, pressures of patches or None), by frames and points:
+        with patches psi is what each point has by itself. z: what the law remembers."""
         derived = self.scene.inputs.derive(frames.inputs)
         deformation = Deformation.of(frames, derived, self.scene.mesh, self.all)
-        F, K = deformation.F, len(self.law.coefficient_names)
+        F, z = deformation.F, self.remembered(frames, self.scene)
         at = PatchPressure.of(self.scene, derived, deformation.H) if self.patched else None
         p = self._at_points(derived.coefficients) if at is None else at.kept
         p = np.tile(p, (len(F), 1))
-        if self.reads_law_state:
-            p, K = np.concatenate([p, frames.law_state.reshape(len(p), -1)], 1), K + frames.law_state.shape[-1]
-        psi, P, by = evaluate(self.law, F.reshape(-1, 3, 3), p)
-        psi, P, by = (x.astype(np.float64) for x in (psi, P, by))
-        return derived, deformation, psi.reshape(F.shape[:2]), P.reshape(F.shape), by.reshape(*F.shape[:2], K), at
+        own = evaluate(self.law, F.reshape(-1, 3, 3), np.concatenate([p, z.reshape(len(p), z.shape[-1])], 1))
+        psi, P, by = (x.astype(np.float64).reshape(*F.shape[:2], *x.shape[1:]) for x in own)
+        by_p, by_z = np.split(by, [p.shape[1]], 2)
+        return derived, deformation, psi, P, by_p, by_z.reshape(z.shape), at
 
     def _at_points(self, coefficients: np.ndarray) -> np.ndarray:
         """Of all points, shape (points, K)."""
@@ -75,23 +76,24 @@ class ElasticEnergy(Output):
         return np.repeat(np.broadcast_to(coefficients, (len(self.all), K)), self.points, 0)
 
     def value(self, frames: "Frames") -> np.ndarray:
-        derived, _, psi, _, _, at = self._densities(frames)
+        derived, _, psi, *_, at = self._densities(frames)
         psi = psi if at is None else psi + 0.5 * at.value * at.theta
         return ((psi * derived.volumes.ravel()) @ self.masks.T).reshape(self.shape(len(psi)))
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
-        derived, deformation, psi, P, by, at = self._densities(frames)
+        derived, deformation, psi, P, by, by_z, at = self._densities(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
         dH, dp, dV = deformation.jvp(du, moved.gradients), self._at_points(moved.coefficients), moved.volumes.ravel()
         dpsi = (P * dH).sum((2, 3)) + (by * (dp if at is None else at.without_lam(dp))).sum(2)
+        dpsi += (by_z * self.remembered_jvp(change, by_z)).sum(3).reshape(psi.shape)
         if at is not None:
             psi = psi + 0.5 * at.value * at.theta
             dpsi = dpsi + 0.5 * (at.jvp(dH, dp, dV) * at.theta + at.value * at.theta_jvp(dH))
         return ((dpsi * derived.volumes.ravel() + psi * dV) @ self.masks.T).reshape(self.shape(len(psi)))
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
-        derived, deformation, psi, P, by, at = self._densities(frames)
+        derived, deformation, psi, P, by, by_z, at = self._densities(frames)
         adjoint, weight = derived.zeros(), seed.reshape(len(psi), -1) @ self.masks  # by frames and points
         scaled = weight * derived.volumes.ravel()
         H_adj, by_p, by_V = scaled[..., None, None] * P, (scaled[..., None] * by).sum(0), (weight * psi).sum(0)
@@ -104,7 +106,8 @@ class ElasticEnergy(Output):
         adjoint.coefficients = by_p if derived.coefficients.ndim == 2 else by_p.sum(0)
         adjoint.volumes, adjoint.rest = by_V.reshape(derived.volumes.shape), -positions.sum(0)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(positions=positions, inputs=inputs)
+        by_state = self.remembered_vjp(frames, scaled.reshape(by_z.shape[:3])[..., None] * by_z)
+        return Change(positions=positions, inputs=inputs, law_state=by_state)
 
 
 class KineticEnergy(Output):

@@ -95,7 +95,7 @@ def _slope(body: BodyForces, hosts: HostForces, u: np.ndarray, phi: np.ndarray, 
     for shift, weight in FOURTH_ORDER:
         body.place(u + shift * step * phi, v)
         adjoint = body.adjoint()
-        own, _ = body.vjp(phi, adjoint)
+        own, *_ = body.vjp(phi, adjoint)
         found, weight = adjoint.collect(), -weight / step
         by_u += weight * own
         for name in ("coefficients", "gradients", "volumes"):

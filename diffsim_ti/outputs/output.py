@@ -13,12 +13,16 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
+NOTED = ("contact_forces", "chamber_pressures", "law_state")  # what runs note besides states, where outputs read it
+
+
 @dataclass
 class Change:
     """A change of frames and inputs, or the gradient of a loss by them; None, and inputs left out, are zero.
 
     positions [m], velocities [m/s]: shape (frames, num_vertices, 3); inputs: name -> array of the input's shape.
-    contact_forces [N], chamber_pressures [Pa]: of the frames' arrays of that name, where an output says that it reads them.
+    contact_forces [N], chamber_pressures [Pa], law_state: of the frames' arrays of that name, where an output says that it
+    reads them.
     positions are those of the frames, which move with rest_positions where displacements are kept, and the other way
     round: they are the variable of the chain rule, and displacements are positions less rest_positions.
     """
@@ -28,10 +32,16 @@ class Change:
     inputs: dict[str, np.ndarray] = field(default_factory=dict)
     contact_forces: np.ndarray | None = None
     chamber_pressures: np.ndarray | None = None
+    law_state: np.ndarray | None = None
+
+    @property
+    def noted(self) -> dict[str, np.ndarray | None]:
+        """Those of what runs note besides states, by name."""
+        return {name: getattr(self, name) for name in NOTED}
 
     def add(self, other: "Change") -> None:
         """Add another one."""
-        for name in ("positions", "velocities", "contact_forces", "chamber_pressures"):
+        for name in ("positions", "velocities", *NOTED):
             mine, theirs = getattr(self, name), getattr(other, name)
             setattr(self, name, mine if theirs is None else theirs if mine is None else mine + theirs)
         for name, value in other.inputs.items():
@@ -53,8 +63,8 @@ class Output(ABC):
     unit = ""  # for pictures
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
-    reads_law_state = False  # whether it evaluates a law that remembers, which a Simulator's state alone has
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
+    reads_law_state = False  # the same of frames.law_state, where the law remembers
 
     def needs_contact_forces(self, solver) -> bool:
         """Whether runs of this solver must; here, whether it reads them in all."""
@@ -67,6 +77,31 @@ class Output(ABC):
             raise ValueError(
                 f"{output} evaluates the law and does not know Growth over time; take Grown(material, growth), or strains"
             )
+
+    def remembered(self, frames: "Frames", scene: "Scene") -> np.ndarray:
+        """What the law remembers at each point in frames, shape (frames, num_tetrahedra, points, S), S being 0 where it
+        remembers nothing, or this output does not read it. Raises ValueError for frames of a run that did not note it."""
+        law, mesh = scene.law, scene.mesh
+        count = len(law.state_names) if self.reads_law_state else 0
+        shape = len(frames.positions), mesh.num_tetrahedra, mesh.reference.num_points, count
+        if not count:
+            return np.zeros(shape)
+        if frames.law_state is None:
+            raise ValueError(
+                f"these frames do not have what {law.title} remembers: pass {type(self).__name__} to "
+                "Rollout(..., outputs=[...]), which then notes it"
+            )
+        return frames.law_state.reshape(shape)
+
+    @staticmethod
+    def remembered_jvp(change: Change, z: np.ndarray) -> np.ndarray:
+        """The change of the same, z, in `change`."""
+        return change.law_state.reshape(z.shape) if z.size and change.law_state is not None else np.zeros_like(z)
+
+    @staticmethod
+    def remembered_vjp(frames: "Frames", z_adj: np.ndarray) -> np.ndarray | None:
+        """The gradient by frames.law_state for that by the same, z."""
+        return z_adj.reshape(frames.law_state.shape) if z_adj.size else None
 
     def settled(self, scene: "Scene") -> "Output":
         """This output for a scene: checked, with what depends on the scene alone; raises ValueError if it does not fit."""

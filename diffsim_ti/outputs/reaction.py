@@ -35,8 +35,7 @@ class Reaction(Output):
     The gradient is exact by all inputs. In single precision a reaction is the small sum of large forces of stress: it has an
     error of some 1e-6 of these.
 
-    Of a law with a state, `Simulator.output` alone knows it. Raises ValueError for a support that is not held, or for about=
-    and per_vertex=True together.
+    Raises ValueError for a support that is not held, or for about= and per_vertex=True together.
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
 
     >>> import diffsim_ti as ds
@@ -48,7 +47,7 @@ class Reaction(Output):
     9810.000 N
     """
 
-    unit, reads_chamber_pressures = "N", True
+    unit, reads_chamber_pressures, reads_law_state = "N", True, True
 
     def __init__(
         self,
@@ -80,8 +79,7 @@ class Reaction(Output):
                 f"Reaction: the support must be among the held vertices, but {len(loose) or 'all'} of its "
                 f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
             )
-        out.scene, out.body, out.loads = scene, BodyForces(scene, remembers=True), GivenLoads(scene)
-        out.reads_law_state = bool(scene.law.state_names)
+        out.scene, out.body, out.loads = scene, BodyForces(scene), GivenLoads(scene)
         out.onto = scene.supports.projectors(out.vertices, self.support)
         return out
 
@@ -90,9 +88,11 @@ class Reaction(Output):
 
     # ---- forces on all vertices, shape (frames, num_vertices, 3) -----------------------------------------------------
 
-    def _state(self, frames, k: int) -> tuple:
-        law_state = frames.law_state[k] if self.reads_law_state else None
-        return frames.displacements[k].astype(np.float64), frames.velocities[k].astype(np.float64), law_state
+    def _place(self, frames, k: int) -> np.ndarray:
+        """Go to the state of frame k; its positions."""
+        u, v = (x[k].astype(np.float64) for x in (frames.displacements, frames.velocities))
+        self.body.place(u, v, self.remembered(frames, self.scene)[k])
+        return frames.positions[k].astype(np.float64)
 
     def _pressures(self, frames, k: int) -> np.ndarray | None:
         """Of chambers that hold a volume in frame k."""
@@ -101,8 +101,8 @@ class Reaction(Output):
     def _held(self, frames) -> np.ndarray:
         """What holds the vertices, shape (frames, k, 3)."""
         derived, out = self.body.load(frames.inputs), []
-        for k, x in enumerate(frames.positions.astype(np.float64)):
-            self.body.place(*self._state(frames, k))
+        for k in range(len(frames.positions)):
+            x = self._place(frames, k)
             f = self.body.forces() + self.loads.forces(
                 derived, x, int(frames.steps[k]), held=self._pressures(frames, k)
             )
@@ -127,10 +127,10 @@ class Reaction(Output):
         tangent, zero, out = self.body.tangent(moved), np.zeros(frames.positions.shape), []
         dx = zero if change.positions is None else change.positions
         dv = zero if change.velocities is None else change.velocities
+        dz = self.remembered_jvp(change, self.remembered(frames, self.scene))
         for k in range(len(zero)):
-            self.body.place(*self._state(frames, k))
-            df = self.body.jvp(dx[k] - moved.rest, dv[k], tangent)
-            x = frames.positions[k].astype(np.float64)
+            x = self._place(frames, k)
+            df = self.body.jvp(dx[k] - moved.rest, dv[k], tangent, dz[k])
             df = df + self.loads.jvp(derived, moved, x, dx[k], int(frames.steps[k]), held=self._pressures(frames, k))
             if change.chamber_pressures is not None and self.scene.holds_volumes:
                 df = df + self.loads.held_jvp(x, change.chamber_pressures[k])
@@ -149,11 +149,11 @@ class Reaction(Output):
             w[:, self.vertices] = seed if self.per_vertex else seed[:, None]
         w[:, self.vertices] = -self._onto(w[:, self.vertices])
         derived, adjoint = self.body.load(frames.inputs), self.body.adjoint()
-        rest, by_loads, by_held = np.zeros(positions.shape[1:]), derived.zeros(), []
+        rest, by_loads, by_held, by_states = np.zeros(positions.shape[1:]), derived.zeros(), [], []
         for k in range(len(w)):
-            self.body.place(*self._state(frames, k))
-            by_u, by_v = self.body.vjp(w[k], adjoint)
-            x = frames.positions[k].astype(np.float64)
+            x = self._place(frames, k)
+            by_u, by_v, by_z = self.body.vjp(w[k], adjoint)
+            by_states.append(by_z)
             held, step = self._pressures(frames, k), int(frames.steps[k])
             positions[k] += by_u + self.loads.vjp(derived, x, w[k], step, by_loads, held=held)
             if held is not None:
@@ -165,4 +165,5 @@ class Reaction(Output):
         adj.add(by_loads)
         adj.rest = adj.rest + rest
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))
-        return Change(positions, velocities, inputs, chamber_pressures=np.stack(by_held) if by_held else None)
+        held, state = (np.stack(x) if x and x[0] is not None else None for x in (by_held, by_states))
+        return Change(positions, velocities, inputs, chamber_pressures=held, law_state=state)

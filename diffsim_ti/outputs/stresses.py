@@ -13,7 +13,7 @@ class TetrahedronStress:
 
     def __init__(self, scene, chosen: np.ndarray):
         self.scene, self.chosen, self.read, self.points = scene, chosen, chosen, scene.mesh.reference.num_points
-        self.law, self.law_state = LawOnArrays(scene.law), None  # what it remembers in frames
+        self.law = LawOnArrays(scene.law)
 
     def chosen_of(self, x: np.ndarray) -> np.ndarray:
         """Of arrays of the tetrahedra that are read, those that are chosen."""
@@ -23,33 +23,38 @@ class TetrahedronStress:
         """Its transpose."""
         return x
 
-    def _numbers(self, coefficients: np.ndarray, frames: int) -> np.ndarray:
-        """Coefficients of all frames, (frames points, K)."""
+    def _coefficients(self, coefficients: np.ndarray) -> np.ndarray:
+        """Of the points, (points, K)."""
         every = np.broadcast_to(coefficients, (self.scene.mesh.num_tetrahedra, coefficients.shape[-1]))
-        out = np.tile(np.repeat(every[self.read], self.points, 0), (frames, 1))
-        if self.law_state is None:
-            return out
-        return np.concatenate([out, self.law_state[:, self.read].reshape(len(out), -1)], 1)
+        return np.repeat(every[self.read], self.points, 0)
 
-    def value(self, H, derived) -> np.ndarray:
-        """P [Pa]."""
-        p = self._numbers(derived.coefficients, len(H))
+    def _numbers(self, coefficients: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Coefficients and what the law remembers of the points of all frames, (frames points, K + S)."""
+        out = np.tile(self._coefficients(coefficients), (len(z), 1))
+        return np.concatenate([out, z[:, self.read].reshape(len(out), z.shape[-1])], 1)
+
+    def value(self, H, z, derived) -> np.ndarray:
+        """P [Pa]; z: what the law remembers, as `Output.remembered` has it."""
+        p = self._numbers(derived.coefficients, z)
         return self.law.stress(H.reshape(-1, 3, 3), p).reshape(H.shape)
 
-    def jvp(self, H, dH, derived, change) -> np.ndarray:
-        """Its change for those of H and of the scene's numbers."""
-        p, dp = (self._numbers(x.coefficients, len(H)) for x in (derived, change))
+    def jvp(self, H, dH, z, dz, derived, change) -> np.ndarray:
+        """Its change for those of H, of z and of the scene's numbers."""
+        p, dp = self._numbers(derived.coefficients, z), self._numbers(change.coefficients, dz)
         return self.law.jvp(H.reshape(-1, 3, 3), dH.reshape(-1, 3, 3), p, dp).reshape(H.shape)
 
-    def vjp(self, H, P_adj, derived, adjoint) -> np.ndarray:
-        """Adjoint of H for that of P; adds those of the scene's numbers."""
-        p = self._numbers(derived.coefficients, len(H))
+    def vjp(self, H, z, P_adj, derived, adjoint) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of H and z for that of P; adds those of the scene's numbers."""
+        p, z_adj, S = self._numbers(derived.coefficients, z), np.zeros_like(z), z.shape[-1]
         by_H, by_p = self.law.vjp(H.reshape(-1, 3, 3), P_adj.reshape(-1, 3, 3), p)
-        self._add_coefficients(by_p.reshape(len(H), -1, self.law.K).sum(0), derived, adjoint)
-        return by_H.reshape(H.shape)
+        by_p, by_z = np.split(by_p, [self.law.K - S], 1)
+        for into, rows in zip(z_adj, by_z.reshape(len(z), len(self.read), self.points, S)):
+            np.add.at(into, self.read, rows)
+        self._add_coefficients(by_p.reshape(len(H), -1, self.law.K - S).sum(0), derived, adjoint)
+        return by_H.reshape(H.shape), z_adj
 
     def _add_coefficients(self, by_p, derived, adjoint) -> None:
-        by_p = by_p.reshape(-1, self.points, self.law.K).sum(1)
+        by_p = by_p.reshape(-1, self.points, by_p.shape[-1]).sum(1)
         if derived.coefficients.ndim == 1:
             adjoint.coefficients = adjoint.coefficients + by_p.sum(0)
         else:
@@ -75,20 +80,20 @@ class PatchStress(TetrahedronStress):
             np.add.at(into, self.at, rows)
         return out
 
-    def value(self, H, derived):
+    def value(self, H, z, derived):
         at = PatchPressure.of(self.scene, derived, H)
         own = self.law.stress(H.reshape(-1, 3, 3), np.tile(at.kept, (len(H), 1))).reshape(H.shape)
         return self.chosen_of(own + at.value[..., None, None] * at.G)
 
-    def jvp(self, H, dH, derived, change):
+    def jvp(self, H, dH, z, dz, derived, change):
         at = PatchPressure.of(self.scene, derived, H, dH)
-        dp = self._numbers(change.coefficients, 1)
+        dp = self._coefficients(change.coefficients)
         p, moved = (np.tile(x, (len(H), 1)) for x in (at.kept, at.without_lam(dp)))
         own = self.law.jvp(H.reshape(-1, 3, 3), dH.reshape(-1, 3, 3), p, moved).reshape(H.shape)
         dpi = at.jvp(dH, dp, change.volumes.ravel())
         return self.chosen_of(own + dpi[..., None, None] * at.G + at.value[..., None, None] * at.turned)
 
-    def vjp(self, H, P_adj, derived, adjoint):
+    def vjp(self, H, z, P_adj, derived, adjoint):
         W = self.chosen_vjp(P_adj)
         at = PatchPressure.of(self.scene, derived, H, W)
         by_H, by_kept = self.law.vjp(H.reshape(-1, 3, 3), W.reshape(-1, 3, 3), np.tile(at.kept, (len(H), 1)))
@@ -96,4 +101,5 @@ class PatchStress(TetrahedronStress):
         by_kept = by_kept.reshape(len(H), -1, self.law.K).sum(0)
         self._add_coefficients(at.split_vjp(by_kept, by_lam), derived, adjoint)
         adjoint.volumes = adjoint.volumes + by_V.reshape(adjoint.volumes.shape)
-        return by_H.reshape(H.shape) + at.value[..., None, None] * at.turned + by_theta[..., None, None] * at.G
+        H_adj = by_H.reshape(H.shape) + at.value[..., None, None] * at.turned + by_theta[..., None, None] * at.G
+        return H_adj, np.zeros_like(z)  # a law of patches remembers nothing

@@ -63,22 +63,23 @@ class _Tensors(Output):
         return num_frames, self.count, *(NUMBERS[self.numbers][0] if self.numbers else (3, 3))
 
     @abstractmethod
-    def _tensors(self, deformation: Deformation, derived) -> np.ndarray:
-        """T of the chosen tetrahedra."""
+    def _tensors(self, deformation: Deformation, z, derived) -> np.ndarray:
+        """T of the chosen tetrahedra; z: what the law remembers, as `remembered` has it."""
 
     @abstractmethod
-    def _tensors_jvp(self, deformation: Deformation, derived, dH, change) -> np.ndarray:
-        """Its change for those of H and of the scene's numbers."""
+    def _tensors_jvp(self, deformation: Deformation, dH, z, dz, derived, change) -> np.ndarray:
+        """Its change for those of H, of z and of the scene's numbers."""
 
     @abstractmethod
-    def _tensors_vjp(self, deformation: Deformation, derived, seed, adjoint) -> np.ndarray:
-        """Adjoint of H; adds those of the scene's numbers."""
+    def _tensors_vjp(self, deformation: Deformation, z, derived, seed, adjoint) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of H and z; adds those of the scene's numbers."""
 
     def _start(self, frames):
         derived = self.scene.inputs.derive(frames.inputs)
         deformation = Deformation.of(frames, derived, self.scene.mesh, self.read)
-        T = self._tensors(deformation, derived)
-        return derived, deformation, T, T if self.means is None else self.means.value(T, self._shares(derived))
+        z = self.remembered(frames, self.scene)
+        T = self._tensors(deformation, z, derived)
+        return derived, deformation, z, T, T if self.means is None else self.means.value(T, self._shares(derived))
 
     @property
     def _interpolated(self) -> bool:
@@ -102,20 +103,21 @@ class _Tensors(Output):
         return moved.volumes[self.chosen].ravel()
 
     def value(self, frames: "Frames") -> np.ndarray:
-        shown = self._start(frames)[3]
+        shown = self._start(frames)[-1]
         return NUMBERS[self.numbers][1](shown) if self.numbers else shown
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
-        derived, deformation, T, shown = self._start(frames)
+        derived, deformation, z, T, shown = self._start(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
-        dT = self._tensors_jvp(deformation, derived, deformation.jvp(du, moved.gradients[self.read]), moved)
+        dH, dz = deformation.jvp(du, moved.gradients[self.read]), self.remembered_jvp(change, z)
+        dT = self._tensors_jvp(deformation, dH, z, dz, derived, moved)
         if self.means is not None:
             dT = self.means.jvp(T, dT, self._shares(derived), self._shares_jvp(derived, moved))
         return NUMBERS[self.numbers][2](shown, dT) if self.numbers else dT
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
-        derived, deformation, T, shown = self._start(frames)
+        derived, deformation, z, T, shown = self._start(frames)
         by_rest = 0.0
         adjoint, seed = derived.zeros(), NUMBERS[self.numbers][3](shown, seed) if self.numbers else seed
         if self.means is not None:
@@ -124,12 +126,12 @@ class _Tensors(Output):
                 by_rest = self.means.shares_vjp(derived.rest, by_shares)
             elif not self.alike:
                 np.add.at(adjoint.volumes, self.chosen, by_shares.reshape(-1, *adjoint.volumes.shape[1:]))
-        H_adj = self._tensors_vjp(deformation, derived, seed, adjoint)
+        H_adj, z_adj = self._tensors_vjp(deformation, z, derived, seed, adjoint)
         positions, by_B = deformation.vjp(H_adj, self.num_vertices)
         np.add.at(adjoint.gradients, self.read, by_B)
         adjoint.rest = by_rest - positions.sum(0)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(positions=positions, inputs=inputs)
+        return Change(positions=positions, inputs=inputs, law_state=self.remembered_vjp(frames, z_adj))
 
 
 class Strain(_Tensors):
@@ -155,17 +157,17 @@ class Strain(_Tensors):
     ):
         super().__init__(name, at, of, principal=principal, stretches=stretches)
 
-    def _tensors(self, deformation, derived):
+    def _tensors(self, deformation, z, derived):
         H = deformation.H
         Ht = np.swapaxes(H, -1, -2)
         return 0.5 * (H + Ht + Ht @ H)  # small strains keep their digits
 
-    def _tensors_jvp(self, deformation, derived, dH, change):
+    def _tensors_jvp(self, deformation, dH, z, dz, derived, change):
         half = np.swapaxes(deformation.F, -1, -2) @ dH
         return 0.5 * (half + np.swapaxes(half, -1, -2))
 
-    def _tensors_vjp(self, deformation, derived, seed, adjoint):
-        return 0.5 * deformation.F @ (seed + np.swapaxes(seed, -1, -2))
+    def _tensors_vjp(self, deformation, z, derived, seed, adjoint):
+        return 0.5 * deformation.F @ (seed + np.swapaxes(seed, -1, -2)), z
 
 
 class Stress(_Tensors):
@@ -183,7 +185,9 @@ class Stress(_Tensors):
     principal: Cauchy's eigenvalues instead, ascending, shape (frames, ..., 3); where two coincide only their sum has a
     gradient. von_mises: sqrt(3/2 s : s) of Cauchy's deviator s instead, shape (frames, ...), at vertices that of the mean
     stress; where it is 0 it has a kink, and its gradient is given as 0.
-    The gradient is exact by all inputs; in single precision the stress has an error of some 1e-6 of the modulus.
+    The gradient is exact by all inputs; in single precision the stress has an error of some 1e-6 of the modulus. Of a law
+    with a state, such as `Prony`, it is that of the strain and of what the law remembers in the frame; the viscous stress
+    of `KelvinVoigt` is not in it.
 
     With volume="patches" its pressure is that of the tetrahedron's patch.
 
@@ -199,6 +203,8 @@ class Stress(_Tensors):
     >>> frames["stress"].shape, bool((frames["stress"][-1] > 0).all())
     ((2, 6), True)
     """
+
+    reads_law_state = True
 
     def __init__(
         self,
@@ -225,37 +231,33 @@ class Stress(_Tensors):
         self.refuse_growth("Stress", scene)
         out = super().settled(scene)
         out.stresses = (TetrahedronStress if scene.volume == "tetrahedra" else PatchStress)(scene, out.chosen)
-        out.read, out.reads_law_state = out.stresses.read, bool(law.state_names)
+        out.read = out.stresses.read
         return out
-
-    def value(self, frames: "Frames") -> np.ndarray:
-        self.stresses.law_state = frames.law_state if self.reads_law_state else None
-        return super().value(frames)
 
     def _cauchy(self, P, F):
         return P @ np.swapaxes(F, -1, -2) / np.linalg.det(F)[..., None, None]
 
-    def _tensors(self, deformation, derived):
-        P = self.stresses.value(deformation.H, derived)
+    def _tensors(self, deformation, z, derived):
+        P = self.stresses.value(deformation.H, z, derived)
         return P if self.kind == "first_piola" else self._cauchy(P, self.stresses.chosen_of(deformation.F))
 
-    def _tensors_jvp(self, deformation, derived, dH, change):
-        dP = self.stresses.jvp(deformation.H, dH, derived, change)
+    def _tensors_jvp(self, deformation, dH, z, dz, derived, change):
+        dP = self.stresses.jvp(deformation.H, dH, z, dz, derived, change)
         if self.kind == "first_piola":
             return dP
         F, dH = (self.stresses.chosen_of(x) for x in (deformation.F, dH))
-        P, J = self.stresses.value(deformation.H, derived), np.linalg.det(F)[..., None, None]
+        P, J = self.stresses.value(deformation.H, z, derived), np.linalg.det(F)[..., None, None]
         grown = np.einsum("...ij,...ji->...", np.linalg.inv(F), dH)[..., None, None]
         Ft, dFt = np.swapaxes(F, -1, -2), np.swapaxes(dH, -1, -2)
         return (dP @ Ft + P @ dFt) / J - grown * self._cauchy(P, F)
 
-    def _tensors_vjp(self, deformation, derived, seed, adjoint):
+    def _tensors_vjp(self, deformation, z, derived, seed, adjoint):
         P_adj, F_adj = seed, np.zeros_like(seed)
         if self.kind == "cauchy":
-            F, P = self.stresses.chosen_of(deformation.F), self.stresses.value(deformation.H, derived)
+            F, P = self.stresses.chosen_of(deformation.F), self.stresses.value(deformation.H, z, derived)
             J = np.linalg.det(F)[..., None, None]
             shrunk = (seed * self._cauchy(P, F)).sum((-1, -2))[..., None, None]
             P_adj = seed @ F / J
             F_adj = np.swapaxes(seed, -1, -2) @ P / J - shrunk * np.swapaxes(np.linalg.inv(F), -1, -2)
-        by_H = self.stresses.vjp(deformation.H, P_adj, derived, adjoint)
-        return by_H + self.stresses.chosen_vjp(F_adj)
+        by_H, by_z = self.stresses.vjp(deformation.H, z, P_adj, derived, adjoint)
+        return by_H + self.stresses.chosen_vjp(F_adj), by_z

@@ -19,15 +19,14 @@ def field_seed(face, k: int | None, change: Change) -> HostSeed:
     by_frames.add(Change(change.positions, change.velocities))
     for name in ("positions", "velocities"):
         check_finite(name, getattr(by_frames, name), face.rollout.save_every)
-    return HostSeed(by_frames.positions, by_frames.velocities, change.contact_forces, change.chamber_pressures)
+    return HostSeed(by_frames.positions, by_frames.velocities, change.noted)
 
 
 class FieldSeed(HostSeed):
     """Gradients by the frames in the fields, copied on the device, with those that came by further outputs."""
 
     def __init__(self, face, k: int | None, change: Change):
-        self.face, self.k, self.change, self.contact_forces = face, k, change, change.contact_forces
-        self.chamber_pressures = None  # of implicit runs
+        self.face, self.k, self.change, self.noted = face, k, change, change.noted
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         face = self.face

@@ -28,7 +28,8 @@ class Frames:
     `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is held, shape (frames, chambers),
     of the substep that ends in the frame; others, and the first frame, have none (0).
 
-    `law_state`: what the law remembers, of frames that outputs of a `Simulator` are asked of.
+    `law_state`, where an output reads it: what the law remembers of each tetrahedron, shape (frames, num_tetrahedra, S), or
+    (frames, num_tetrahedra, 4, S) at the points of ten-node tetrahedra, in the order of the law's `state_names`.
 
     `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
     the last good one.
@@ -47,7 +48,7 @@ class Frames:
     computed: dict = field(default_factory=dict, repr=False)
     chamber_pressures: np.ndarray | None = field(default=None, repr=False)
     sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
-    law_state: np.ndarray | None = field(default=None, repr=False)  # of a Simulator's state, for outputs
+    law_state: np.ndarray | None = field(default=None, repr=False)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
     error: FloatingPointError | None = None
@@ -96,8 +97,7 @@ class HostSeed:
 
     positions: np.ndarray
     velocities: np.ndarray
-    contact_forces: np.ndarray | None = None
-    chamber_pressures: np.ndarray | None = None
+    noted: dict[str, np.ndarray | None]
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         adjoint.start(self.positions, self.velocities, last_frame_is_state)

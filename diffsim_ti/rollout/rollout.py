@@ -86,7 +86,9 @@ class Rollout:
         given = (outputs,) if isinstance(outputs, Output) else tuple(listed("outputs", outputs, "Outputs"))
         contacts = any(isinstance(output, Output) and output.needs_contact_forces(solver) for output in given)
         chambers = any(getattr(output, "reads_chamber_pressures", False) for output in given)
-        self.sweep = sweep = Sweep(solver, steps, **options, contacts=contacts, chambers=chambers)
+        law_states = any(getattr(output, "reads_law_state", False) for output in given)
+        noted = dict(contacts=contacts, chambers=chambers, law_states=law_states)
+        self.sweep = sweep = Sweep(solver, steps, **options, **noted)
         self.steps, self.save_every, self.num_frames = sweep.steps, sweep.save_every, sweep.num_frames
         self.values, self.inputs, self.wanted = sweep.values, sweep.inputs, sweep.wanted
         self.outputs = self._check_outputs((Positions(), Velocities(), Displacements(), *given))
@@ -124,13 +126,7 @@ class Rollout:
             if not isinstance(name, str) or not name.isidentifier() or name in taken:
                 rule = "need names of their own without blanks"
                 raise ValueError(f"outputs: {rule}, got {shown(name)}; taken: {', '.join(taken)}")
-            out[output.name] = settled = output.settled(self.scene)
-            if settled.reads_law_state:
-                raise ValueError(
-                    f"outputs: {output.name!r} needs what {self.scene.law.title} remembers "
-                    f"({', '.join(self.scene.law.state_names)}), which frames do not keep: ask Simulator.output(...) at the "
-                    "moments that matter, or let the loss be of positions and velocities"
-                )
+            out[output.name] = output.settled(self.scene)
         return out
 
     def with_scene(self, **changes) -> "Rollout":
@@ -206,8 +202,8 @@ class Rollout:
         frames.computed = self.computed
         frames.steps = np.arange(self.num_frames) * self.save_every
         frames.error = run.error
-        noted = self.sweep.contact_forces(), self.sweep.chamber_pressures()
-        frames.contact_forces, frames.chamber_pressures = (None if x is None else x[rows] for x in noted)
+        for name, x in self.sweep.noted_values().items():
+            setattr(frames, name, x[rows])
         for name, output in self.computed.items():
             value, shape = np.asarray(output.value(frames)), tuple(output.shape(self.num_frames))
             if value.shape != shape:
@@ -230,7 +226,7 @@ class Rollout:
         change = self.pulled_to_frames(frames, dict(positions=positions, velocities=velocities) | seeds)
         zero = np.zeros(frames.positions.shape)
         at_frames = [zero if x is None else x for x in (change.positions, change.velocities)]
-        seed = HostSeed(*at_frames, change.contact_forces, change.chamber_pressures)
+        seed = HostSeed(*at_frames, change.noted)
         self.gradients = self.gradients_of(frames.run, self.sweep.pull_back(frames.run, seed), change)
         for name in self.gradients.keys() & frames.sets.keys():
             self.gradients[name] = gathered(self.gradients[name], frames.sets[name])
@@ -288,7 +284,7 @@ class Rollout:
         tangents = {name: change_like(name, x, values[name].shape) for name, x in tangents.items()}
         derived = self.scene.inputs.derive_jvp(values, tangents)
         moved = self.sweep.push_forward(frames.run, derived)
-        return Change(*moved, tangents, self.sweep.contact_change, self.sweep.chamber_change)
+        return Change(*moved, tangents, **self.sweep.noted_changes)
 
     # ---- under ti.ad.Tape -------------------------------------------------------------------------------------------
 

@@ -38,10 +38,10 @@ class Run:
 
 
 class Seed(Protocol):
-    """Gradients of a loss by the frames' positions and velocities, wherever they lie; of what else was noted on the host."""
+    """Gradients of a loss by the frames' positions and velocities, wherever they lie; of what else was
+    noted (outputs/output.py), by name, on the host."""
 
-    contact_forces: np.ndarray | None
-    chamber_pressures: np.ndarray | None
+    noted: dict[str, np.ndarray | None]
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         """Set a solver's adjoint to them and everything else in it to zero; their norms, or FloatingPointError."""

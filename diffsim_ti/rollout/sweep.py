@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.common.checked import as_numbers, listed, number, whole
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
+from diffsim_ti.outputs.output import NOTED
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.run import Run, Seed
 from diffsim_ti.rollout.shape import MOVED
@@ -41,6 +42,7 @@ class Sweep:
         health: bool = False,
         contacts: bool = False,
         chambers: bool = False,
+        law_states: bool = False,
         raise_errors: bool = True,
     ):
         if contacts:
@@ -48,6 +50,7 @@ class Sweep:
         self.raise_errors, self.last_error = raise_errors, None  # what stopped the last run
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
+        self.law_states = law_states and bool(solver.scene.law.state_names)  # whether what the law remembers is
         self.solver, self.scene, self.steps = solver, solver.scene, steps
         self.save_every = max(steps, 1) if save_every is None else whole("save_every", save_every, 0)
         if self.save_every < 1 or steps % self.save_every:
@@ -77,7 +80,7 @@ class Sweep:
         self._loaded, self._started = None, False  # the values that are on the device; whether the run began elsewhere
         self._current = None  # the run whose frames and snapshots the workspace holds
         self._adjoint = None  # the solver's, made by the first pull-back
-        self.contact_change = self.chamber_change = None  # of the contact forces and chambers, by the last tangent
+        self.noted_changes: dict[str, np.ndarray] = {}  # of what runs note, by the last tangent
         self._recorded, self._warned = False, False  # whether the record holds all passes; whether of coarse contacts
 
     def _check_names(self, names) -> tuple[str, ...]:
@@ -101,18 +104,21 @@ class Sweep:
         times = [self.solver.schedule.frame_time(max(k, 1), self.save_every) for k in range(self.num_frames)]
         return np.reshape(times if self.steps else [1.0], (-1, 1, 1, 1, 1))
 
-    def contact_forces(self) -> np.ndarray | None:
-        """Mean forces [N] of obstacles on vertices in the frames of the last run, if they are noted."""
-        return self.workspace.contact_forces(self.frame_time) if self.contacts else None
-
-    def chamber_pressures(self) -> np.ndarray | None:
-        """Pressures [Pa] in chambers in the frames of the last run, if they are wanted."""
-        return self.workspace.chamber_pressures(self.num_frames, self.save_every) if self.chambers else None
-
     @property
     def noted(self) -> tuple[str, ...]:
         """What frames hold besides states, by name."""
-        return ("contact_forces",) * self.contacts + ("chamber_pressures",) * self.chambers
+        return tuple(n for n, asked in zip(NOTED, (self.contacts, self.chambers, self.law_states)) if asked)
+
+    def noted_values(self) -> dict[str, np.ndarray]:
+        """The same of the last run."""
+        ws = self.workspace
+        return self._noted(ws, lambda: ws.chamber_pressures(self.num_frames, self.save_every))
+
+    def _noted(self, of, chamber_pressures: Callable) -> dict[str, np.ndarray]:
+        """What a workspace or a tangent has of what frames hold besides states."""
+        contact_forces, law_state = lambda: of.contact_forces(self.frame_time), lambda: of.law_frames.values()
+        make = dict(zip(NOTED, (contact_forces, chamber_pressures, law_state)))
+        return {name: make[name]() for name in self.noted}
 
     @property
     def truncates(self) -> bool:
@@ -201,6 +207,8 @@ class Sweep:
                 self.workspace.make_frames(self.num_frames)
                 if self.contacts:
                     self.workspace.record_contacts()
+                if self.law_states:
+                    self.workspace.record_law_states()
                 self._snapshots = self.workspace.history(self.checkpoints.snapshots)
                 self._guard = self._make_guard()
             else:
@@ -280,8 +288,7 @@ class Sweep:
         if self.solver.last_frame_is_state:
             tangent.save_frame(self.num_frames - 1)
         self._current = run if current is run else None  # its frames and snapshots are untouched
-        self.contact_change = tangent.contact_forces(self.frame_time) if self.contacts else None
-        self.chamber_change = tangent.chamber_record.changes(self.num_frames) if self.chambers else None
+        self.noted_changes = self._noted(tangent, lambda: tangent.chamber_record.changes(self.num_frames))
         return tangent.collect()
 
     # ---- adjoints ---------------------------------------------------------------------------------------------------
@@ -304,7 +311,7 @@ class Sweep:
             if not self.careful:
                 self._reverse(seed, True)  # raises where it happens
             raise FloatingPointError("the adjoint is not finite at the start of the run")
-        if not any(getattr(seed, name) is not None for name in self.noted):  # whose seeds are no adjoints of places
+        if not any(seed.noted[name] is not None for name in self.noted):  # whose seeds are no adjoints of places
             _warn_of_explosion(of_frames, of_start, float(self.solver.schedule.time(self.steps)) or self.solver.dt)
         return derived
 
@@ -331,9 +338,13 @@ class Sweep:
         self._make_ready()
         norms, self.health = seed.put(self._adjoint, self.solver.last_frame_is_state), []
         if self.contacts:
-            self._adjoint.seed_contacts(seed.contact_forces, self.frame_time)
+            self._adjoint.seed_contacts(seed.noted["contact_forces"], self.frame_time)
         if self.chambers:
-            self._adjoint.chamber_record.adjoints = seed.chamber_pressures
+            self._adjoint.chamber_record.adjoints = seed.noted["chamber_pressures"]
+        if self.law_states:
+            self._adjoint.law_frames.put(seed.noted["law_state"])
+            if self.solver.last_frame_is_state:
+                self._adjoint.law_frames.add_to(self._adjoint.z, self.num_frames - 1)
         stop = 0 if self.truncate is None else self.solver.schedule.first(max(0, self.steps - self.truncate))
         kept, end = self._kept, checkpoints.num_segments
         self._kept = kept[:1]  # the sweep overwrites the others, also if it does not get to its end

@@ -24,6 +24,22 @@ def copy_slot(source, s: int, target, t: int) -> None:
         host[t] = runtime.view(source)[s]
 
 
+@runtime.untaped
+@runtime.kernel
+def _add_slot(source: ti.types.ndarray(ndim=2), s: ti.i32, target: ti.types.ndarray(ndim=2), t: ti.i32):
+    for i in range(source.shape[1]):
+        target[t, i] += source[s, i]
+
+
+def add_slot(source, s: int, target, t: int) -> None:
+    """target[t] += source[s], likewise."""
+    host = runtime.view(target)
+    if host is None:
+        _add_slot(source, s, target, t)
+    else:
+        host[t] += runtime.view(source)[s]
+
+
 class VertexRows:
     """Of the vertices `nodes`, in arrays of shape (slots, num_vertices)."""
 

@@ -50,11 +50,11 @@ class StaticSolver(ImplicitSolver):
         for x in scene.interactions:
             if x.no_equilibrium:
                 raise ValueError(f"{x.no_equilibrium}; take a solver with inertia")
-        law = scene.law
-        if law.state_names:
+        if scene.law.state_names:
             raise ValueError(
-                f"{type(law).__name__} has a state ({', '.join(law.state_names)}) that moves on with time, and an "
-                "equilibrium has none; take a solver with inertia, or a law of what is left when it has settled"
+                f"{scene.law.title} has a state that moves on with time, and an equilibrium has none: take a solver with "
+                "inertia, or the law of what lasts when all has settled, which of Prony(material, shares, times) is the "
+                "material inside with the same numbers"
             )
         super().__init__(scene, dt, load_steps, tolerance, max_iterations, parallel, preconditioner)
         self._refuse_rigid_modes()

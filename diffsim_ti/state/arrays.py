@@ -238,7 +238,7 @@ class SceneArrays:
     def stiffness_of(self, obstacle: int, vertices) -> float:
         """Stiffness [N/m] of an obstacle's barrier at vertices, on average."""
         twin, first, _ = self.obstacles[obstacle]
-        return float(self.values.parameters[first + twin.count]) * self.area_of(obstacle, vertices)
+        return float(self.values.parameters[first + twin.index.stiffness]) * self.area_of(obstacle, vertices)
 
     def stiffer(self, obstacle: int, vertices, stiffness: float) -> str:
         """In words, the number of an obstacle that gives its barrier a stiffness [N/m] at vertices."""

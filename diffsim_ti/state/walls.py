@@ -14,6 +14,14 @@ from diffsim_ti.common import rotations
 from diffsim_ti.state.schedule import Schedule
 
 MORE = 6  # rows of an obstacle that turns
+AT_STAGE, AT_BEGIN, RATE = range(3)  # rows of displacements, and of rotations
+TAU = 5  # of those of one that turns
+
+
+def _at_share(s: np.ndarray, phi: np.ndarray, share: float) -> np.ndarray:
+    """Modified Rodrigues parameters of R(share phi) R, from those of R; in kernels turning.py."""
+    turn = rotations.quaternion(share * phi)
+    return rotations.rodrigues(rotations.product(turn, rotations.from_rodrigues(s)))
 
 
 @dataclass(frozen=True)
@@ -55,12 +63,11 @@ class Walls:
             self._translations(out, path, at)
             for row, c in self.turning:
                 s = at.schedule.row_of(path, at.j)
-                phi, start = path[s, c + 2], rotations.from_rodrigues(path[s, c + 1])
-                for m, share in enumerate((at.at_stage, at.begin)):
-                    turn = rotations.quaternion(share * phi)
-                    out[row + m] = rotations.rodrigues(rotations.product(turn, start))
-                out[row + 2] = phi / at.schedule.step_length(at.j)
-                out[row + 5, 0] = at.tau
+                phi = path[s, c + 2]
+                for m, share in ((AT_STAGE, at.at_stage), (AT_BEGIN, at.begin)):
+                    out[row + m] = _at_share(path[s, c + 1], phi, share)
+                out[row + RATE] = phi / at.schedule.step_length(at.j)
+                out[row + TAU, 0] = at.tau
         return out
 
     def _translations(self, out, path, at):
@@ -79,8 +86,10 @@ class Walls:
     def velocity_at(self, k: int, rows: np.ndarray, point: np.ndarray, about: np.ndarray) -> np.ndarray:
         """Of obstacle k at a point [m/s]."""
         if k not in self.place_of:
-            return rows[3 * k + 2]
-        return rows[3 * k + 2] + np.cross(rows[3 * self.place_of[k] + 2], point - rows[3 * k] - self.away[k] - about)
+            return rows[3 * k + RATE]
+        return rows[3 * k + RATE] + np.cross(
+            rows[3 * self.place_of[k] + RATE], point - rows[3 * k] - self.away[k] - about
+        )
 
     # ---- places ------------------------------------------------------------------------------------------------------
 
@@ -96,8 +105,7 @@ class Walls:
         """Where they are when the share of a drift is done."""
         out = places + share * drift
         for at in self.place_of.values():
-            start = rotations.from_rodrigues(places[at])
-            out[at] = rotations.rodrigues(rotations.product(rotations.quaternion(share * drift[at]), start))
+            out[at] = _at_share(places[at], drift[at], share)
         return out
 
     def way_at(
@@ -120,10 +128,10 @@ class Walls:
             for row, c in self.turning:
                 s = at.schedule.row_of(path, at.j)
                 phi, theta, dphi = path[s, c + 2], dpath[s, c + 1], dpath[s, c + 2]
-                for m, share in enumerate((at.at_stage, at.begin)):
+                for m, share in ((AT_STAGE, at.at_stage), (AT_BEGIN, at.begin)):
                     turn = rotations.quaternion(share * phi)
                     out[row + m] = share * rotations.left_jacobian(share * phi) @ dphi + rotations.turned(turn, theta)
-                out[row + 2] = dphi / at.schedule.step_length(at.j)
+                out[row + RATE] = dphi / at.schedule.step_length(at.j)
         return out
 
     def vjp(self, path: np.ndarray, walls_adj: np.ndarray, at: Moment, path_adj: np.ndarray) -> None:
@@ -138,8 +146,8 @@ class Walls:
         for row, c in self.turning:
             s = schedule.row_of(path, j)
             phi = path[s, c + 2]
-            for m, share in enumerate((at.at_stage, at.begin)):
+            for m, share in ((AT_STAGE, at.at_stage), (AT_BEGIN, at.begin)):
                 by, back = walls_adj[row + m], rotations.quaternion(-share * phi)
                 path_adj[s, c + 1] += rotations.turned(back, by)
                 path_adj[s, c + 2] += share * rotations.left_jacobian(share * phi).T @ by
-            path_adj[s, c + 2] += walls_adj[row + 2] / schedule.step_length(j)
+            path_adj[s, c + 2] += walls_adj[row + RATE] / schedule.step_length(j)

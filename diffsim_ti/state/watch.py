@@ -208,7 +208,7 @@ class ContactWatch:
         """Depths in the barriers, in widths, that stop vertices with these speeds: m v^2 / 2 = k w^2 beta(1 - depth)."""
         area = np.where(values.surface > 0, values.surface, 1.0)
         stiffness = [
-            (values.parameters[first + twin.count] if twin.watched else 1.0)
+            (values.parameters[first + twin.index.stiffness] if twin.watched else 1.0)
             * (area if twin.per_area else np.ones_like(area))
             for twin, first, _ in self._obstacles
         ]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.common.rows import indices
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.collision_surface import cuts_of
@@ -55,6 +56,8 @@ class SelfContact(Term):
     each other raises Tunnelling.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
+
+    index = indices(stiffness=1, width=1, friction_speed=1, friction=1)  # of its numbers; as many coefficients as pairs
 
     def __init__(
         self,

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.rows import indices
 from diffsim_ti.inputs import Input, Range
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.term import Term, nonempty
@@ -35,6 +36,8 @@ class SurfaceDrag(Term):
     Raises ValueError for other shapes and numbers below zero, and for unknown sets.
     Taylor 1952, Analysis of the swimming of long and narrow animals, doi:10.1098/rspa.1952.0159.
     """
+
+    index = indices(density=1, normal=1, tangential=1, stream=3)  # of its numbers
 
     def __init__(
         self,

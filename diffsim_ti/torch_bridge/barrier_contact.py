@@ -1,9 +1,7 @@
 """PyTorch face: contact with a floor as a torch formula, and as the core's term with the same numbers."""
 
-import math
-
 from diffsim_ti.terms import Ground
-from diffsim_ti.terms.obstacles.barrier import CROSSOVER
+from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.torch_bridge.autograd import torch
 
 
@@ -56,12 +54,9 @@ class DifferentiableBarrierContact:
     def barrier_potential(self, d: torch.Tensor) -> torch.Tensor:
         """Energy [J] at distances d [m], elementwise."""
         s = d / self.d_hat
-        safe = s.clamp(CROSSOVER, 1.0)
-        t = torch.minimum(s - CROSSOVER, torch.zeros_like(s))
-        log = math.log(CROSSOVER)
-        slope = -2 * (CROSSOVER - 1) * log - (CROSSOVER - 1) ** 2 / CROSSOVER
-        curvature = -2 * log - 4 * (CROSSOVER - 1) / CROSSOVER + ((CROSSOVER - 1) / CROSSOVER) ** 2
-        beta = -((safe - 1) ** 2) * torch.log(safe) + t * (slope + t * curvature / 2)
+        safe = s.clamp(barrier.CROSSOVER, 1.0)
+        t = torch.minimum(s - barrier.CROSSOVER, torch.zeros_like(s))
+        beta = barrier.value_within(safe, torch.log(safe)) + t * (barrier.SLOPE + t * barrier.CURVATURE / 2)
         return self.kappa * self.d_hat**2 * beta
 
     def ground_contact_force(self, positions: torch.Tensor, velocities: torch.Tensor | None = None) -> torch.Tensor:

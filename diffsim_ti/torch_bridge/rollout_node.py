@@ -79,8 +79,8 @@ class _OutputNode(torch.autograd.Function):
     def backward(ctx, seed):
         seeds = {ctx.name: seed.detach().to("cpu", torch.float64).numpy()}
         change = ctx.rollout.pulled_to_frames(ctx.frames, seeds)
-        states = ("positions", "velocities", "contact_forces", "chamber_pressures")
-        gradients = {name: getattr(change, name) for name in states} | change.inputs
+        states = dict(positions=change.positions, velocities=change.velocities)
+        gradients = states | change.noted | change.inputs
         if "initial_positions" in gradients:
             gradients["initial_displacements"] = gradients["initial_positions"]
         return None, None, None, None, *_as_tensors(gradients, ctx.names, ctx.tensors, ctx.needs_input_grad[4:])

@@ -74,9 +74,8 @@ class TensorStart:
 class TensorSeed:
     """Gradients by the frames as tensors, copied on the device; see `Seed` in rollout/run.py."""
 
-    def __init__(self, face: "TensorRollout", pair: list, with_positions: bool, contact_forces: np.ndarray | None):
-        self.face, self.pair, self.with_positions, self.contact_forces = face, pair, with_positions, contact_forces
-        self.chamber_pressures = None  # of implicit runs
+    def __init__(self, face: "TensorRollout", pair: list, with_positions: bool, noted: dict):
+        self.face, self.pair, self.with_positions, self.noted = face, pair, with_positions, noted
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         norms = []
@@ -189,10 +188,9 @@ class TensorRollout:
         others = [name for name in wanted if not (direct and name in START)]
         others = ["initial_positions" if name == "initial_displacements" else name for name in others]
         if direct:
-            pair = [self._ready(x) for x in adjoints]
-            seed = TensorSeed(self, pair, "initial_positions" in others, noted.get("contact_forces"))
+            seed = TensorSeed(self, [self._ready(x) for x in adjoints], "initial_positions" in others, noted)
         else:
-            seed = HostSeed(*(x.detach().to("cpu", torch.float64).numpy() for x in adjoints), **noted)
+            seed = HostSeed(*(x.detach().to("cpu", torch.float64).numpy() for x in adjoints), noted)
             for name, x in (("positions", seed.positions), ("velocities", seed.velocities)):
                 check_finite(name, x, rollout.save_every)
         derived = rollout.sweep.pull_back(run, seed)

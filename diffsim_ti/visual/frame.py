@@ -114,13 +114,13 @@ def _strained(scene: Scene, frames: Frames, k: int) -> dict[str, np.ndarray]:
     of its points [Pa]."""
     mesh, derived = scene.mesh, scene.inputs.derive(frames.inputs)
     one = {name: getattr(frames, name)[[k]] for name in ("positions", "velocities", "displacements", "times", "steps")}
-    one = replace(frames, **one, outputs={})
+    one = replace(frames, **one, law_state=None if frames.law_state is None else frames.law_state[[k]], outputs={})
     F = Deformation.of(one, derived, mesh, np.arange(mesh.num_tetrahedra)).F
     J = np.linalg.det(F).reshape(mesh.num_tetrahedra, -1).min(1)
     if mesh.order == 2:
         u = one.displacements[0].astype(np.float64)
         J = np.minimum(J, ratios_at_corners(mesh.elements, derived.rest, u).min(1))
-    if scene.law.state_names:  # which frames do not have
+    if scene.law.state_names and frames.law_state is None:  # which no output of the run reads
         return dict(J=J)
     try:
         stress = Stress(von_mises=True).settled(scene)

@@ -82,7 +82,7 @@ class PotentialKernels:
         for i in range(plan.num_vertices):
             value = ti.cast(0, self.fp)
             if self.felt(i, scene):
-                value = self.obstacles.whole_energy(i, at.u[0, i], scene, pass_, plan)
+                value = self.obstacles.total_energy(i, at.u[0, i], scene, pass_, plan, True)
             out.contact[i] = value
 
     @cached_property
@@ -97,7 +97,7 @@ class PotentialKernels:
         for i in range(plan.num_vertices):
             value = ti.cast(0, self.fp)
             if self.felt(i, scene):
-                value = self.obstacles.energy(i, at.u[0, i], scene, pass_)
+                value = self.obstacles.total_energy(i, at.u[0, i], scene, pass_, plan, False)
             out.contact[i] = value
 
     @cached_property
@@ -120,7 +120,7 @@ class PotentialKernels:
         for i in range(plan.num_vertices):
             pushed, total = self.obstacles.vector(0), self.obstacles.vector(0)
             if self.felt(i, scene):
-                pushed = self.obstacles.whole_force(i, at.u[0, i], scene, pass_, plan)
+                pushed = self.obstacles.total_force(i, at.u[0, i], scene, pass_, plan)
             norm = self.length(pushed)
             for c in range(scene.start[i], scene.start[i + 1]):
                 part = scene.corner[scene.corner_of[c]]
@@ -145,10 +145,7 @@ class PotentialKernels:
         for i in range(plan.num_vertices):
             f = self.element.gather(i, scene, scene.corner)
             if self.felt(i, scene):
-                if ti.static(friction):
-                    f += self.obstacles.whole_product(i, at.u[0, i], at.w[0, i], scene, pass_, plan)
-                else:
-                    f += self.obstacles.product(i, at.u[0, i], at.w[0, i], scene, pass_)
+                f += self.obstacles.total_product(i, at.u[0, i], at.w[0, i], scene, pass_, plan, friction)
             out.y[0, i] = f
 
     @ti.func
@@ -207,7 +204,7 @@ class PotentialKernels:
             unit = self.obstacles.vector(0)
             for m in ti.static(range(3)):
                 unit[m] = ti.select(d == m, ti.cast(1, self.fp), ti.cast(0, self.fp))
-            f = self.obstacles.whole_product(i, at.u[0, i], unit, scene, pass_, plan)
+            f = self.obstacles.total_product(i, at.u[0, i], unit, scene, pass_, plan, True)
         return f
 
     @ti.func

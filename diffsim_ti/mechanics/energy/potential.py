@@ -122,7 +122,7 @@ class Potential:
     def without_friction(self):
         """What has a potential in the state alone, for friction has one in a pass."""
         a, rubbing = self.arrays, getattr(self.rubbing, "inner", self.rubbing)  # that of curved faces acts on corners
-        rough = [first + force.count + 2 for force, first, _ in a.obstacles if force.friction]
+        rough = [first + force.index.friction for force, first, _ in a.obstacles if force.friction]
         if not (rough or rubbing):
             yield
             return

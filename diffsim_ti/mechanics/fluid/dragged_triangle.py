@@ -11,6 +11,7 @@ import taichi as ti
 from diffsim_ti.mechanics.fluid import drag
 from diffsim_ti.mechanics.interaction import ItemForce
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.surface_drag import SurfaceDrag
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 pull, pull_jvp, pull_vjp = (ti.func(f) for f in (drag.pull, drag.pull_jvp, drag.pull_vjp))
@@ -42,7 +43,7 @@ class DraggedTriangle(ItemForce):
     @ti.func
     def speed(self, t, v: A, s, parameters: A, scene: A):
         """Mean velocity of the corners in slot s, less the stream."""
-        first = scene.dragged_numbers[t] + 3
+        first = scene.dragged_numbers[t] + SurfaceDrag.index.stream
         stream = self.vector(parameters[first], parameters[first + 1], parameters[first + 2], ti.cast(0, self.fp))
         total = v[s, scene.dragged[3 * t]] + v[s, scene.dragged[3 * t + 1]] + v[s, scene.dragged[3 * t + 2]]
         return total * self.number(1.0 / 3.0) - stream
@@ -51,7 +52,8 @@ class DraggedTriangle(ItemForce):
     def numbers(self, t, parameters: A, scene: A):
         """(rho / 12, c_t, c_n - c_t)"""
         k = scene.dragged_numbers[t]
-        return parameters[k] * self.number(1.0 / 12.0), parameters[k + 2], parameters[k + 1] - parameters[k + 2]
+        rho, c_t = parameters[k + SurfaceDrag.index.density], parameters[k + SurfaceDrag.index.tangential]
+        return rho * self.number(1.0 / 12.0), c_t, parameters[k + SurfaceDrag.index.normal] - c_t
 
     @ti.func
     def inverse(self, x):

@@ -6,6 +6,7 @@ import numpy as np
 from diffsim_ti.mechanics.fluid.drag import pull, pull_jvp, pull_vjp
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+from diffsim_ti.terms.surface_drag import SurfaceDrag
 
 
 def _dot(a, b):
@@ -30,8 +31,14 @@ class Fluid(HostForce):
 
     def _numbers(self, parameters):
         """(rho / 12, c_t, c_n - c_t, stream) of each triangle."""
-        rows = parameters[self.first[:, None] + np.arange(6)]
-        return rows[:, :1] / 12, rows[:, 2:3], rows[:, 1:2] - rows[:, 2:3], rows[:, 3:]
+        rows, index = parameters[self._rows], SurfaceDrag.index
+        rho, c_n, c_t = (rows[:, [k]] for k in (index.density, index.normal, index.tangential))
+        return rho / 12, c_t, c_n - c_t, rows[:, index.stream :]
+
+    @property
+    def _rows(self):
+        """Where the numbers of each triangle stand, shape (m, numbers)."""
+        return self.first[:, None] + np.arange(SurfaceDrag.index.end)
 
     def _mean(self, v):
         return v[self.triangles].mean(1)
@@ -82,7 +89,6 @@ class Fluid(HostForce):
         by_place = triangle_normals_vjp(self.values.rest + u, self.triangles, 2 * by_N)
         if adj is not None:
             by_k, by_c, by_rho = along * over * across, L * straight, -size * _dot(w, B) / 12
-            numbers = np.hstack([by_rho, by_k, by_c - by_k, -by_v])
-            np.add.at(adj.parameters, self.first[:, None] + np.arange(6), numbers)
+            np.add.at(adj.parameters, self._rows, np.hstack([by_rho, by_k, by_c - by_k, -by_v]))
             adj.rest += by_place
         return by_place, self._to_vertices(by_v / 3)

@@ -7,6 +7,7 @@ would lead it to or from the obstacle is left out, as if it were across the norm
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import taichi as ti
 
@@ -17,15 +18,19 @@ from diffsim_ti.mechanics.obstacles.contact_impulses import (
     seed_of_friction,
 )
 from diffsim_ti.mechanics.obstacles.held_back import HeldBack
-from diffsim_ti.mechanics.obstacles.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
+from diffsim_ti.mechanics.obstacles.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
 from diffsim_ti.terms.obstacles import stage
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class ContactFriction(HeldBack):
+class ContactFriction(ObstacleStages):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
+
+    @cached_property
+    def held_back(self) -> HeldBack:
+        return HeldBack(self.features, self.precision)
 
     @ti.func
     def led_normal(self, i, n, scene: A):
@@ -126,7 +131,7 @@ class ContactFriction(HeldBack):
         """Velocity after friction."""
         after = self.slide_all(i, v, ratio, scene, state)
         x, _ = self.crowding(i, v, after, z, now, state)
-        c, slope = self.share_and_slope(x)
+        c, slope = self.held_back.share_and_slope(x)
         if slope < 0:
             after = v + c * (after - v)
         return after
@@ -136,16 +141,15 @@ class ContactFriction(HeldBack):
     @ti.func
     def slide_jvp_of(self, g: A, k, i, u, du, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
         """Velocity after the friction of one obstacle, and its change."""
-        row, numbers = ROWS * (g.number + k), g.first + k * g.size + g.force.count
+        row, first = ROWS * (g.number + k), g.first + k * g.size
         pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
         if pushed.x > 0:
             plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
             X = self.seen_now(g, k, scene.rest[i], now, scene)
-            dwall, change = (
-                self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent),
-                state.stage[row + SEED, i],
-            )
-            dmu, deps = tangent.parameters[numbers + 2], tangent.parameters[numbers + 3]
+            dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+            change = state.stage[row + SEED, i]
+            dmu = tangent.parameters[first + g.force.index.friction]
+            deps = tangent.parameters[first + g.force.index.friction_speed]
             dafter = stage.slide_jvp(
                 self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
             )
@@ -171,7 +175,7 @@ class ContactFriction(HeldBack):
         """Velocity after friction, and its change."""
         after, change = self.slide_all_jvp(i, u, du, v, dv, ratio, dratio, now, scene, state, tangent)
         x, number = self.crowding(i, v, after, z, now, state)
-        c, slope = self.share_and_slope(x)
+        c, slope = self.held_back.share_and_slope(x)
         dc, start, dstart = ti.cast(0, self.fp), v, dv
         if slope < 0:
             way, dway, dx = after - v, change - dv, ti.cast(0, self.fp)
@@ -179,7 +183,7 @@ class ContactFriction(HeldBack):
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    dx = self.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
+                    dx = self.held_back.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
             dc = slope * dx
             after, change = v + c * way, dv + c * dway + dc * way
         if ti.static(self.features.recorded):
@@ -234,7 +238,7 @@ class ContactFriction(HeldBack):
         """(adjoints of v before friction, of h / m, of the move z, of alpha, of u); notes or adds those of all else."""
         after, by_z, by_u = self.slide_all(i, v, ratio, scene, state), self.vector(0), self.vector(0)
         x, number = self.crowding(i, v, after, z, now, state)
-        c, slope = self.share_and_slope(x)
+        c, slope = self.held_back.share_and_slope(x)
         way_adj, own, by_alpha = v_adj, self.vector(0), ti.cast(0, self.fp)
         if slope < 0:
             way = after - v
@@ -245,7 +249,7 @@ class ContactFriction(HeldBack):
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    of_e, of_z, of_u = self.adjoint_of_x(
+                    of_e, of_z, of_u = self.held_back.adjoint_of_x(
                         g, k, i, i, u, z, now.alpha * way, x, by_x, now, scene, adjoint, adjoint
                     )
                     way_adj += now.alpha * of_e

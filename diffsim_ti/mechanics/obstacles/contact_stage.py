@@ -15,12 +15,13 @@ A vertex that is held in some directions goes the way `lead` there, and is pushe
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.contact_friction import ContactFriction
 from diffsim_ti.mechanics.obstacles.contact_impulses import note_impulses, note_pushes_jvp, seed_impulses
-from diffsim_ti.mechanics.obstacles.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
+from diffsim_ti.mechanics.obstacles.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
 from diffsim_ti.mechanics.obstacles.outside_work import add_work, work_of_lead, work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
 
@@ -29,11 +30,15 @@ MOST_ROUNDS = 60
 
 
 @dataclass(frozen=True)
-class ContactStage(ContactFriction):
+class ContactStage(ObstacleStages):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it.
 
     Obstacles of all kinds are gone through in one loop, over what `look` notes of them.
     """
+
+    @cached_property
+    def friction(self) -> ContactFriction:
+        return ContactFriction(self.features, self.precision)
 
     @property
     def epsilon(self) -> float:
@@ -57,10 +62,8 @@ class ContactStage(ContactFriction):
                     for k in range(g.count):
                         first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
                         wall = self.wall(g, k, X, u, now, scene)
-                        plane, width = (
-                            g.force.outlook(scene.parameters, first, X, u),
-                            g.force.width(scene.parameters, first),
-                        )
+                        plane = g.force.outlook(scene.parameters, first, X, u)
+                        width = g.force.width(scene.parameters, first)
                         if turn == 0:
                             y = plane.w + self.normal(plane).dot(move - now.h * wall)
                             near = near or ti.min(plane.w, y) < width
@@ -139,11 +142,11 @@ class ContactStage(ContactFriction):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * self.blend(plan) * ratio
                 z, total, _, _ = self.solve(i, lead, free, a, now, scene, state, plan)
-                delta, v = ratio * total, self.rubbed(i, v_plus, z, ratio, now, scene, state)
+                delta, v = ratio * total, self.friction.rubbed(i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.recorded):
-                    note_impulses(self, i, v_plus, z, ratio, now, scene, state)
+                    note_impulses(self.friction, i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.moving > 0):
-                    add_work(self, i, work_of_stage(self, i, v_plus, now, scene, state), state, plan)
+                    add_work(self, i, work_of_stage(self.friction, i, v_plus, now, scene, state), state, plan)
                 if ti.static(self.features.guided and self.features.motion):
                     add_work(self, i, work_of_lead(self, i, lead, state), state, plan)
         pressed = self.blend(plan) * delta
@@ -174,7 +177,9 @@ class ContactStage(ContactFriction):
                 delta, ddelta = ratio * total, dratio * total + ratio * dtotal
                 if ti.static(self.features.recorded):
                     note_pushes_jvp(self, i, now, state, tangent)
-                v, dv = self.rubbed_jvp(i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now, scene, state, tangent)
+                v, dv = self.friction.rubbed_jvp(
+                    i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now, scene, state, tangent
+                )
         w, dw = v + blend * delta, dv + blend * ddelta
         du_next = du + dalpha * w + now.alpha * dw
         dv_next = now.decay * dv + ddelta - (1 - now.decay) * blend * ddelta
@@ -235,7 +240,7 @@ class ContactStage(ContactFriction):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * blend * ratio
                 z, total, xyz, mixed = self.solve(i, moved, free, a, now, scene, state, plan)
-                w = self.rubbed(i, v_plus, z, ratio, now, scene, state) + blend * ratio * total
+                w = self.friction.rubbed(i, v_plus, z, ratio, now, scene, state) + blend * ratio * total
                 delta_adj = q + blend * w_adj
                 by_alpha, by_ratio = p.dot(w), delta_adj.dot(total)
                 self.seed_all(i, ratio * delta_adj, state)
@@ -243,7 +248,7 @@ class ContactStage(ContactFriction):
                     seed_impulses(self, i, now, state, adjoint)
                 by_z = self.vector(0)
                 if ti.static(len(self.features.staged_rough) > 0):
-                    v_adj, more, of_z, of_alpha, of_u = self.rubbed_vjp(
+                    v_adj, more, of_z, of_alpha, of_u = self.friction.rubbed_vjp(
                         i, u, v_plus, v_adj, z, ratio, now, scene, state, adjoint
                     )
                     by_ratio += more
@@ -307,14 +312,14 @@ class ContactStage(ContactFriction):
                 by_place, by_own, by = stage.push_vjp(
                     g.force, scene.parameters, first, X, u, own, plan.contact_damping, by_n, by_push
                 )
-                for m in ti.static(range(g.force.count + 2)):
+                for m in ti.static(range(g.force.index.width + 1)):
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
                 by_wall = -now.h * by_own
                 move_adj += by_own
                 if ti.static(g.force.friction):
-                    at = first + g.force.count + 2
-                    adjoint.sums[at, i] = adjoint.sums[at, i] + pushed.z
-                    adjoint.sums[at + 1, i] = adjoint.sums[at + 1, i] + pushed.w
+                    at_mu, at_eps = first + g.force.index.friction, first + g.force.index.friction_speed
+                    adjoint.sums[at_mu, i] = adjoint.sums[at_mu, i] + pushed.z
+                    adjoint.sums[at_eps, i] = adjoint.sums[at_eps, i] + pushed.w
                     by_wall += state.stage[row + WALL, i]
                 by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
                 u_adj += by_u

@@ -99,7 +99,7 @@ class CurvedPoints(ObstacleFunctions):
         """The sum over the points of a triangle as whose node number `spot` vertex i stands; X, u, w: rows of its nodes;
         thicker: share by which the weight changes. Of "numbers" the sum of force . at.w."""
         out, by, per = self.vector(0), self.rows(0), ti.cast(1, self.fp) / ti.cast(parts, self.fp)
-        stiffness, width = scene.parameters[first + g.force.count], g.force.width(scene.parameters, first)
+        stiffness, width = scene.parameters[first + g.force.index.stiffness], g.force.width(scene.parameters, first)
         corners, turns, wi = self.rows(0), self.rows(0), self.row_of(w, spot)
         for a in range(3):
             seen = self.corner(g, first, self.row_of(X, a), self.row_of(u, a), scene)
@@ -167,7 +167,7 @@ class CurvedPoints(ObstacleFunctions):
                                     for m in ti.static(range(3)):
                                         by[a, m] += of_a * wi[m]
                                     by[a, 3] += s[a] * by_t / width
-                                at_k, at_w = first + g.force.count, first + g.force.count + 1
+                                at_k, at_w = first + g.force.index.stiffness, first + g.force.index.width
                                 more.sums[at_k, i] = more.sums[at_k, i] + f / stiffness
                                 more.sums[at_w, i] = more.sums[at_w, i] + (f - sigma * by_s - t * by_t) / width
                                 out[0] += f
@@ -180,9 +180,11 @@ class CurvedPoints(ObstacleFunctions):
                                 dt = self.besides(g, said, dn[3]) / width
                                 grown = ti.cast(0, self.fp)
                                 if ti.static(what == "jvp"):
-                                    dwidth = more.parameters[first + g.force.count + 1] / width
+                                    dwidth = more.parameters[first + g.force.index.width] / width
                                     ds, dt = ds - sigma * dwidth, dt - t * dwidth
-                                    grown = thicker + more.parameters[first + g.force.count] / stiffness + dwidth
+                                    grown = (
+                                        thicker + more.parameters[first + g.force.index.stiffness] / stiffness + dwidth
+                                    )
                                 dFs, dFt = Fss * ds + Fst * dt + grown * Fs, Fst * ds + Ftt * dt + grown * Ft
                                 out += scale * own * (self.besides(g, dFs, dFt) * now + self.besides(g, Fs, Ft) * dn)
                                 out += scale * of_corner * (dFt * ni + Ft * ti_)

@@ -121,7 +121,7 @@ class FaceForces(FaceRows):
                             turned = self.turn(what, g, first, Xs, us, mixed, scene, out)
                         if ti.static(what == "force"):
                             value = point_energy(sigma, t, g.force, self.fp)
-                            stiff = weight * scene.parameters[first + g.force.count]
+                            stiff = weight * scene.parameters[first + g.force.index.stiffness]
                             faces.energy[f] = faces.energy[f] + stiff * width * width * value
                         found += self.point(
                             what,
@@ -193,7 +193,7 @@ class FaceForces(FaceRows):
         out: A,
     ):
         """What a point adds to the rows of the corners; dn: change of (normal, distance) there."""
-        found, stiffness = self.rows(0), scene.parameters[first + g.force.count]
+        found, stiffness = self.rows(0), scene.parameters[first + g.force.index.stiffness]
         scale, stiff = 0 - weight * stiffness * width, weight * stiffness
         Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
         push = self.besides(g, Fs, Ft)
@@ -221,8 +221,8 @@ class FaceForces(FaceRows):
             dt = self.besides(g, said, dn[3]) / width
             dk, dw = zero, zero
             if ti.static(what == "jvp"):
-                dk = thicker + out.parameters[first + g.force.count] / stiffness
-                dw = out.parameters[first + g.force.count + 1] / width
+                dk = thicker + out.parameters[first + g.force.index.stiffness] / stiffness
+                dw = out.parameters[first + g.force.index.width] / width
                 ds, dt = ds - sigma * dw, dt - t * dw
             dFs, dFt = Fss * ds + Fst * dt, Fst * ds + Ftt * dt
             dpush = self.besides(g, dFs, dFt)
@@ -250,7 +250,7 @@ class FaceForces(FaceRows):
     @ti.func
     def numbers(self, g: A, first, f, s, sigma, t, now, Xs, us, mixed, w, corners, weight, width, scene: A, out: A):
         """Adjoints of (normal, distance) at the corners; adds those of the obstacle's numbers."""
-        by, stiffness = self.rows(0), scene.parameters[first + g.force.count]
+        by, stiffness = self.rows(0), scene.parameters[first + g.force.index.stiffness]
         scale = 0 - weight * stiffness * width
         Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
         Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
@@ -267,9 +267,9 @@ class FaceForces(FaceRows):
             for m in ti.static(range(3)):
                 by[a, m] = scale * Ft * s[a] * w[a, m]
             by[a, 3] = s[a] * by_t / width
-        at = first + g.force.count
-        out.sums[at, f] = out.sums[at, f] + of_force / stiffness
+        at_k, at_w = first + g.force.index.stiffness, first + g.force.index.width
+        out.sums[at_k, f] = out.sums[at_k, f] + of_force / stiffness
         if ti.static(g.force.per_area):
             out.by_areas[f] = out.by_areas[f] + of_force
-        out.sums[at + 1, f] = out.sums[at + 1, f] + (of_force - sigma * by_s - t * by_t) / width
+        out.sums[at_w, f] = out.sums[at_w, f] + (of_force - sigma * by_s - t * by_t) / width
         return by

@@ -17,6 +17,7 @@ import numpy as np
 
 from diffsim_ti.common import rotations
 from diffsim_ti.state.walls import Moment
+from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
 
 TINY = 1e-300
 
@@ -50,11 +51,16 @@ class FaceFriction:
         self.ws, self.a, self.surface, self.obstacles = workspace, a, surface, []
         for g in a.features().groups:
             if g.force.friction and a.features().reaches(g):
-                self.obstacles += [(g.number + k, g.first + k * g.size + g.force.count + 2) for k in range(g.count)]
-        self.number = np.array([o for o, _ in self.obstacles], int)
-        # of mu; eps comes next, a point turned about last
-        self.numbers = np.array([at for _, at in self.obstacles], int)
+                self.obstacles += [(g.number + k, g.first + k * g.size, g.force.index) for k in range(g.count)]
+        self.number = np.array([o for o, _, _ in self.obstacles], int)
+        self.at_mu = np.array([first + index.friction for _, first, index in self.obstacles], int)
+        self.at_eps = np.array([first + index.friction_speed for _, first, index in self.obstacles], int)
         self.free = a.supports.freedom(a.num_vertices)[surface]
+
+    def _about(self, k: int) -> slice:
+        """Where the point that the k-th of them turns about stands in the parameters."""
+        _, first, index = self.obstacles[k]
+        return slice(first + index.about, first + index.about + 3)
 
     def __bool__(self) -> bool:
         return bool(self.obstacles)
@@ -96,7 +102,7 @@ class FaceFriction:
                 continue
             pose, h = 3 * self.a.walls.place_of[o], rub.now.h
             turn = h * rub.walls[pose + 2]
-            r = y[own] - self.a.origin - rub.walls[3 * o] - self.a.values.parameters[self.numbers[k] + 2 :][:3]
+            r = y[own] - self.a.origin - rub.walls[3 * o] - self.a.values.parameters[self._about(k)]
             yield k, own, pose, r, rotations.left_jacobian(turn), rotations.turned(rotations.quaternion(turn), r)
 
     def _wall(self, rub: Rubbing, y: np.ndarray) -> np.ndarray:
@@ -111,7 +117,7 @@ class FaceFriction:
         out = dwalls[3 * self.number[rub.obstacle] + 2]
         for k, own, pose, _, J, turned in self._turning(rub, y):
             if pose is not None:
-                dr = dy[own] - dwalls[3 * self.number[k]] - parameters_dot[self.numbers[k] + 2 :][:3]
+                dr = dy[own] - dwalls[3 * self.number[k]] - parameters_dot[self._about(k)]
                 turn = rotations.quaternion(rub.now.h * rub.walls[pose + 2])
                 out[own] += (rotations.turned(turn, dr) - dr) / rub.now.h + np.cross(J @ dwalls[pose + 2], turned)
         return out
@@ -126,13 +132,13 @@ class FaceFriction:
                 out[own] = (rotations.turned(back, by[own]) - by[own]) / rub.now.h
                 walls_adj[pose + 2] += J.T @ np.cross(turned, by[own]).sum(0)
                 walls_adj[3 * self.number[k]] -= out[own].sum(0)
-                parameters_adj[self.numbers[k] + 2 :][:3] -= out[own].sum(0)
+                parameters_adj[self._about(k)] -= out[own].sum(0)
         return out
 
     def _known(self, rub: Rubbing) -> SimpleNamespace:
         """All that the formula names."""
         p, I = self.a.values.parameters, rub.impulses
-        mu, eps = p[self.numbers][rub.obstacle], p[self.numbers + 1][rub.obstacle]
+        mu, eps = p[self.at_mu][rub.obstacle], p[self.at_eps][rub.obstacle]
         P = I.sum(1)
         size = np.linalg.norm(P, axis=1)
         n = P / size[:, None]
@@ -146,7 +152,7 @@ class FaceFriction:
         S = self._gather(rub, (np.abs(w) * L[:, None])[..., None])
         lightness = inverse[rub.corners, 0]
         c = (np.abs(w) * S[rub.corners, 0] * lightness).sum(1)
-        kappa, f, y, B = slip(speed, c, eps)
+        kappa, f, y, B = slip(speed, c, eps, TINY, ARRAYS)
         r = -(L * kappa)[:, None] * t
         of_push = dict(mu=mu, size=size, n=n, w=w, L=L, at=at)
         of_motion = dict(v=v, x=x, wall=wall, relative=relative, t=t, speed=speed)
@@ -178,7 +184,7 @@ class FaceFriction:
         """
         k = self._known(rub)
         dI = dI[:, self.number][rub.face, rub.obstacle]
-        d_mu, d_eps = (parameters_dot[self.numbers + m][rub.obstacle] for m in (0, 1))
+        d_mu, d_eps = (parameters_dot[at][rub.obstacle] for at in (self.at_mu, self.at_eps))
         dP = dI.sum(1)
         d_size = (k.n * dP).sum(1)
         dn = (dP - k.n * d_size[:, None]) / k.size[:, None]
@@ -243,8 +249,8 @@ class FaceFriction:
         I_adj = w_adj[:, :, None] * k.n[:, None]
         n_adj += np.einsum("ka,kad->kd", w_adj, rub.impulses)
         P_adj = k.n * size_adj[:, None] + (n_adj - k.n * _dot(k.n, n_adj)) / k.size[:, None]
-        np.add.at(parameters, self.numbers[rub.obstacle], mu_adj)
-        np.add.at(parameters, self.numbers[rub.obstacle] + 1, eps_adj)
+        np.add.at(parameters, self.at_mu[rub.obstacle], mu_adj)
+        np.add.at(parameters, self.at_eps[rub.obstacle], eps_adj)
         return SimpleNamespace(
             impulses=I_adj + P_adj[:, None],
             v=v_adj,
@@ -253,17 +259,6 @@ class FaceFriction:
             parameters=parameters,
             walls=walls_adj,
         )
-
-
-def slip(s: np.ndarray, c: np.ndarray, eps: np.ndarray) -> tuple:
-    """(f / |t|, f, y, B) for |t| = s, with df = B (ds - f dc - y d eps), as of surfaces that rub."""
-    sticks = s < eps + c
-    both = eps + 2 * c
-    keep = 2 * eps / (both + np.sqrt(np.maximum(both * both - 4 * c * np.minimum(s, eps + c), 0)))
-    y = np.where(sticks, keep * s / eps, 1.0)
-    kappa = np.where(sticks, keep / eps * (2 - y), 1 / np.maximum(s, TINY))
-    B = np.where(sticks, 2 * (1 - y) / (eps + 2 * c * (1 - y)), 0.0)
-    return kappa, np.where(sticks, y * (2 - y), 1.0), y, B
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -202,7 +202,7 @@ class FacePoints(CurvedPoints):
         """The sum over the points of a face whose first corner is vertex i; X, u, w: rows of its corners; grown: share by
         which the weight changes. Of "numbers" the sum of force . at.w."""
         out, per, third = self.vector(0), ti.cast(1, self.fp) / ti.cast(parts, self.fp), ti.cast(1 / 3, self.fp)
-        stiffness, width = scene.parameters[first + g.force.count], g.force.width(scene.parameters, first)
+        stiffness, width = scene.parameters[first + g.force.index.stiffness], g.force.width(scene.parameters, first)
         thirds = ti.Vector([third, third, third])
         corners, turns, middle = self.rows(0), self.rows(0), self.vector(0)  # (normal, distance) there, and its change
         for a in range(4):
@@ -320,7 +320,7 @@ class FacePoints(CurvedPoints):
                             by[0, 3] += s0 * by_t / width
                             by[1, 3] += s1 * by_t / width
                             by[2, 3] += s2 * by_t / width
-                            at_k, at_w = first + g.force.count, first + g.force.count + 1
+                            at_k, at_w = first + g.force.index.stiffness, first + g.force.index.width
                             more.sums[at_k, i] = more.sums[at_k, i] + f / stiffness
                             more.sums[at_w, i] = more.sums[at_w, i] + (f - s * by_s - t * by_t) / width
                             out[0] += f
@@ -332,9 +332,9 @@ class FacePoints(CurvedPoints):
                             dt = (s0 * turns[0, 3] + s1 * turns[1, 3] + s2 * turns[2, 3] - dn[3]) / width
                             grown = ti.cast(0, self.fp)
                             if ti.static(what == "jvp"):
-                                dwidth = more.parameters[first + g.force.count + 1] / width
+                                dwidth = more.parameters[first + g.force.index.width] / width
                                 ds, dt = ds - s * dwidth, dt - t * dwidth
-                                grown = thicker + more.parameters[first + g.force.count] / stiffness + dwidth
+                                grown = thicker + more.parameters[first + g.force.index.stiffness] / stiffness + dwidth
                             out += scale * (
                                 (Fss * ds + Fst * dt) * now
                                 + Fs * dn

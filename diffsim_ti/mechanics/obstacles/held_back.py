@@ -36,10 +36,6 @@ class HeldBack(ObstacleStages):
         return c, slope
 
     @ti.func
-    def normal(self, plane):
-        return self.vector(plane.x, plane.y, plane.z, ti.cast(0, self.fp))
-
-    @ti.func
     def plane(self, g: A, k, i, u, now: A, scene: A):
         """(n, d) of an obstacle at u, where it is when the pass begins."""
         X = self.seen_now(g, k, scene.rest[i], now, scene)

@@ -48,6 +48,11 @@ class ObstacleFunctions:
         """X: a rest position relative to an obstacle at a place; of one that turns seven numbers (obstacle_force.py)."""
         return self.turned.seen(rest, place) if g.force.turns else rest - place
 
+    @ti.func
+    def normal(self, plane):
+        """n of (n, d)."""
+        return self.vector(plane.x, plane.y, plane.z, ti.cast(0, self.fp))
+
     @property
     def num_obstacles(self) -> int:
         return sum(group.count for group in self.features.groups)
@@ -77,6 +82,45 @@ class ObstacleFunctions:
         if ti.static(self.features.shape):
             for d in ti.static(range(3)):
                 adjoint.sums[row + d, i] = adjoint.sums[row + d, i] + by_X[d]
+
+    # ---- the force of a barrier on vertex i, whatever says where obstacles are; X: as `seen` has it ---------------------
+
+    @ti.func
+    def force(self, g: A, k, i, X, u, v, scene: A):
+        return self.on_area(g, i, g.force.force(scene.parameters, g.first + k * g.size, X, u, v), scene)
+
+    @ti.func
+    def force_jvp(self, g: A, k, i, X, u, v, moved, dv, scene: A, tangent: A):
+        """Its change; moved: that of the place as the obstacle sees it."""
+        first = g.first + k * g.size
+        df = g.force.force_jvp(scene.parameters, first, X, u, v, moved, dv)
+        by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
+        for m in ti.static(range(g.size)):
+            df += by[m] * tangent.parameters[first + m]
+        df = self.on_area(g, i, df, scene)
+        if ti.static(g.force.per_area):
+            df += tangent.surface[i] * g.force.force(scene.parameters, first, X, u, v)
+        return df
+
+    @ti.func
+    def force_vjp(self, g: A, k, i, X, u, v, w, scene: A, adjoint: A):
+        """(adjoints of the place as the obstacle sees it, of v) for the adjoint w; adds those of numbers and area."""
+        first = g.first + k * g.size
+        if ti.static(g.force.per_area and self.features.shape):
+            self.add_to_area(g, i, g.force.force(scene.parameters, first, X, u, v).dot(w), adjoint)
+        w = self.on_area(g, i, w, scene)
+        by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
+        for m in ti.static(range(g.size)):
+            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
+        by_place, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
+        return by_place, by_v
+
+    @ti.func
+    def add_to_numbers(self, g: A, k, i, by: A, adjoint: A):
+        """Add the adjoints of an obstacle's numbers."""
+        for m in ti.static(range(g.size)):
+            row = g.first + k * g.size + m
+            adjoint.sums[row, i] = adjoint.sums[row, i] + by[m]
 
     # ---- points within a face, whose nodes are the rows of a matrix, its corners the first three ------------------------
 
@@ -195,7 +239,7 @@ class ObstacleFunctions:
             seen, width = g.force.outlook(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
             s, dwidth = seen[3] / width, ti.cast(0, self.fp)
             if ti.static(what == "jvp"):
-                dwidth = more.parameters[first + g.force.count + 1]
+                dwidth = more.parameters[first + g.force.index.width]
             slope, ds = barrier.slope(s, self.fp), (t[3] - s * dwidth) / width
             of_distance = slope * t[3] + (barrier.value(s, self.fp) - s * slope) * dwidth
             t = barrier.curvature(s, self.fp) * ds * seen + slope * t
@@ -209,7 +253,7 @@ class ObstacleFunctions:
             x, y, w = self.row_of(X, a), self.row_of(u, a), self.row_of(by, a)
             if ti.static(g.force.hollow):
                 seen, width = g.force.outlook(scene.parameters, first, x, y), g.force.width(scene.parameters, first)
-                s, at_w = seen[3] / width, first + g.force.count + 1
+                s, at_w = seen[3] / width, first + g.force.index.width
                 slope, of_value = barrier.slope(s, self.fp), w[3]
                 by_s = barrier.curvature(s, self.fp) * self.dot3(seen, w) / width
                 more = (barrier.value(s, self.fp) - s * slope) * of_value - s * by_s

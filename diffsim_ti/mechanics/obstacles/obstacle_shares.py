@@ -32,13 +32,6 @@ class ObstacleShares(ObstaclePotential):
         return Kernel(name, body, self.precision, own, NUMBERS)
 
     @ti.func
-    def dragged(self, g: A, k, i, scene: A, pass_: A):
-        rubbed = False
-        if ti.static(g.force.friction):
-            rubbed = self.is_rubbed(g, k, i, scene, pass_)
-        return rubbed
-
-    @ti.func
     def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
@@ -46,9 +39,9 @@ class ObstacleShares(ObstaclePotential):
                 for k in range(g.count):
                     row, f, drag = 2 * (g.number + k), self.vector(0), self.vector(0)
                     if scene.surface[i] > 0:
-                        f = self.on_area(g, i, self.push(g, k, i, at.u[0, i], scene, pass_), scene)
+                        f = self.push(g, k, i, at.u[0, i], scene, pass_)
                         if ti.static(g.force.friction):
-                            if self.dragged(g, k, i, scene, pass_):
+                            if self.is_rubbed(g, k, i, scene, pass_):
                                 drag = self.drag(g, k, i, at.u[0, i], scene, pass_, plan)
                                 drag = self.on_rubbed_area(g, i, drag, scene)
                     out.force[row, i] = f
@@ -69,7 +62,7 @@ class ObstacleShares(ObstaclePotential):
                     if scene.surface[i] > 0:
                         f = self.push_jvp(g, k, i, u, du, scene, pass_, tangent)
                         if ti.static(g.force.friction):
-                            if self.dragged(g, k, i, scene, pass_):
+                            if self.is_rubbed(g, k, i, scene, pass_):
                                 drag = self.drag_jvp(g, k, i, u, du, scene, pass_, tangent, plan)
                     out.force[row, i] = f
                     out.force[row + 1, i] = drag
@@ -91,7 +84,7 @@ class ObstacleShares(ObstaclePotential):
                     if scene.surface[i] > 0:
                         y += self.push_vjp(g, k, i, at.u[0, i], at.seed[row, i], scene, pass_, adjoint)
                         if ti.static(g.force.friction):
-                            if self.dragged(g, k, i, scene, pass_):
+                            if self.is_rubbed(g, k, i, scene, pass_):
                                 y += self.drag_vjp(
                                     g, k, i, at.u[0, i], at.seed[row + 1, i], scene, pass_, adjoint, plan
                                 )

@@ -11,7 +11,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
 from diffsim_ti.runtime import assign, at, let, traced
-from diffsim_ti.state.walls import MORE
+from diffsim_ti.state.walls import AT_BEGIN, AT_STAGE, MORE, RATE, TAU
 from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -24,7 +24,7 @@ class ObstaclePotential(ObstacleFunctions):
     @ti.func
     def rest_now(self, g: A, k, i, scene: A, pass_: A):
         """Rest position of vertex i relative to an obstacle where forces are taken."""
-        return self.seen(g, scene.rest[i], self.place_of(g, k, 0, pass_))
+        return self.seen(g, scene.rest[i], self.place_of(g, k, AT_STAGE, pass_))
 
     @traced
     def turning_row(self, g, k):
@@ -33,8 +33,8 @@ class ObstaclePotential(ObstacleFunctions):
 
     @traced
     def place_of(self, g, k, m, pass_):
-        """Displacement of an obstacle, of one that turns with its unit quaternion, where forces are taken (m = 0) or the
-        pass begins (1)."""
+        """Displacement of an obstacle, of one that turns with its unit quaternion, where forces are taken (m = AT_STAGE) or
+        the pass begins (AT_BEGIN)."""
         shift = at(pass_.walls, 3 * (g.number + k) + m)
         if not g.force.turns:
             return shift
@@ -62,30 +62,7 @@ class ObstaclePotential(ObstacleFunctions):
         assign(at(adjoint.walls, row, i), at(adjoint.walls, row, i) + self.turned.long(by_theta))
         return by_u, by_t
 
-    # ---- the barrier -------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def energy(self, i, u, scene: A, pass_: A):
-        """Energy of the barriers [J]."""
-        value = ti.cast(0, self.fp)
-        for g in ti.static(self.features.groups):
-            for k in range(g.count):
-                X = self.rest_now(g, k, i, scene, pass_)
-                value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
-        return value
-
-    @ti.func
-    def product(self, i, u, w, scene: A, pass_: A):
-        """Change of the barriers' force for a change w of the displacement."""
-        f, zero = self.vector(0), self.vector(0)
-        for g in ti.static(self.features.groups):
-            for k in range(g.count):
-                X = self.rest_now(g, k, i, scene, pass_)
-                change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
-                f += self.on_area(g, i, change, scene)
-        return f
-
-    # ---- with friction -----------------------------------------------------------------------------------------------
+    # ---- friction ----------------------------------------------------------------------------------------------------
     # Of obstacles that reach into faces, points within them push as well: N and its direction are then the size and the
     # direction of `pass_.pressed`, all that an obstacle pushes a vertex with where the pass begins.
 
@@ -100,14 +77,14 @@ class ObstaclePotential(ObstacleFunctions):
     @ti.func
     def rest_before(self, g: A, k, i, scene: A, pass_: A):
         """Rest position of vertex i relative to an obstacle where the pass begins."""
-        return self.seen(g, scene.rest[i], self.place_of(g, k, 1, pass_))
+        return self.seen(g, scene.rest[i], self.place_of(g, k, AT_BEGIN, pass_))
 
     # The velocity of an obstacle that turns is that at the place where the pass begins, so that it is no function of u.
 
     @traced
     def wall(self, g, k, i, scene, pass_):
         """Velocity of an obstacle at a vertex."""
-        v = at(pass_.walls, 3 * (g.number + k) + 2)
+        v = at(pass_.walls, 3 * (g.number + k) + RATE)
         return self.turned_wall(g, k, i, v, scene, pass_) if g.force.turns else v
 
     @ti.func
@@ -118,25 +95,25 @@ class ObstaclePotential(ObstacleFunctions):
     @ti.func
     def spin(self, g: A, k, walls: A):
         """Angular velocity."""
-        return self.turned.short(walls[self.turning_row(g, k) + 2])
+        return self.turned.short(walls[self.turning_row(g, k) + RATE])
 
     @ti.func
     def turned_wall(self, g: A, k, i, v, scene: A, pass_: A):
-        tau, r = pass_.walls[self.turning_row(g, k) + 5][0], self.arm(g, k, i, scene, pass_)
+        tau, r = pass_.walls[self.turning_row(g, k) + TAU][0], self.arm(g, k, i, scene, pass_)
         return self.turned.wall(self.turned.short(v), self.spin(g, k, pass_.walls), tau, r)
 
     @traced
     def wall_jvp(self, g, k, i, scene, pass_, tangent):
         """Its change."""
-        dv = at(tangent.walls, 3 * (g.number + k) + 2)
+        dv = at(tangent.walls, 3 * (g.number + k) + RATE)
         return self.turned_wall_jvp(g, k, i, dv, scene, pass_, tangent) if g.force.turns else dv
 
     @ti.func
     def turned_wall_jvp(self, g: A, k, i, dv, scene: A, pass_: A, tangent: A):
         n, dr = 3 * (g.number + k), tangent.lag[0, i] + tangent.rest[i]
-        darm = self.turned.short(dr - tangent.walls[n + 1])
+        darm = self.turned.short(dr - tangent.walls[n + AT_BEGIN])
         darm += -1 * self.turned.about(g, g.first + k * g.size, tangent.parameters)
-        tau, r = pass_.walls[self.turning_row(g, k) + 5][0], self.arm(g, k, i, scene, pass_)
+        tau, r = pass_.walls[self.turning_row(g, k) + TAU][0], self.arm(g, k, i, scene, pass_)
         omega, domega = self.spin(g, k, pass_.walls), self.spin(g, k, tangent.walls)
         return self.turned.wall_jvp(self.turned.short(dv), omega, domega, tau, r, darm)
 
@@ -145,11 +122,11 @@ class ObstaclePotential(ObstacleFunctions):
         """(adjoints of the place where the pass begins, of the obstacle's displacement there), of the velocity's and of six
         numbers by_place; adds those of all else."""
         row, r = self.turning_row(g, k), self.arm(g, k, i, scene, pass_)
-        tau, omega = pass_.walls[row + 5][0], self.spin(g, k, pass_.walls)
+        tau, omega = pass_.walls[row + TAU][0], self.spin(g, k, pass_.walls)
         by_omega, by_arm = self.turned.wall_vjp(omega, tau, r, self.turned.short(by_wall))
-        adjoint.walls[row + 2, i] = adjoint.walls[row + 2, i] + self.turned.long(by_omega)
+        adjoint.walls[row + RATE, i] = adjoint.walls[row + RATE, i] + self.turned.long(by_omega)
         X = self.rest_before(g, k, i, scene, pass_)
-        by_u, by_t = self.spread(g, k, 1, i, X, pass_.lag[0, i], by_place, scene, adjoint, by_arm)
+        by_u, by_t = self.spread(g, k, AT_BEGIN, i, X, pass_.lag[0, i], by_place, scene, adjoint, by_arm)
         return by_u, by_t
 
     @ti.func
@@ -186,8 +163,7 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def push(self, g: A, k, i, u, scene: A, pass_: A):
-        X = self.rest_now(g, k, i, scene, pass_)
-        return g.force.force(scene.parameters, g.first + k * g.size, X, u, self.vector(0))
+        return self.force(g, k, i, self.rest_now(g, k, i, scene, pass_), u, self.vector(0), scene)
 
     @ti.func
     def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
@@ -201,33 +177,35 @@ class ObstaclePotential(ObstacleFunctions):
         dv = plan.per_gamma * w
         return g.force.rub_product(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, dv)
 
+    # ---- barrier and friction; `rough`: whether friction counts -------------------------------------------------------
+
     @ti.func
-    def whole_energy(self, i, u, scene: A, pass_: A, plan: A):
+    def total_energy(self, i, u, scene: A, pass_: A, plan: A, rough: A):
         """Energy of the barriers and the potential of friction [J]."""
         value = ti.cast(0, self.fp)
         for g in ti.static(self.features.groups):
             for k in range(g.count):
                 X = self.rest_now(g, k, i, scene, pass_)
                 value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
-                if ti.static(g.force.friction):
+                if ti.static(rough and g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
                         lost = self.lost(g, k, i, u, scene, pass_, plan)
                         value += self.on_rubbed_area(g, i, lost, scene) / plan.per_gamma
         return value
 
     @ti.func
-    def whole_force(self, i, u, scene: A, pass_: A, plan: A):
+    def total_force(self, i, u, scene: A, pass_: A, plan: A):
         f = self.vector(0)
         for g in ti.static(self.features.groups):
             for k in range(g.count):
-                f += self.on_area(g, i, self.push(g, k, i, u, scene, pass_), scene)
+                f += self.push(g, k, i, u, scene, pass_)
                 if ti.static(g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
                         f += self.on_rubbed_area(g, i, self.drag(g, k, i, u, scene, pass_, plan), scene)
         return f
 
     @ti.func
-    def whole_product(self, i, u, w, scene: A, pass_: A, plan: A):
+    def total_product(self, i, u, w, scene: A, pass_: A, plan: A, rough: A):
         """Change of the force for a change w of the displacement."""
         f, zero = self.vector(0), self.vector(0)
         for g in ti.static(self.features.groups):
@@ -235,7 +213,7 @@ class ObstaclePotential(ObstacleFunctions):
                 X = self.rest_now(g, k, i, scene, pass_)
                 change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
                 f += self.on_area(g, i, change, scene)
-                if ti.static(g.force.friction):
+                if ti.static(rough and g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
                         f += self.on_rubbed_area(g, i, self.drag_product(g, k, i, u, w, scene, pass_, plan), scene)
         return f
@@ -244,22 +222,15 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def push_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A):
-        first, zero, X = g.first + k * g.size, self.vector(0), self.rest_now(g, k, i, scene, pass_)
-        moved = self.moved(g, k, 0, X, u, du + tangent.rest[i], scene, tangent)
-        f = g.force.force_jvp(scene.parameters, first, X, u, zero, moved, zero)
-        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
-        for m in ti.static(range(g.size)):
-            f += by[m] * tangent.parameters[first + m]
-        f = self.on_area(g, i, f, scene)
-        if ti.static(g.force.per_area):
-            f += tangent.surface[i] * self.push(g, k, i, u, scene, pass_)
-        return f
+        zero, X = self.vector(0), self.rest_now(g, k, i, scene, pass_)
+        moved = self.moved(g, k, AT_STAGE, X, u, du + tangent.rest[i], scene, tangent)
+        return self.force_jvp(g, k, i, X, u, zero, moved, zero, scene, tangent)
 
     @ti.func
     def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
         first, dv = g.first + k * g.size, plan.per_gamma * (du - tangent.lag[1, i])
         v, wall = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_)
-        moved, dwall = (self.felt_jvp(g, k, i, scene, pass_, tangent), self.wall_jvp(g, k, i, scene, pass_, tangent))
+        moved, dwall = self.felt_jvp(g, k, i, scene, pass_, tangent), self.wall_jvp(g, k, i, scene, pass_, tangent)
         f = g.force.rub_jvp(
             scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, tangent.parameters, moved, dv, dwall
         )
@@ -274,7 +245,7 @@ class ObstaclePotential(ObstacleFunctions):
         if self.reaches(g):
             return at(tangent.pressed, g.number + k, i)
         X, u = self.rest_before(g, k, i, scene, pass_), at(pass_.lag, 0, i)
-        return self.moved(g, k, 1, X, u, at(tangent.lag, 0, i) + at(tangent.rest, i), scene, tangent)
+        return self.moved(g, k, AT_BEGIN, X, u, at(tangent.lag, 0, i) + at(tangent.rest, i), scene, tangent)
 
     @ti.func
     def add_jvp(self, i, f, u, du, scene: A, pass_: A, tangent: A, plan: A):
@@ -289,20 +260,13 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def push_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A):
-        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
-        if ti.static(g.force.per_area and self.features.shape):
-            self.add_to_area(g, i, self.push(g, k, i, u, scene, pass_).dot(w), adjoint)
-        w = self.on_area(g, i, w, scene)
-        X = self.rest_now(g, k, i, scene, pass_)
-        by_place, _ = g.force.force_vjp(scene.parameters, first, X, u, zero, w)
-        by_u, by_t = self.spread(g, k, 0, i, X, u, by_place, scene, adjoint)
-        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
-        for m in ti.static(range(g.size)):
-            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
+        n, zero, X = 3 * (g.number + k), self.vector(0), self.rest_now(g, k, i, scene, pass_)
+        by_place, _ = self.force_vjp(g, k, i, X, u, zero, w, scene, adjoint)
+        by_u, by_t = self.spread(g, k, AT_STAGE, i, X, u, by_place, scene, adjoint)
         self.add_to_rest(i, by_u, adjoint)
-        adjoint.walls[n, i] = by_t
-        adjoint.walls[n + 1, i] = zero
-        adjoint.walls[n + 2, i] = zero
+        adjoint.walls[n + AT_STAGE, i] = by_t
+        adjoint.walls[n + AT_BEGIN, i] = zero
+        adjoint.walls[n + RATE, i] = zero
         return by_u
 
     @ti.func
@@ -315,16 +279,15 @@ class ObstaclePotential(ObstacleFunctions):
         by_felt, by_v, by_wall, by = g.force.rub_vjp(
             scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, w
         )
-        for m in ti.static(range(g.size)):
-            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+        self.add_to_numbers(g, k, i, by, adjoint)
         if ti.static(self.reaches(g)):
             adjoint.pressed[g.number + k, i] = by_felt
         if ti.static(g.force.turns or not self.reaches(g)):
             by_u, by_t = self.felt_vjp(g, k, i, by_felt, by_wall, scene, pass_, adjoint)
             self.add_to_rest(i, by_u, adjoint)
             adjoint.lag[0, i] = adjoint.lag[0, i] + by_u
-            adjoint.walls[n + 1, i] = by_t
-        adjoint.walls[n + 2, i] = by_wall
+            adjoint.walls[n + AT_BEGIN, i] = by_t
+        adjoint.walls[n + RATE, i] = by_wall
         adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
         return plan.per_gamma * by_v
 

@@ -182,8 +182,7 @@ class SweptKernels(ObstacleFunctions):
     def rotation(self, g: A, k, t, way: A):
         """Unit quaternion of an obstacle that turns when the share t of the step is done."""
         n = self.place_of_turn(g, k)
-        start = turning.from_rodrigues(self.turned.short(way.places[n]), self.fp)
-        return turning.product(turning.quaternion(t * self.turned.short(way.drifts[n]), self.fp), start)
+        return turning.at_share(self.turned.short(way.places[n]), self.turned.short(way.drifts[n]), t, self.fp)
 
     @traced
     def place_of_turn(self, g, k):

@@ -51,7 +51,7 @@ class Turned:
     @traced
     def about(self, g, first, parameters):
         """The point c."""
-        start = first + g.force.size - 3
+        start = first + g.force.index.about
         return let(ti.types.vector(3, self.fp)(*(at(parameters, start + d) for d in range(3))))
 
     @traced
@@ -104,7 +104,7 @@ class Turned:
         by_theta = self.short(by, 3) - r.cross(by_place)
         by_c = turning.turned(q, -1, by_place, self.fp) - by_place - by_arm
         for d in ti.static(range(3)):
-            row = first + g.force.size - 3 + d
+            row = first + g.force.index.about + d
             sums[row, i] = sums[row, i] + by_c[d]
         by_u = by_place + by_arm
         return self.long(by_u), self.long(0 - by_u), by_theta

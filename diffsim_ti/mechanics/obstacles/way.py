@@ -109,7 +109,7 @@ class Way:
     @property
     def widths(self) -> list[float]:
         """How far each obstacle is felt [m]."""
-        return [float(self.a.values.parameters[first + twin.count + 1]) for twin, first, _ in self.a.obstacles]
+        return [float(self.a.values.parameters[first + twin.index.width]) for twin, first, _ in self.a.obstacles]
 
     @property
     def widest(self) -> float:

@@ -6,7 +6,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.reduced import body_motion as motion
 from diffsim_ti.mechanics.reduced.body_motion import VECTOR
-from diffsim_ti.mechanics.reduced.body_tangent import BodyTangent
+from diffsim_ti.mechanics.reduced.explicit import Bodies
 from diffsim_ti.runtime import let, traced
 from diffsim_ti.state.bodies import NUMBERS, PAIRS, SUMS
 
@@ -14,7 +14,7 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class BodyStage(BodyTangent):
+class BodyStage(Bodies):
     """Taichi functions of body b in pass j."""
 
     @ti.func

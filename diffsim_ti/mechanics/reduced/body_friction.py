@@ -122,8 +122,7 @@ class BodyFriction(ObstacleStages):
                     u_adj += by_u
                     v_adj += by_v
                     felt += own
-                    for m in ti.static(range(g.size)):
-                        adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+                    self.add_to_numbers(g, k, i, by, adjoint)
                     self.add_to_area(g, i, now.h * by_time, adjoint)
                     self.add_to_rest(i, by_u, adjoint)
         return u_adj, v_adj, felt

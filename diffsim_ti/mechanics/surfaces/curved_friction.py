@@ -182,7 +182,7 @@ class CurvedFriction:
         runtime.fill(self.dv, before)
         at = dict(du=self.unread, dv=self.dv, mass_dot=self.no_mass, parameters_dot=numbers.parameters)
         of_pass = self.inner.pass_numbers(plan)
-        self.inner.run(self.inner.derivatives.slide_jvp, self._state() | at, slot=0, keep=0, ratio_dot=0.0, **of_pass)
+        self.inner.run(self.inner.kernels.slide_jvp, self._state() | at, slot=0, keep=0, ratio_dot=0.0, **of_pass)
         pushed, gained = self.freed(self._impulses(self.dv, before)), kept[2]
         # what was gained is inverse * pushes
         per_inverse = np.divide(gained, self.inverse, out=np.zeros_like(gained), where=self.inverse > 0)
@@ -214,14 +214,14 @@ class CurvedFriction:
         runtime.fill(self.v, self._at_points(kept[1]))
         runtime.fill(self.dv, 0)
         at = self._state() | inner.adjoints | dict(v_adj=self.dv)
-        inner.run(inner.derivatives.pairs_vjp, at, slot=0, keep=0, **of_pass)
+        inner.run(inner.kernels.pairs_vjp, at, slot=0, keep=0, **of_pass)
         self.rows.put(adjoint.v, 0, q + self._of_points(self.dv))
         by_load = self._where_it_rubs(own.load_adj)
         by_inverse = (self.size.T @ by_load) * (self.size.T @ self.load) / self.lightness
         self.by_mass[:, 0] -= self.inverse[:, 0] ** 2 * by_inverse
         runtime.fill(own.load_adj, self._spread(by_load, self.inverse))
         at = dict(place=self.pairs.fine(history.u, slot), **{k: inner.adjoints[k] for k in ("by_place", "by_mu")})
-        inner.run(inner.derivatives.measure_vjp, at, slot=0, begin=0, num_rows=inner.num_rows)
+        inner.run(inner.kernels.measure_vjp, at, slot=0, begin=0, num_rows=inner.num_rows)
         self.by_place = self.C.T @ runtime.fetch(inner.adjoints["by_place"]).astype(np.float64)
 
     def add_place(self, adjoint) -> None:

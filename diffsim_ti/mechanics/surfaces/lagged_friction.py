@@ -5,6 +5,10 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
+from diffsim_ti.terms.obstacles.friction import ARRAYS, dissipated, slip
+from diffsim_ti.terms.self_contact import SelfContact
+
+TINY = 1e-300
 
 
 class LaggedFriction(PairFriction):
@@ -37,7 +41,7 @@ class LaggedFriction(PairFriction):
 
     @property
     def speed(self) -> float:
-        return float(self.a.values.parameters[self.pairs.first + 2])
+        return float(self.a.values.parameters[self.pairs.first + SelfContact.index.friction_speed])
 
     def _sliding(self, u: np.ndarray) -> tuple:
         """(velocities of the corners, their difference across the gap, t, |t|, t / |t|, f / |t|, df / d|t|)"""
@@ -45,9 +49,8 @@ class LaggedFriction(PairFriction):
         relative = np.einsum("pk,pkd->pd", self.w, v)
         t = self._across(relative)
         s = np.linalg.norm(t, axis=1)
-        y, safe = s / eps, np.maximum(s, 1e-300)
-        kappa, slope = np.where(y < 1, (2 - y) / eps, 1 / np.maximum(s, eps)), np.where(y < 1, 2 * (1 - y) / eps, 0.0)
-        return v, relative, t, s, t / safe[:, None], kappa, slope
+        kappa, _, _, slope = slip(s, 0, eps, TINY, ARRAYS)
+        return v, relative, t, s, t / np.maximum(s, TINY)[:, None], kappa, slope
 
     def _across(self, x: np.ndarray) -> np.ndarray:
         return x - self.n * _dot(self.n, x)
@@ -59,9 +62,7 @@ class LaggedFriction(PairFriction):
 
     def energies(self, u: np.ndarray) -> np.ndarray:
         """Of each pair [J]: what sliding so would dissipate."""
-        s, eps = self._sliding(u)[3], self.speed
-        y = np.minimum(s / eps, 1)
-        return self.L / self.per_gamma * np.where(s < eps, eps * y * y * (1 - y / 3), s - eps / 3)
+        return self.L / self.per_gamma * dissipated(self._sliding(u)[3], self.speed, ARRAYS)
 
     def _pulls(self, u: np.ndarray) -> np.ndarray:
         _, _, t, _, _, kappa, _ = self._sliding(u)
@@ -105,7 +106,7 @@ class LaggedFriction(PairFriction):
         self.changes(self.pairs.next, 0, self.pairs.step, numbers)
         d_pressing = whole(self.own.pressing_dot)[self.felt].astype(np.float64)
         dw, dn, dL = whole(self.own.weights_dot)[self.felt].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
-        d_speed = float(runtime.fetch(numbers.parameters)[self.pairs.first + 2])
+        d_speed = float(runtime.fetch(numbers.parameters)[self.pairs.first + SelfContact.index.friction_speed])
         v, relative, t, s, e, kappa, slope = self._sliding(u)
         dv = (self.per_gamma * (du - dx))[self.corners]
         d_relative = np.einsum("pk,pkd->pd", self.w, dv) + np.einsum("pk,pkd->pd", dw, v)

@@ -10,6 +10,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE, Pair
 from diffsim_ti.runtime import Kernel, traced
+from diffsim_ti.terms.self_contact import SelfContact
 
 A = ti.template()
 MARGIN = 1.001
@@ -66,17 +67,23 @@ class ListedPair(Pair):
         return Kernel(name, body, self.precision, dict(scene=SCENE | (scene or {}), at=at), NUMBERS | numbers)
 
     @ti.func
+    def of_term(self, parameters: A):
+        """(stiffness, width) of the term among all parameters."""
+        at_k, at_w = self.first + SelfContact.index.stiffness, self.first + SelfContact.index.width
+        return parameters[at_k], parameters[at_w]
+
+    @ti.func
     def own_share(self, p, scene: A):
         """What pair p has of the scene's width: all, but no more than half of its distance at rest."""
-        return ti.min(
-            ti.cast(1, self.fp), ti.cast(0.5, self.fp) * scene.rest_plane[p][3] / scene.parameters[self.first + 1]
-        )
+        _, W = self.of_term(scene.parameters)
+        return ti.min(ti.cast(1, self.fp), ti.cast(0.5, self.fp) * scene.rest_plane[p][3] / W)
 
     @ti.func
     def numbers(self, p, scene: A):
         """Stiffness and width of pair p (docstring of SelfContact)."""
         share = self.own_share(p, scene)
-        return scene.parameters[self.first] / share, share * scene.parameters[self.first + 1]
+        k, W = self.of_term(scene.parameters)
+        return k / share, share * W
 
     @ti.func
     def width(self, p, scene: A):
@@ -87,7 +94,7 @@ class ListedPair(Pair):
     def numbers_jvp(self, p, scene: A, d_stiffness, d_width, d_rest):
         """Changes of stiffness and width of pair p for those of the scene's and of the pair's distance at rest."""
         share, d_share = self.own_share(p, scene), ti.cast(0, self.fp)
-        k, W = scene.parameters[self.first], scene.parameters[self.first + 1]
+        k, W = self.of_term(scene.parameters)
         if share < 1:
             d_share = (ti.cast(0.5, self.fp) * d_rest - share * d_width) / W
         return (d_stiffness - k / share * d_share) / share, share * d_width + W * d_share
@@ -96,7 +103,7 @@ class ListedPair(Pair):
     def numbers_vjp(self, p, scene: A, by_stiffness, by_width):
         """Adjoints of the scene's stiffness and width and of the pair's distance at rest."""
         share, by_share = self.own_share(p, scene), ti.cast(0, self.fp)
-        k, W = scene.parameters[self.first], scene.parameters[self.first + 1]
+        k, W = self.of_term(scene.parameters)
         if share < 1:
             by_share = W * by_width - k / (share * share) * by_stiffness
         return by_stiffness / share, share * (by_width - by_share / W), ti.cast(0.5, self.fp) * by_share / W

@@ -8,7 +8,6 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
-from diffsim_ti.mechanics.surfaces.friction_derivatives import FrictionDerivatives
 from diffsim_ti.mechanics.surfaces.friction_kernels import FrictionKernels
 from diffsim_ti.runtime import kernels_of
 
@@ -27,8 +26,7 @@ class PairFriction:
         self.a, self.num_surface = a, len(a.mesh.surface_vertices)
         labels, rows = pairs.term.labels(a.mesh)
         self.num_rows, guided = int(rows.max()) + 1, bool(len(a.supports.guided))
-        key = a.precision, pairs.first, pairs.parallel, guided, len(rows)
-        self.kernels, self.derivatives = kernels_of(FrictionKernels, *key), kernels_of(FrictionDerivatives, *key)
+        self.kernels = kernels_of(FrictionKernels, a.precision, pairs.first, pairs.parallel, guided, len(rows))
         n = self.num_surface
         self.own = SimpleNamespace(
             any=runtime.array(ti.i32, 1), rubs=runtime.array(ti.i32, n), load=runtime.array(a.fp, n)
@@ -108,13 +106,13 @@ class PairFriction:
         if not hasattr(self.own, "load_dot"):
             self.own.load_dot = runtime.array(self.a.fp, self.num_surface)
         at = dict(u=u, w=u_dot, rest_dot=numbers.rest, parameters_dot=numbers.parameters)
-        self.run(self.derivatives.measure_jvp, at, slot=slot)
+        self.run(self.kernels.measure_jvp, at, slot=slot)
 
     def slide_jvp(self, history, slot: int, plan, rate_dot: float, u_dot, v_dot, numbers) -> None:
         """Adds to the changes of the state that the pass to a slot led to, without friction there (`alone`)."""
         at = dict(du=u_dot, dv=v_dot, mass_dot=numbers.mass, parameters_dot=numbers.parameters)
         own = dict(ratio_dot=rate_dot * ratio_by_rate(plan), **self.pass_numbers(plan))
-        self.run(self.derivatives.slide_jvp, self._state(history) | at, slot=slot, keep=slot, **own)
+        self.run(self.kernels.slide_jvp, self._state(history) | at, slot=slot, keep=slot, **own)
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
@@ -142,7 +140,7 @@ class PairFriction:
         at |= dict(corner_adj=adjoint.corner, rate_corner=adjoint.rate_corner)
         own = dict(begin=slot, rates=int(adjoint.rate_corner.shape[0] > 1))
         own |= dict(num_rows=self.num_rows, ratio_by_rate=ratio_by_rate(plan))
-        self.run(self.derivatives.slide_vjp, at, slot=slot + 1, keep=slot + 1, **own, **self.pass_numbers(plan))
+        self.run(self.kernels.slide_vjp, at, slot=slot + 1, keep=slot + 1, **own, **self.pass_numbers(plan))
 
     def _pull_back(self, u, slot: int, felt: np.ndarray, w_adj: np.ndarray, pressing_adj: np.ndarray) -> np.ndarray:
         """Adjoint of u[slot] at surface vertices for those of the weights and of (n, mu N) of some pairs; adds those of the
@@ -155,7 +153,7 @@ class PairFriction:
             runtime.fill(array, every)
         runtime.fill(self.own.load_adj, 0)
         at = dict(place=u, by_place=self.adjoints["by_place"], by_mu=self.adjoints["by_mu"])
-        self.run(self.derivatives.measure_vjp, at, slot=slot, begin=slot, num_rows=self.num_rows)
+        self.run(self.kernels.measure_vjp, at, slot=slot, begin=slot, num_rows=self.num_rows)
         return runtime.fetch(self.adjoints["by_place"])
 
     def add_place(self, adjoint) -> None:

@@ -67,7 +67,7 @@ class Pair:
 
     @ti.func
     def nearest_on_triangle(self, y1, y2, y3):
-        """(t_1, t_2, G_11, G_12, G_22) of the origin and the triangle y1 + t_1 (y2 - y1) + t_2 (y3 - y1)."""
+        """(t_1, t_2, (G_11, G_12, G_22)) of the origin and the triangle y1 + t_1 (y2 - y1) + t_2 (y3 - y1)."""
         zero, one = ti.cast(0, self.fp), ti.cast(1, self.fp)
         e1, e2, q = y2 - y1, y3 - y1, 0 * y1 - y1
         a11, a12, a22, normal = e1.norm_sqr(), e1.dot(e2), e2.norm_sqr(), e1.cross(e2)
@@ -86,11 +86,11 @@ class Pair:
                 s, t, g, d1 = zero, t2, self.vec3(zero, zero, free2), d2
             if d3 < d1:
                 s, t, g = one - t3, t3, self.vec3(free3, 0 - free3, free3)
-        return s, t, g[0], g[1], g[2]
+        return s, t, g
 
     @ti.func
     def nearest_of_edges(self, y1, y2, y3):
-        """(t_1, t_2, G_11, G_12, G_22) of the edges t_1 y1 and y2 + t_2 (y3 - y2)."""
+        """(t_1, t_2, (G_11, G_12, G_22)) of the edges t_1 y1 and y2 + t_2 (y3 - y2)."""
         zero, one = ti.cast(0, self.fp), ti.cast(1, self.fp)
         a, b = y1, y3 - y2
         aa, ab, bb, normal = a.norm_sqr(), a.dot(b), b.norm_sqr(), a.cross(b)
@@ -114,26 +114,19 @@ class Pair:
             d = (s1 * a - y3).norm_sqr()
             if d < best:
                 s, t, g = s1, one, self.vec3(free3, zero, zero)
-        return s, t, g[0], g[1], g[2]
+        return s, t, g
 
     @ti.func
     def nearest(self, kind: A, y1, y2, y3):
         """Weights w of the corners, r, and G, as (w, r, (G_11, G_12, G_22))."""
-        one, w = ti.cast(1, self.fp), self.vec4(0)
-        s, t, g11, g12, g22 = (
-            ti.cast(0, self.fp),
-            ti.cast(0, self.fp),
-            ti.cast(0, self.fp),
-            ti.cast(0, self.fp),
-            ti.cast(0, self.fp),
-        )
+        one, w, s, t, g = ti.cast(1, self.fp), self.vec4(0), ti.cast(0, self.fp), ti.cast(0, self.fp), self.vec3(0)
         if ti.static(kind == VERTEX_TRIANGLE):
-            s, t, g11, g12, g22 = self.nearest_on_triangle(y1, y2, y3)
+            s, t, g = self.nearest_on_triangle(y1, y2, y3)
             w = self.vec4(one, s + t - one, 0 - s, 0 - t)
         else:
-            s, t, g11, g12, g22 = self.nearest_of_edges(y1, y2, y3)
+            s, t, g = self.nearest_of_edges(y1, y2, y3)
             w = self.vec4(one - s, s, t - one, 0 - t)
-        return w, w[1] * y1 + w[2] * y2 + w[3] * y3, self.vec3(g11, g12, g22)
+        return w, w[1] * y1 + w[2] * y2 + w[3] * y3, g
 
     @ti.func
     def clamp(self, t):
@@ -216,11 +209,8 @@ class Pair:
         energy, g1, g2, g3 = ti.cast(0, self.fp), self.vec3(0), self.vec3(0), self.vec3(0)
         if d < width:
             s = d / width
-            phi, slope = (
-                stiffness * width * width * barrier.value(s, self.fp),
-                stiffness * width * barrier.slope(s, self.fp),
-            )
-            m = ti.cast(1, self.fp)
+            phi = stiffness * width * width * barrier.value(s, self.fp)
+            slope, m = stiffness * width * barrier.slope(s, self.fp), ti.cast(1, self.fp)
             if ti.static(kind == EDGE_EDGE):
                 a, b = y1, y3 - y2
                 x = scale * a.cross(b)
@@ -238,13 +228,8 @@ class Pair:
         corners, stiffness and width; and the products of dy with the gradient's derivatives by stiffness and width."""
         w, r, g = self.nearest(kind, y1, y2, y3)
         d = ti.sqrt(r.norm_sqr())
-        h1, h2, h3, by_stiffness, by_width = (
-            self.vec3(0),
-            self.vec3(0),
-            self.vec3(0),
-            ti.cast(0, self.fp),
-            ti.cast(0, self.fp),
-        )
+        h1, h2, h3 = self.vec3(0), self.vec3(0), self.vec3(0)
+        by_stiffness, by_width = ti.cast(0, self.fp), ti.cast(0, self.fp)
         if d < width:
             inverse = ti.cast(1, self.fp) / ti.max(d, ti.cast(self.tiny, self.fp))
             n, s = inverse * r, d / width

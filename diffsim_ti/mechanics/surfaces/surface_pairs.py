@@ -14,7 +14,8 @@ from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
-from diffsim_ti.terms.obstacles.barrier import CROSSOVER, beta
+from diffsim_ti.terms.obstacles.barrier import beta, curvature_at
+from diffsim_ti.terms.self_contact import SelfContact
 
 HELD = 4  # vertices that a pair is to stop, with what is behind it
 
@@ -80,7 +81,11 @@ class SurfacePairs:
 
     @property
     def width(self) -> float:
-        return float(self.a.values.parameters[self.first + 1])
+        return float(self.a.values.parameters[self.first + SelfContact.index.width])
+
+    @property
+    def stiffness(self) -> float:
+        return float(self.a.values.parameters[self.first + SelfContact.index.stiffness])
 
     def load(self, u) -> None:
         """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""
@@ -261,21 +266,19 @@ class SurfacePairs:
         start = float(np.linalg.norm(start - start.mean(0), axis=1).max(initial=0))
         own = frames if fastest * h > 1 and len(frames) > 1 else v
         speed = max(2 * start, 2 * float(np.linalg.norm(own - own.mean(0), axis=1).max(initial=0)), 1e-300)
-        k, w, energy = float(self.a.values.parameters[self.first]), self.width, 0.5 * HELD * mass * speed**2
+        k, w, energy = self.stiffness, self.width, 0.5 * HELD * mass * speed**2
         shares = np.geomspace(0.02, 1, 400)
         s, stiffness = float(np.interp(-energy / (k * w * w), -beta(shares), shares)), None
         if energy > k * w * w * beta(0.02):
             s, stiffness = 0.1, energy / float(w * w * beta(0.1))
-        t = 1 - 1 / s
-        omega = np.sqrt((stiffness or k) * light * (t * t - 4 * t + 2 * np.log1p(-t)))
+        omega = np.sqrt((stiffness or k) * light * curvature_at(s))
         return stiffness, float(min(0.5 / max(omega, 1e-300), 0.1 * w / speed, 0.5 * h))
 
     def _fastest(self, gaps: np.ndarray, pairs: np.ndarray) -> float:
         """A frequency [rad/s] of pairs that press, of the lightest vertex against the stiffest pair."""
         at_rest = whole(self.rest_plane)[: self.list.count, 3].astype(np.float64)
         share = np.minimum(1, at_rest / (2 * self.width))  # listed_pair.py
-        t = 1 - 1 / np.clip(gaps / (share * self.width), CROSSOVER, 1)  # beta'' = t^2 - 4 t - 2 log s, s = 1 / (1 - t)
-        stiffness = self.a.values.parameters[self.first] / share * (t * t - 4 * t + 2 * np.log1p(-t))
+        stiffness = self.stiffness / share * curvature_at(gaps / (share * self.width))
         lightness = runtime.fetch(self.a.inverse_mass).astype(np.float64)[pairs].max(1)
         return float(np.sqrt((stiffness * lightness).max(initial=0)))
 

@@ -8,6 +8,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.stage import Passes
+from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.mechanics.workspace import FrameArrays
 from diffsim_ti.solvers.explicit.stages import with_buffers
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint
@@ -33,6 +34,7 @@ class ExplicitAdjoint:
         self._arrays = {name: runtime.array(a.vector, *shape) for name, shape in self._made.items()}
         if a.law.state_names:
             self._arrays["z"] = a.law_states(1)
+        self.law_frames = LawFrames(workspace) if workspace.law_frames else None
         self._of_bodies = a.bodies.adjoint() if a.bodies else {}
         self._arrays |= self._of_bodies
         vars(self).update(self._arrays)
@@ -103,6 +105,8 @@ class ExplicitAdjoint:
         """
         most = self.ws.most_passes(2 * self.ws.arrays.num_tetrahedra)  # a pass costs twice as much as forward
         launches = self.ws.launches(stop, last, num_passes, save_every, most, backwards=True)
+        if self.law_frames:
+            launches = self.law_frames.added_after(launches, self.z)
         self._run(launches, base, num_passes, save_every, halt=stop if to_state else -1)
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:

@@ -293,7 +293,7 @@ class ExplicitWorkspace(Workspace):
         run = num_passes, num_rows, save_every, self.rate, schedule
         turn, sizes = -1 if backwards else 1, self.kept("sizes", self._sizes)
         sizes = sizes | dict(contact_damping=solver.contact_damping)
-        for window, begin, end in self.table.windows(first, last)[::turn]:
+        for window, begin, end in self._windows(first, last, save_every)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
             number = -(-(end - begin) // most)
             chunk = -(-(end - begin) // number)  # launches of one size
@@ -301,11 +301,24 @@ class ExplicitWorkspace(Workspace):
             for start, stop in list(zip(stops, stops[1:]))[::turn]:
                 counted = int(schedule.counted(start, save_every)) if save_every else -1
                 own = dict(counted=counted, window=window, first=start, count=stop - start, times=chunk)
+                own["shown"] = int(schedule.shown(start, save_every)) if self.law_frames else -1
                 yield sizes | own
+
+    def _windows(self, first: int, last: int, save_every: int) -> list[tuple[int, int, int]]:
+        """(window, first pass, last pass) of what launches lie in: where frames note what the law remembers, each pass that
+        shows one begins a launch."""
+        edges = [first, last]
+        if self.law_frames and save_every:
+            later = np.arange(first + 1, last)
+            edges[1:1] = later[self.solver.schedule.shown(later, save_every) >= 0].tolist()
+        return [part for stretch in zip(edges, edges[1:]) for part in self.table.windows(*stretch)]
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
         recording = base is not None
         history, most = self.record if recording else self.state, self.most_passes(self.arrays.num_tetrahedra)
         at = Passes(self, self, history, base or 0, int(recording), num_passes, save_every)
-        at.go("do", self.stages, self.launches(first, last, num_passes, save_every, most))
+        launches = self.launches(first, last, num_passes, save_every, most)
+        if self.law_frames:
+            launches = self.law_frames.noted_before(launches, history.z, at.base, at.stride)
+        at.go("do", self.stages, launches)

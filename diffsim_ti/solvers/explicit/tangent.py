@@ -8,6 +8,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.stage import Passes
+from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.mechanics.workspace import FrameArrays
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.explicit.stages import with_buffers
@@ -25,6 +26,7 @@ class ExplicitTangent:
         self.v = runtime.upload(tangent.velocity[None], a.vector)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
+        self.law_frames = LawFrames(workspace) if workspace.law_frames else None
         self.impulses = ImpulseRecord(workspace) if workspace.impulses else None
         if a.bodies:
             vars(self).update(a.bodies.tangent(tangent))
@@ -37,6 +39,8 @@ class ExplicitTangent:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
         ws = self.ws
         launches = ws.launches(first, last, num_passes, save_every, ws.most_passes(2 * ws.arrays.num_tetrahedra))
+        if self.law_frames:
+            launches = self.law_frames.noted_before(launches, self.z)
         Passes(ws, self, ws.record, first, 1, num_passes, save_every).go("tangent", self.stages, launches)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
@@ -47,6 +51,8 @@ class ExplicitTangent:
         """Copy the current tangent to a frame."""
         copy_slot(self.u, 0, self.frames.frames_u, frame)
         copy_slot(self.v, 0, self.frames.frames_v, frame)
+        if self.law_frames:
+            self.law_frames.note(frame, self.z)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities, float64."""

@@ -16,6 +16,7 @@ from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, SharesA
 from diffsim_ti.mechanics.obstacles.face_kernels import face_kernels
 from diffsim_ti.mechanics.obstacles.face_lattice import nodes_of_faces, rest_of_areas
 from diffsim_ti.mechanics.obstacles.pressed import PressedAdjoint
+from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.numbers import Adjoint
@@ -45,6 +46,7 @@ class ImplicitAdjoint(RecordedPasses):
             corner, y = runtime.array(a.vector, *a.corner.shape), runtime.array(a.vector, 1, n)
             runtime.fill(corner, 0)  # also where surfaces in contact have theirs
             self._law = SimpleNamespace(z=self.z, corner=corner, y=y)
+        self.law_frames = LawFrames(workspace) if workspace.law_frames else None
         self.held = a.held_numbers()  # in a pass, by the law
         self._vjp = self.kernels.vjp.bind(a.in_vectors, **own)
         if p.faces:
@@ -110,6 +112,8 @@ class ImplicitAdjoint(RecordedPasses):
             if 0 <= frame < len(self.frames[0]) - 1:
                 self.p += self.frames[0][frame]
                 self.q += self.frames[1][frame]
+                if self.law_frames:
+                    self.law_frames.add_to(self.z, frame)
 
     def _pull_back_growth(self, j: int) -> None:
         """What tetrahedra felt of growth in pass j goes to its step."""

@@ -10,6 +10,7 @@ from diffsim_ti.mechanics.chambers.record import ChamberRecord
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.mechanics.obstacles.pressed import PressedTangent
+from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.numbers import Tangent
@@ -32,6 +33,7 @@ class ImplicitTangent(RecordedPasses):
         if self.z is not None:
             runtime.fill(self.z, 0)
             self._law = SimpleNamespace(z=self.z, w=p.w)
+        self.law_frames = LawFrames(workspace) if workspace.law_frames else None
         self.held = a.held_numbers()
         self._jvp = kernels.jvp.bind(a.in_vectors, **own)
         if p.faces:
@@ -138,6 +140,8 @@ class ImplicitTangent(RecordedPasses):
         """Copy the current tangent to a frame."""
         for saved, now in zip(self.frames, (self.du, self.dv)):
             saved.append(now.copy())
+        if self.law_frames:
+            self.law_frames.note(frame, self.z)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities."""

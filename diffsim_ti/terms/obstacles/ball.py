@@ -36,10 +36,11 @@ class SphereForce(ObstacleForce):
 
     @traced
     def distance_and_normal(self, g, p, X, u):
-        length, n = radial(g, [(x - c) + y for x, c, y in zip(X, p, u)])
+        *center, radius = p
+        length, n = radial(g, [(x - c) + y for x, c, y in zip(X, center, u)])
         if self.inside:
-            return p[3] - length, [g.number(0) - k for k in n]
-        return length - p[3], n
+            return radius - length, [g.number(0) - k for k in n]
+        return length - radius, n
 
 
 class Sphere(Obstacle):
@@ -84,11 +85,12 @@ class CapsuleForce(ObstacleForce):
 
     @traced
     def distance_and_normal(self, g, p, X, u):
-        r = [(x - c) + y for x, c, y in zip(X, p[:3], u)]
-        axis = [b - a for a, b in zip(p[:3], p[3:6])]
+        start, end, radius = p[:3], p[3:6], p[6]
+        r = [(x - c) + y for x, c, y in zip(X, start, u)]
+        axis = [b - a for a, b in zip(start, end)]
         share = g.minimum(g.maximum(g.dot(r, axis) / g.dot(axis, axis), 0), 1)
         length, n = radial(g, [x - share * a for x, a in zip(r, axis)])
-        return length - p[6], n
+        return length - radius, n
 
 
 class Capsule(Obstacle):

@@ -12,10 +12,29 @@ import math
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.runtime import traced
+
 CROSSOVER = 1e-3
-_VALUE = -((CROSSOVER - 1) ** 2) * math.log(CROSSOVER)
-_SLOPE = -2 * (CROSSOVER - 1) * math.log(CROSSOVER) - (CROSSOVER - 1) ** 2 / CROSSOVER
-_CURVATURE = -2 * math.log(CROSSOVER) - 4 * (CROSSOVER - 1) / CROSSOVER + ((CROSSOVER - 1) / CROSSOVER) ** 2
+
+# beta and its derivatives between the crossover and 1, for numbers of kernels, of the host and arrays; log: log s
+
+
+@traced
+def value_within(s, log):
+    return -(s - 1) * (s - 1) * log
+
+
+@traced
+def slope_within(s, log):
+    return -(s - 1) * (2 * log + (s - 1) / s)
+
+
+@traced
+def curvature_within(s, log):
+    return -2 * log - 4 * (s - 1) / s + (s - 1) * (s - 1) / (s * s)
+
+
+VALUE, SLOPE, CURVATURE = (f(CROSSOVER, math.log(CROSSOVER)) for f in (value_within, slope_within, curvature_within))
 
 
 @ti.func
@@ -24,9 +43,9 @@ def value(s, fp: ti.template()):
     b = 0 * s
     if s < ti.cast(CROSSOVER, fp):
         t = s - ti.cast(CROSSOVER, fp)
-        b = ti.cast(_VALUE, fp) + t * (ti.cast(_SLOPE, fp) + t * ti.cast(_CURVATURE / 2, fp))
+        b = ti.cast(VALUE, fp) + t * (ti.cast(SLOPE, fp) + t * ti.cast(CURVATURE / 2, fp))
     elif s < 1:
-        b = -(s - 1) * (s - 1) * ti.log(s)
+        b = value_within(s, ti.log(s))
     return b
 
 
@@ -35,9 +54,9 @@ def slope(s, fp: ti.template()):
     """beta'(s)"""
     b = 0 * s
     if s < ti.cast(CROSSOVER, fp):
-        b = ti.cast(_SLOPE, fp) + (s - ti.cast(CROSSOVER, fp)) * ti.cast(_CURVATURE, fp)
+        b = ti.cast(SLOPE, fp) + (s - ti.cast(CROSSOVER, fp)) * ti.cast(CURVATURE, fp)
     elif s < 1:
-        b = -(s - 1) * (2 * ti.log(s) + (s - 1) / s)
+        b = slope_within(s, ti.log(s))
     return b
 
 
@@ -46,9 +65,9 @@ def curvature(s, fp: ti.template()):
     """beta''(s)"""
     b = 0 * s
     if s < ti.cast(CROSSOVER, fp):
-        b = ti.cast(_CURVATURE, fp)
+        b = ti.cast(CURVATURE, fp)
     elif s < 1:
-        b = -2 * ti.log(s) - 4 * (s - 1) / s + (s - 1) * (s - 1) / (s * s)
+        b = curvature_within(s, ti.log(s))
     return b
 
 
@@ -59,8 +78,8 @@ def slope_and_curvature(s, fp: ti.template()):
     if s < ti.cast(CROSSOVER, fp):
         b, c = slope(s, fp), curvature(s, fp)
     elif s < 1:
-        log, share = ti.log(s), (s - 1) / s
-        b, c = -(s - 1) * (2 * log + share), -2 * log - 4 * (s - 1) / s + (s - 1) * (s - 1) / (s * s)
+        log = ti.log(s)
+        b, c = slope_within(s, log), curvature_within(s, log)
     return b, c
 
 
@@ -73,21 +92,29 @@ def third(s, fp: ti.template()):
     return b
 
 
-def beta(s) -> np.ndarray:
-    """beta(s) on the host, for numbers or arrays, in float64."""
+# on the host, for numbers or arrays, in float64
+
+
+def _joined(s, below, inside):
+    """`below` of s less the crossover where that is negative, else `inside`, which is zero from s = 1 on."""
     s = np.asarray(s, np.float64)
-    t, inside = s - CROSSOVER, np.clip(s, CROSSOVER, 1)
-    return np.where(s < CROSSOVER, _VALUE + t * (_SLOPE + t * _CURVATURE / 2), -((inside - 1) ** 2) * np.log(inside))
+    clipped = np.clip(s, CROSSOVER, 1)
+    return np.where(s < CROSSOVER, below(s - CROSSOVER), inside(clipped, np.log(clipped)))
 
 
-def slope_at(s: float) -> float:
-    """beta'(s) on the host, for s < 1."""
-    if s < CROSSOVER:
-        return _SLOPE + (s - CROSSOVER) * _CURVATURE
-    return -(s - 1) * (2 * math.log(s) + (s - 1) / s)
+def beta(s) -> np.ndarray:
+    """beta(s)"""
+    return _joined(s, lambda t: VALUE + t * (SLOPE + t * CURVATURE / 2), value_within)
 
 
-def reference_curvature() -> float:
-    """beta'' at a tenth of the width: the stiffness to expect of a firm contact, in units of the barrier's stiffness."""
-    s = 0.1
-    return -2 * math.log(s) - 4 * (s - 1) / s + ((s - 1) / s) ** 2
+def slope_at(s) -> np.ndarray:
+    """beta'(s)"""
+    return _joined(s, lambda t: SLOPE + t * CURVATURE, slope_within)
+
+
+def curvature_at(s) -> np.ndarray:
+    """beta''(s)"""
+    return _joined(s, lambda t: CURVATURE + 0 * t, curvature_within)
+
+
+REFERENCE_CURVATURE = float(curvature_at(0.1))  # the stiffness to expect of a firm contact, per that of the barrier

@@ -44,11 +44,12 @@ class BoxForce(ObstacleForce):
 
     @traced
     def distance_and_normal(self, g, p, X, u):
-        r = [(x - c) + y for x, c, y in zip(X, p[:3], u)]
-        R = rotation(g, p[6:10])
+        center, size, quaternion = p[:3], p[3:6], p[6:]
+        r = [(x - c) + y for x, c, y in zip(X, center, u)]
+        R = rotation(g, quaternion)
         y = [g.dot([R[d][k] for d in range(3)], r) for k in range(3)]
         signs = [ti.select(k.value < 0, ti.cast(-1, g.fp), ti.cast(1, g.fp)) for k in y]
-        d, by = corner(g, [k * s - half * 0.5 for k, s, half in zip(y, map(g.leaf, signs), p[3:6])])
+        d, by = corner(g, [k * s - half * 0.5 for k, s, half in zip(y, map(g.leaf, signs), size)])
         local = [k * s for k, s in zip(by, map(g.leaf, signs))]
         return d, [g.dot(R[d], local) for d in range(3)]
 
@@ -114,15 +115,16 @@ class CylinderForce(ObstacleForce):
 
     @traced
     def distance_and_normal(self, g, p, X, u):
-        axis = [b - a for a, b in zip(p[:3], p[3:6])]
+        start, end, radius = p[:3], p[3:6], p[6]
+        axis = [b - a for a, b in zip(start, end)]
         length = g.sqrt(g.dot(axis, axis))
         along = [a / length for a in axis]
-        r = [(x - c) + y for x, c, y in zip(X, p[:3], u)]
+        r = [(x - c) + y for x, c, y in zip(X, start, u)]
         height = g.dot(r, along)
         across, out = radial(g, [x - height * a for x, a in zip(r, along)])
         middle = height - length * 0.5
         sign = g.leaf(ti.select(middle.value < 0, ti.cast(-1, g.fp), ti.cast(1, g.fp)))
-        d, (by_radius, by_height) = corner(g, [across - p[6], middle * sign - length * 0.5])
+        d, (by_radius, by_height) = corner(g, [across - radius, middle * sign - length * 0.5])
         return d, [by_radius * a + by_height * sign * b for a, b in zip(out, along)]
 
 

@@ -11,13 +11,28 @@ quadratic equation for s < eps, and s = s* - c beyond, Coulomb's law exactly. So
 adds energy, and holds what Coulomb's law holds, but for a creep slower than eps = friction_speed.
 """
 
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti.runtime import traced
+
+ARRAYS = SimpleNamespace(sqrt=np.sqrt, minimum=np.minimum, maximum=np.maximum, select=np.where)
+
+
+@traced
+def _both_and_square(speed, c, eps):
+    """(a, b) with s / s* = 2 eps / (a + sqrt b) where a vertex sticks, s* = speed < eps + c."""
+    both = eps + c * 2
+    return both, both * both - c * speed * 4
+
 
 def keeps(g, speed, c, eps):
     """s / s*, the share of the speed s* that is left; C1 in everything."""
     sticks = speed.value < eps.value + c.value
-    inside = g.minimum(speed, eps + c)  # where the root is real
-    both = eps + c * 2
-    stuck = eps * 2 / (both + g.sqrt(both * both - c * inside * 4))
+    both, square = _both_and_square(g.minimum(speed, eps + c), c, eps)  # where the root is real
+    stuck = eps * 2 / (both + g.sqrt(square))
     outside = g.maximum(speed, eps + c)
     sliding = g.number(1) - c / outside
     return g.select(sticks, stuck, sliding)
@@ -27,10 +42,33 @@ def lost_per(g, speed, c, eps):
     """(1 - keeps) / c, with all its digits where c is small; tends to f(s / eps) / s."""
     sticks = speed.value < eps.value + c.value
     inside = g.minimum(speed, eps + c)
-    both = eps + c * 2
-    root = g.sqrt(both * both - c * inside * 4)
+    both, square = _both_and_square(inside, c, eps)
+    root = g.sqrt(square)
     stuck = (2 + 4 * (c + eps - inside) / (root + eps)) / (both + root)
     return g.select(sticks, stuck, 1 / g.maximum(speed, eps + c))
+
+
+def slip(speed, c, eps, tiny, m: ti.template()):
+    """(f / s*, f, y, B) at y = s / eps for the speed s*; df = B (ds* - f dc - y d eps). c = 0: where s* is s.
+
+    For NumPy's arrays, and as `slip_in_kernels` for numbers of kernels; m: ARRAYS, KERNELS.
+    """
+    sticks = speed < eps + c
+    both, square = _both_and_square(m.minimum(speed, eps + c), c, eps)
+    keep = eps * 2 / (both + m.sqrt(m.maximum(square, 0)))
+    y = m.select(sticks, keep * speed / eps, 1)
+    kappa = m.select(sticks, keep / eps * (2 - y), 1 / m.maximum(speed, tiny))
+    return kappa, y * (2 - y), y, 2 * (1 - y) / (eps + 2 * c * (1 - y))
+
+
+KERNELS = SimpleNamespace(sqrt=ti.sqrt, minimum=ti.min, maximum=ti.max, select=ti.select)
+slip_in_kernels = ti.func(slip)
+
+
+def dissipated(speed, eps, m):
+    """Integral of f(s / eps) over s, eps (y^2 - y^3 / 3) for y = s / eps < 1, s - eps / 3 beyond; m: ARRAYS or a graph."""
+    low = m.minimum(speed, eps)
+    return low * low / eps * (1 - low / (eps * 3)) + (speed - low)
 
 
 def normal_force(g, n, push):
@@ -40,7 +78,7 @@ def normal_force(g, n, push):
     return [x / size for x in n], push * size
 
 
-def slide(g, n, push, v, wall, mu, h_over_m, eps):
+def slide(g, n, push, v, wall, h_over_m, mu, eps):
     """Velocity after friction: push n the barrier's force, v and wall the velocities of vertex and obstacle.
 
     Everything is a number of the graph `g`, or a list of three.
@@ -73,9 +111,6 @@ def rub(g, n, push, v, wall, mu, eps):
 
 
 def dissipation(g, n, push, v, wall, mu, eps):
-    """Its potential by the velocity, mu N eps (y^2 - y^3 / 3) for y = |t| / eps < 1, mu N (|t| - eps / 3) beyond."""
+    """Its potential by the velocity."""
     _, speed = tangential(g, n, v, wall)
-    third = g.number(1 / 3)
-    low = g.minimum(speed, eps)
-    inside = low * low / eps * (g.number(1) - third * low / eps)
-    return mu * push * g.select(speed.value < eps.value, inside, speed - third * eps)
+    return mu * push * dissipated(speed, eps, g)

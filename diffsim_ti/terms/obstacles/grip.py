@@ -13,7 +13,7 @@ import taichi as ti
 
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.obstacles import friction
-from diffsim_ti.terms.obstacles.turning import changes
+from diffsim_ti.terms.obstacles.turning import all_changes
 
 
 @traced
@@ -21,7 +21,7 @@ def _record(force, parameters, first, X, u, v, wall, time, total):
     """(graph, the obstacle's numbers, leaves of u, v, wall, [time, total], h mu N, impulse)"""
     g, p, moved, d, n = force.record(parameters, first, X, u)
     before, walls = ([g.leaf(at(x, d)) for d in range(3)] for x in (v, wall))
-    time, total, mu, eps = g.leaf(time), g.leaf(total), p[force.count + 2], p[force.count + 3]
+    time, total, (mu, eps) = g.leaf(time), g.leaf(total), force.rough(p)
     n, push = friction.normal_force(g, n, force.push(g, p, d))
     t, speed = friction.tangential(g, n, before, walls)
     load = time * mu * push
@@ -34,7 +34,7 @@ def load(force, parameters, first, X, u, time):
     """h mu N [N s]; time: h, on the area of the vertex where the stiffness is per area."""
     g, p, _, d, n = force.record(parameters, first, X, u)
     _, push = friction.normal_force(g, n, force.push(g, p, d))
-    return let((g.leaf(time) * p[force.count + 2] * push).value)
+    return let((g.leaf(time) * p[force.index.friction] * push).value)
 
 
 @traced
@@ -49,18 +49,16 @@ def load_jvp(force, parameters, first, X, u, time, parameters_dot, du, dtime):
     g, p, moved, d, n = force.record(parameters, first, X, u)
     _, push = friction.normal_force(g, n, force.push(g, p, d))
     time = g.leaf(time)
-    dots = [(time, dtime), *((q, at(parameters_dot, first + k)) for k, q in enumerate(p)), *changes(moved, du)]
-    return g.forward(dots, [time * p[force.count + 2] * push])[0]
+    dots = [(time, dtime), *all_changes(p, parameters_dot, first, (moved, du))]
+    return g.forward(dots, [time * p[force.index.friction] * push])[0]
 
 
 @traced
 def impulse_jvp(force, parameters, first, X, u, v, wall, time, total, parameters_dot, du, dv, dwall, dtime, dtotal):
     """Change of p."""
     g, p, moved, before, walls, numbers, _, out = _record(force, parameters, first, X, u, v, wall, time, total)
-    dots = [(numbers[0], dtime), (numbers[1], dtotal), *((q, at(parameters_dot, first + k)) for k, q in enumerate(p))]
-    for leaves, change in ((moved, du), (before, dv), (walls, dwall)):
-        dots += changes(leaves, change)
-    return force.vector_of(g.forward(dots, out))
+    dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (walls, dwall))
+    return force.vector_of(g.forward([*zip(numbers, (dtime, dtotal)), *dots], out))
 
 
 @traced

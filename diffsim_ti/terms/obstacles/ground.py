@@ -3,12 +3,24 @@
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
 from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
-from diffsim_ti.terms.obstacles import barrier, shapes
+from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+
+
+@dataclass(frozen=True)
+class GroundForce(ObstacleForce):
+    """d = y - height."""
+
+    count = 1
+    lanes = True
+    hollow = True
+
+    @traced
+    def distance_and_normal(self, g, p, X, u):
+        return (X[1] - p[0]) + u[1], [g.number(0), g.number(1), g.number(0)]
 
 
 class Ground(Obstacle):
@@ -29,6 +41,8 @@ class Ground(Obstacle):
     ['floor.height', 'floor.stiffness_per_area', 'floor.width', 'floor.friction', 'floor.friction_speed']
     """
 
+    twin = GroundForce
+
     def __init__(self, height: float = 0.0, stiffness: float | None = None, width: float = 0.01, **options):
         super().__init__(
             [Input("height", height, ((),), "m", plain="ground_height", axes="y")], stiffness, width, **options
@@ -36,9 +50,6 @@ class Ground(Obstacle):
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         return positions[:, 1] - float(self.values["ground_height"])
-
-    def least_radius(self):
-        return np.inf
 
     def floor_height(self):
         return float(self.values["ground_height"])
@@ -49,58 +60,7 @@ class Ground(Obstacle):
             f"{float(self.values['ground_height']):g} ({(gap <= 0).sum()} vertices); lift the body or lower the ground"
         )
 
-    def kernel(self, precision: str) -> "GroundForce":
-        return (TurningGroundForce if self.turns else GroundForce)(precision, self.has_friction)
-
     def surface(self, size):
         """A square, of one that turns."""
         height = float(self.values["ground_height"])
         return shapes.square((self.about[0], height, self.about[2]), (0.0, 1.0, 0.0), size) if self.turns else None
-
-
-@dataclass(frozen=True)
-class TurningGroundForce(ObstacleForce):
-    """d = y - height."""
-
-    count = 1
-    lanes = True
-    hollow = True
-
-    @traced
-    def distance_and_normal(self, g, p, X, u):
-        return (X[1] - p[0]) + u[1], [g.number(0), g.number(1), g.number(0)]
-
-
-@dataclass(frozen=True)
-class GroundForce(TurningGroundForce):
-    """Compile-time twin of Ground; the force is written out, since only one component of it is not zero."""
-
-    @ti.func
-    def scaled(self, parameters: ti.template(), first, X, u):
-        """(d / width, stiffness, width)"""
-        width = parameters[first + 2]
-        return ((X.y - parameters[first]) + u.y) / width, parameters[first + 1], width
-
-    @ti.func
-    def force(self, parameters: ti.template(), first, X, u, v):
-        s, stiffness, width = self.scaled(parameters, first, X, u)
-        f = 0 * u
-        f.y = -stiffness * width * barrier.slope(s, self.fp)
-        return f
-
-    @ti.func
-    def force_jvp(self, parameters: ti.template(), first, X, u, v, du, dv):
-        s, stiffness, width = self.scaled(parameters, first, X, u)
-        df = 0 * u
-        df.y = -stiffness * barrier.curvature(s, self.fp) * du.y
-        return df
-
-    @ti.func
-    def parameter_derivatives(self, parameters: ti.template(), first, X, u, v):
-        s, stiffness, width = self.scaled(parameters, first, X, u)
-        slope, curvature = barrier.slope(s, self.fp), barrier.curvature(s, self.fp)
-        by = self._zeros(u)
-        by[0].y = stiffness * curvature
-        by[1].y = -width * slope
-        by[2].y = -stiffness * (slope - s * curvature)
-        return by

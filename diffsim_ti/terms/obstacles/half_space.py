@@ -25,9 +25,10 @@ class HalfSpaceForce(ObstacleForce):
 
     @traced
     def distance_and_normal(self, g, p, X, u):
-        length = g.sqrt(g.dot(p[3:], p[3:]))
-        n = [k / length for k in p[3:]]
-        return g.dot(n, [(x - c) + y for x, c, y in zip(X, p, u)]), n
+        point, normal = p[:3], p[3:]
+        length = g.sqrt(g.dot(normal, normal))
+        n = [k / length for k in normal]
+        return g.dot(n, [(x - c) + y for x, c, y in zip(X, point, u)]), n
 
 
 class HalfSpace(Obstacle):

@@ -1,14 +1,17 @@
 """The compile-time class of an obstacle: everything that kernels need of it, from its distance alone."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
+from types import SimpleNamespace
 
 import taichi as ti
 
+from diffsim_ti.common.rows import indices
 from diffsim_ti.differentiation import Graph
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import assign, at, let, traced
 from diffsim_ti.terms.obstacles import barrier, friction
-from diffsim_ti.terms.obstacles.turning import changes, cross, length_of, rotation_matrix
+from diffsim_ti.terms.obstacles.turning import all_changes, changes, cross, length_of, rotation_matrix
 from diffsim_ti.terms.term import VertexForce
 
 
@@ -37,7 +40,14 @@ class ObstacleForce(VertexForce):
 
     @property
     def size(self) -> int:
-        return self.count + (4 if self.friction else 2) + (3 if self.turns else 0)
+        return self.index.end
+
+    @cached_property
+    def index(self) -> SimpleNamespace:
+        """Where each of its numbers stands, by name, counted from its first; those of its shape come first."""
+        sizes = dict(shape=self.count, stiffness=1, width=1)
+        sizes |= dict(friction=1, friction_speed=1) if self.friction else {}
+        return indices(**sizes, **(dict(about=3) if self.turns else {}))
 
     @traced
     def distance_and_normal(self, g, p, X, u) -> tuple:
@@ -60,7 +70,7 @@ class ObstacleForce(VertexForce):
     def _record_turned(self, g, p, X, rest, moved):
         """(leaves of u and theta, d, n) from the place as the obstacle was made, c + R^T (X - c) + R^T u."""
         R = rotation_matrix([at(X, 3 + k) for k in range(4)])
-        c = [x.value for x in p[self.size - 3 :]]
+        c = [x.value for x in p[self.index.about :]]
         arm = [let(x.value - y) for x, y in zip(rest, c)]
         made = [g.leaf(c[d] + sum_of(R[e][d] * arm[e] for e in range(3))) for d in range(3)]
         theta = [g.number(0) for _ in range(3)]
@@ -87,10 +97,15 @@ class ObstacleForce(VertexForce):
     @traced
     def push(self, g, p, d):
         """Size N of the barrier's force."""
-        stiffness, width = p[self.count], p[self.count + 1]
+        stiffness, width = p[self.index.stiffness], p[self.index.width]
         s, fp = d / width, self.fp
         slope = g.function(barrier.slope(s.value, fp), (s, lambda: barrier.curvature(s.value, fp)))
         return g.number(0) - stiffness * width * slope
+
+    @traced
+    def rough(self, p):
+        """(mu, friction speed)"""
+        return p[self.index.friction], p[self.index.friction_speed]
 
     @traced
     def _record_force(self, parameters, first, X, u):
@@ -121,9 +136,8 @@ class ObstacleForce(VertexForce):
     def outlook_jvp(self, parameters, first, X, u, du, parameters_dot=None):
         """Its change for changes of the place and, where given, of the obstacle's numbers."""
         g, p, moved, d, n = self.record(parameters, first, X, u)
-        dots = changes(moved, du)
-        if parameters_dot is not None:
-            dots += [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
+        known = p if parameters_dot is not None else ()
+        dots = all_changes(known, parameters_dot, first, (moved, du))
         return let(ti.types.vector(4, self.fp)(*g.forward(dots, [*n, d])))
 
     @traced
@@ -142,7 +156,7 @@ class ObstacleForce(VertexForce):
     @ti.func
     def width(self, parameters: ti.template(), first):
         """How far the obstacle is felt [m]."""
-        return parameters[first + self.count + 1]
+        return parameters[first + self.index.width]
 
     @ti.func
     def touches(self, parameters: ti.template(), first, X, u):
@@ -159,7 +173,7 @@ class ObstacleForce(VertexForce):
     def rigidity(self, parameters: ti.template(), first, X, u):
         """b''(d) [N/m]"""
         s = self.gap(parameters, first, X, u) / self.width(parameters, first)
-        return parameters[first + self.count] * barrier.curvature(s, self.fp)
+        return parameters[first + self.index.stiffness] * barrier.curvature(s, self.fp)
 
     # ---- the barrier's force ----------------------------------------------------------------------------------------
 
@@ -167,7 +181,7 @@ class ObstacleForce(VertexForce):
     def energy(self, parameters: ti.template(), first, X, u):
         width = self.width(parameters, first)
         s = self.gap(parameters, first, X, u) / width
-        return parameters[first + self.count] * width * width * barrier.value(s, self.fp)
+        return parameters[first + self.index.stiffness] * width * width * barrier.value(s, self.fp)
 
     @ti.func
     def force(self, parameters: ti.template(), first, X, u, v):
@@ -228,9 +242,9 @@ class ObstacleForce(VertexForce):
     @traced
     def _record_slide(self, parameters, first, X, u, v, wall, h_over_m):
         g, p, moved, d, n = self.record(parameters, first, X, u)
-        before, mu, eps = [g.leaf(at(v, d)) for d in range(3)], p[self.count + 2], p[self.count + 3]
+        before = [g.leaf(at(v, d)) for d in range(3)]
         ratio, wall = g.leaf(h_over_m), [g.leaf(at(wall, d)) for d in range(3)]
-        after = friction.slide(g, n, self.push(g, p, d), before, wall, mu, ratio, eps)
+        after = friction.slide(g, n, self.push(g, p, d), before, wall, ratio, *self.rough(p))
         return g, p, moved, before, wall, ratio, after
 
     @traced
@@ -242,10 +256,8 @@ class ObstacleForce(VertexForce):
     def slide_jvp(self, parameters, first, X, u, v, wall, h_over_m, parameters_dot, du, dv, dwall, dh_over_m):
         """Its change."""
         g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
-        dots = [(ratio, dh_over_m)] + [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
-        for leaves, change in ((moved, du), (before, dv), (walls, dwall)):
-            dots += changes(leaves, change)
-        return self.vector_of(g.forward(dots, after))
+        dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (walls, dwall))
+        return self.vector_of(g.forward([(ratio, dh_over_m), *dots], after))
 
     @traced
     def slide_vjp(self, parameters, first, X, u, v, wall, h_over_m, w):
@@ -262,9 +274,7 @@ class ObstacleForce(VertexForce):
         X, u = felt
         if X is None:
             g = Graph(self.fp, parameters)
-            p, place = (
-                [g.leaf(x) for x in xs] for xs in (self._numbers(parameters, first), [at(u, d) for d in range(3)])
-            )
+            p, place = [g.leaf(x) for x in self._numbers(parameters, first)], [g.leaf(at(u, d)) for d in range(3)]
             push = g.sqrt(g.dot(place, place))
             n = [x / push for x in place]
         else:
@@ -281,12 +291,12 @@ class ObstacleForce(VertexForce):
     def dissipation(self, parameters, first, felt, v, wall):
         """Potential of friction by the velocity [W]."""
         g, p, _, speed, wall, n, push = self._record_rub(parameters, first, felt, v, wall)
-        return friction.dissipation(g, n, push, speed, wall, p[self.count + 2], p[self.count + 3]).value
+        return friction.dissipation(g, n, push, speed, wall, *self.rough(p)).value
 
     @traced
     def _rubbed(self, parameters, first, felt, v, wall):
         g, p, moved, speed, wall, n, push = self._record_rub(parameters, first, felt, v, wall)
-        return g, p, moved, speed, wall, friction.rub(g, n, push, speed, wall, p[self.count + 2], p[self.count + 3])
+        return g, p, moved, speed, wall, friction.rub(g, n, push, speed, wall, *self.rough(p))
 
     @traced
     def rub(self, parameters, first, felt, v, wall):
@@ -303,9 +313,7 @@ class ObstacleForce(VertexForce):
     def rub_jvp(self, parameters, first, felt, v, wall, parameters_dot, du, dv, dwall):
         """Its change for changes of everything."""
         g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
-        dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
-        for leaves, change in ((moved, du), (speed, dv), (walls, dwall)):
-            dots += changes(leaves, change)
+        dots = all_changes(p, parameters_dot, first, (moved, du), (speed, dv), (walls, dwall))
         return self.vector_of(g.forward(dots, f))
 
     @traced

@@ -11,7 +11,7 @@ import taichi as ti
 from diffsim_ti.differentiation import Graph
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.obstacles import friction, secant
-from diffsim_ti.terms.obstacles.turning import changes
+from diffsim_ti.terms.obstacles.turning import all_changes
 
 
 @traced
@@ -24,7 +24,7 @@ def numbers(force: ti.template(), parameters: ti.template(), first):
     """(stiffness, width, mu, friction speed)"""
     out = ti.types.vector(4, force.fp)(0)
     for k in ti.static(range(4 if force.friction else 2)):
-        out[k] = parameters[first + force.count + k]
+        out[k] = parameters[first + force.index.stiffness + k]
     return out
 
 
@@ -67,7 +67,7 @@ def _record_push(force, parameters, first, X, u, move, damping):
     """(graph, the obstacle's numbers, leaves of u, leaves of move, n, P)"""
     g, p, moved, d, n = force.record(parameters, first, X, u)
     leaves = [g.leaf(at(move, k)) for k in range(3)]
-    stiffness, width = p[force.count], p[force.count + 1]
+    stiffness, width = p[force.index.stiffness], p[force.index.width]
     s, t = d / width, (d + g.dot(n, leaves)) / width
     value, by_s, by_t = _three(secant.push(s.value, t.value, damping, force.fp))
     p_of = g.function(value, (s, lambda: let(-by_s)), (t, lambda: let(-by_t)))
@@ -83,9 +83,7 @@ def _three(values):
 def push_jvp(force, parameters, first, X, u, move, damping, parameters_dot, du, dmove):
     """Change of (n, P)"""
     g, p, moved, leaves, n, pushed = _record_push(force, parameters, first, X, u, move, damping)
-    dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
-    for own, change in ((moved, du), (leaves, dmove)):
-        dots += changes(own, change)
+    dots = all_changes(p, parameters_dot, first, (moved, du), (leaves, dmove))
     *dn, dp = g.forward(dots, [*n, pushed])
     return _vector(force.fp, dn, dp)
 
@@ -109,7 +107,7 @@ def _record_slide(fp, plane, push, v, wall, ratio, mu, eps):
     g = Graph(fp)
     n, before, walls = ([g.leaf(at(x, d)) for d in range(3)] for x in (plane, v, wall))
     pushed, ratio, mu, eps = (g.leaf(x) for x in (push, ratio, mu, eps))
-    after = friction.slide(g, n, pushed, before, walls, mu, ratio, eps)
+    after = friction.slide(g, n, pushed, before, walls, ratio, mu, eps)
     return g, [*n, pushed, *before, *walls, ratio, mu, eps], after
 
 

@@ -23,6 +23,13 @@ def changes(leaves, change):
 
 
 @traced
+def all_changes(numbers, parameters_dot, first, *pairs):
+    """(leaf, its change) of an obstacle's numbers and of the leaves of vectors, given as (leaves, change)."""
+    out = [(q, at(parameters_dot, first + k)) for k, q in enumerate(numbers)]
+    return sum((changes(leaves, change) for leaves, change in pairs), out)
+
+
+@traced
 def cross(a, b):
     """Of lists of three."""
     return [let(a[(d + 1) % 3] * b[(d + 2) % 3] - a[(d + 2) % 3] * b[(d + 1) % 3]) for d in range(3)]
@@ -41,44 +48,23 @@ def rotation_matrix(q):
 
 
 @ti.func
+def _series(s, divisors: ti.template(), fp: ti.template()):
+    """1 - s / a (1 - s / b (1 - ...)) for divisors a, b ..."""
+    out = 1 + 0 * s
+    for k in ti.static(divisors[::-1]):
+        out = 1 - s * ti.cast(1 / k, fp) * out
+    return out
+
+
+@ti.func
 def coefficients(a, fp: ti.template()):
     """(cos, sinc, b, c)"""
     s = a.norm_sqr()
     out = ti.types.vector(4, fp)(0)
     if s < ti.cast(0.25, fp):
-        out[1] = 1 - s * ti.cast(1 / 6, fp) * (
-            1
-            - s
-            * ti.cast(1 / 20, fp)
-            * (
-                1
-                - s
-                * ti.cast(1 / 42, fp)
-                * (1 - s * ti.cast(1 / 72, fp) * (1 - s * ti.cast(1 / 110, fp) * (1 - s * ti.cast(1 / 156, fp))))
-            )
-        )
-        out[2] = ti.cast(0.5, fp) * (
-            1
-            - s
-            * ti.cast(1 / 12, fp)
-            * (
-                1
-                - s
-                * ti.cast(1 / 30, fp)
-                * (1 - s * ti.cast(1 / 56, fp) * (1 - s * ti.cast(1 / 90, fp) * (1 - s * ti.cast(1 / 132, fp))))
-            )
-        )
-        out[3] = ti.cast(1 / 6, fp) * (
-            1
-            - s
-            * ti.cast(1 / 20, fp)
-            * (
-                1
-                - s
-                * ti.cast(1 / 42, fp)
-                * (1 - s * ti.cast(1 / 72, fp) * (1 - s * ti.cast(1 / 110, fp) * (1 - s * ti.cast(1 / 156, fp))))
-            )
-        )
+        out[1] = _series(s, (6, 20, 42, 72, 110, 156), fp)
+        out[2] = ti.cast(0.5, fp) * _series(s, (12, 30, 56, 90, 132), fp)
+        out[3] = ti.cast(1 / 6, fp) * _series(s, (20, 42, 72, 110, 156), fp)
         out[0] = 1 - s * out[2]
     else:
         size = ti.sqrt(s)
@@ -135,6 +121,12 @@ def product(p, q):
     out[2] = p[0] * q[2] + q[0] * p[2] + p[3] * q[1] - p[1] * q[3]
     out[3] = p[0] * q[3] + q[0] * p[3] + p[1] * q[2] - p[2] * q[1]
     return out
+
+
+@ti.func
+def at_share(s, phi, share, fp: ti.template()):
+    """R(share phi) R, a unit quaternion, of the modified Rodrigues parameters s of R."""
+    return product(quaternion(share * phi, fp), from_rodrigues(s, fp))
 
 
 @ti.func

@@ -1,4 +1,4 @@
-"""Distances, energies and their derivatives of many pairs at once, outside any scene (proximity.py)."""
+"""Distances, energies and their derivatives of many pairs of surface primitives, outside any scene (proximity.py)."""
 
 from dataclasses import dataclass
 from functools import cached_property
