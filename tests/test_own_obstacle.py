@@ -324,7 +324,9 @@ def test_a_force_of_ones_own_acts_in_batches_and_step_by_step(tethered):
     for b in range(3):
         alone = ds.Rollout(solver, 3).forward(swing_force=swing[b]).positions
         np.testing.assert_allclose(found[b], alone, rtol=0, atol=1e-15)
-    one = dict(swing_force=swing[1], tether_c=0.0)  # for steps end with a kick of their own, and c sees velocities there
+    one = dict(
+        swing_force=swing[1], tether_c=0.0
+    )  # for steps end with a kick of their own, and c sees velocities there
     simulator = ds.Simulator(ds.VelocityVerletSolver(tethered.with_values(one), dt=2e-4))
     simulator.run(3)
     alone = ds.Rollout(solver, 3).forward(**one).positions
