@@ -22,9 +22,9 @@ class Reaction(Output):
 
         R = -sum over the support of Q_i (f_i + m_i g + F_i)
 
-    f: force of the body's stress on a vertex, m_i g its weight, F its loads (of the step that ends in the frame), drag and inertial
-    forces at its velocity, Q_i: the
-    projector onto the directions in which the support holds it, or, if `support` is no name in the scene's `fixed`, all do.
+    f: force of the body's stress on a vertex, m_i g its weight, F its loads (of the step that ends in the frame), drag and
+    inertial forces at its velocity, Q_i: the projector onto the directions in which the support holds it, or, if `support`
+    is no name in the scene's `fixed`, all do.
     So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero where
     supports share no vertices, or hold them in directions perpendicular to each other.
     What obstacles and self-contact do to held vertices themselves is not in it (ContactForce has the first), nor is the
