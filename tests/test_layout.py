@@ -123,6 +123,7 @@ DEEP = {  # classes that may stand more than three deep, and why
     **dict.fromkeys(
         "TetrahedronOfEight PatchOfScenes PatchOfEight".split(), "elements of a batch read elements of one scene"
     ),
+    "HeldPressure": "of the pressures in chambers those that are found with a volume, told apart by their class",
     "PressedFace": "a curved face stores and sums what a flat one does",
     "Muscle": "to users a muscle is a cable, and a cable a spring",
     "_AtStart": "a solver of users that checks less",
