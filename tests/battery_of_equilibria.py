@@ -40,6 +40,7 @@ def terms_by_name(mesh: ds.TetrahedralMesh) -> dict[str, Callable[[], object]]:
         "pressure": lambda: ds.Pressure(10.0),
         "traction": lambda: ds.Traction((0, 10.0, 0)),
         "surface drag": lambda: ds.SurfaceDrag(10.0),
+        "rotating frame": lambda: ds.RotatingFrame((0, 1.0, 0)),
         "gravity": lambda: ds.Gravity(),
         "drag": lambda: ds.Drag(1.0),
         "force": lambda: ds.ExternalForce([0.0, 1.0, 0.0], [top]),

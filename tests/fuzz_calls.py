@@ -68,6 +68,7 @@ TERMS = dict(
     muscle=lambda: ds.Muscle((0, 1, 0), 1e3, lambda t: t, "part"),
     foundation=lambda: ds.ElasticFoundation(1e4, 0.0, "cavity"),
     fluid=lambda: ds.SurfaceDrag(10.0),
+    turntable=lambda: ds.RotatingFrame((0, 1.0, 0)),
     growth=lambda: ds.Growth(lambda t: 0.1 * t),
     ground=lambda: ds.Ground(LOW - 0.01, friction=0.3, **THIN),
     turning=lambda: ds.HalfSpace((0, LOW - 0.01, 0), (0, 1, 0), path=lambda t: [0, 0, t, 0, t, 0], **THIN),

@@ -83,12 +83,15 @@ ACTING = (
     *(f"{what} {how}" for what in ("Cable tension", "Cable length", "Pressure", "BodyForce") for how in HOW),
     *(f"{what} {how}" for what in ("Muscle", "Growth") for how in HOW),
     "SurfaceDrag",
+    "RotatingFrame",
 )
 
 
 def acting(name: str, rng, steps: int, dt: float):
     """A term that acts on a body of MESH besides tetrahedra, of random numbers."""
     kind, how = name.split(" ")[0], name.split(" ", 1)[-1]
+    if kind == "RotatingFrame":
+        return ds.RotatingFrame(rng.normal(size=3), rng.normal(size=3))
     if kind == "SurfaceDrag":
         return ds.SurfaceDrag(
             500.0, normal=2.0, tangential=0.1, stream=rng.normal(size=3), surface=("xmax", None)[rng.integers(2)]

@@ -106,6 +106,7 @@ def calls() -> dict:
         ),
         "create_box": (ds.TetrahedralMesh.create_box, dict(resolution=2, size=1.0, origin=(0, 0, 0), pattern="kuhn")),
         "Growth": (ds.Growth, dict(growth=0.1, tetrahedra=None, per="all", name=None)),
+        "RotatingFrame": (ds.RotatingFrame, dict(angular_velocity=[0, 1, 0], center=[0, 0, 0], name=None)),
         "SurfaceDrag": (ds.SurfaceDrag, dict(density=1.0, normal=1.0, tangential=0.1, stream=[0, 0, 0], surface=None)),
         "MeshObstacle": (
             ds.MeshObstacle,

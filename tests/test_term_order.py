@@ -286,6 +286,7 @@ ALONE = {
     "muscle": lambda: dict(terms=[ds.Muscle((0, 1, 0), 1e3, 0.5)]),
     "foundation": lambda: dict(terms=[ds.ElasticFoundation(1e5, 1e4, "ymin")]),
     "fluid": lambda: dict(terms=[ds.SurfaceDrag(1000.0)], initial_velocities=(1.0, 0, 0)),
+    "rotating frame": lambda: dict(terms=[ds.RotatingFrame((0, 3.0, 0))]),
     "self-contact": lambda: dict(terms=[ds.SelfContact(stiffness=10.0, width=1e-3)]),
     "floor": lambda: dict(terms=[ds.Ground(-0.005, stiffness=100.0, friction=0.2)]),
     "moving floor": lambda: dict(terms=[ds.Ground(-0.005, stiffness=100.0, path=KEYS)]),

@@ -27,8 +27,8 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 @dataclass(frozen=True)
 class ForceKernel:
-    """Taichi functions of one kind of force in a pass. Vectors have four components, the last zero. Of vectors write
-    x = x - y and -1.0 * x, not x -= y and -x, for which Taichi's compiler fails.
+    """Taichi functions of one kind of force in a pass. Vectors have four components, the last zero. Taichi's compiler fails
+    for x -= y and -x of vectors: write x = x - y and ti.cast(-1, self.fp) * x.
 
     arrays: {array of the scene that they read: kind}, as in `runtime.array_types`, without numbers that inputs change;
     derived: the same of these, arrays of `Derived`; adjoints: {array that they add to: kind}.

@@ -30,26 +30,30 @@ class InertialForce(VertexwiseForce):
         return dict(inertial_adjoint=3 * plan.num_vertices)
 
     @ti.func
+    def number(self, x):
+        return ti.cast(x, self.fp)
+
+    @ti.func
     def numbers(self, p: A):
         """(Omega, c)"""
-        n, zero = ti.static(self.first), ti.cast(0, self.fp)
+        n, zero = ti.static(self.first), self.number(0)
         return self.vector(p[n], p[n + 1], p[n + 2], zero), self.vector(p[n + 3], p[n + 4], p[n + 5], zero)
 
     @ti.func
     def mass(self, i, scene: A):
-        inverse, zero = scene.inverse_mass[i], ti.cast(0, self.fp)
-        return ti.select(inverse > 0, 1 / ti.max(inverse, ti.cast(1e-30, self.fp)), zero)
+        inverse, zero = scene.inverse_mass[i], self.number(0)
+        return ti.select(inverse > 0, self.number(1) / ti.max(inverse, self.number(1e-30)), zero)
 
     @ti.func
     def solved(self, v, spin):
         """y of y + spin x y = v; with -spin that of the transposed equation."""
-        return (v - self.cross(spin, v) + spin.dot(v) * spin) / (1 + spin.dot(spin))
+        return (v - self.cross(spin, v) + spin.dot(v) * spin) / (self.number(1) + spin.dot(spin))
 
     @ti.func
     def force(self, i, u, v, now: A, scene: A):
         spin, c = self.numbers(scene.parameters)
         y, r = self.solved(v, (now.pre + now.post) * spin), scene.rest[i] + u - c
-        return -self.mass(i, scene) * (2 * self.cross(spin, y) + self.cross(spin, self.cross(spin, r)))
+        return -self.mass(i, scene) * (self.number(2) * self.cross(spin, y) + self.cross(spin, self.cross(spin, r)))
 
     @ti.func
     def force_jvp(self, i, u, v, du, dv, now: A, scene: A, tangent: A):
@@ -58,20 +62,22 @@ class InertialForce(VertexwiseForce):
         h = now.pre + now.post
         y, r, dr = self.solved(v, h * spin), scene.rest[i] + u - c, tangent.rest[i] + du - dc
         dy = self.solved(dv - h * self.cross(dspin, y), h * spin)
-        a = 2 * self.cross(spin, y) + self.cross(spin, self.cross(spin, r))
-        da = 2 * (self.cross(dspin, y) + self.cross(spin, dy)) + self.cross(dspin, self.cross(spin, r))
+        a = self.number(2) * self.cross(spin, y) + self.cross(spin, self.cross(spin, r))
+        da = self.number(2) * (self.cross(dspin, y) + self.cross(spin, dy)) + self.cross(dspin, self.cross(spin, r))
         da += self.cross(spin, self.cross(dspin, r) + self.cross(spin, dr))
         return -self.mass(i, scene) * da - tangent.mass[i] * a
 
     @ti.func
     def force_vjp(self, i, u, v, w, now: A, scene: A, adjoint: A):
-        h, z, zero = now.pre + now.post, self.mass(i, scene) * w, ti.cast(0, self.fp)
+        h, z, zero = now.pre + now.post, self.mass(i, scene) * w, self.number(0)
         spin, c = self.numbers(scene.parameters)
         y, r = self.solved(v, h * spin), scene.rest[i] + u - c
         across, turned = self.cross(spin, r), self.cross(spin, z)
-        by_u, by_v = self.cross(turned, spin), self.solved(2 * turned, -h * spin)
-        by_spin = 2 * self.cross(z, y) - h * self.cross(y, by_v) + self.cross(z, across) - self.cross(turned, r)
-        by_mass = -w.dot(2 * self.cross(spin, y) + self.cross(spin, across))
+        by_u, by_v = self.cross(turned, spin), self.solved(self.number(2) * turned, -h * spin)
+        by_spin = (
+            self.number(2) * self.cross(z, y) - h * self.cross(y, by_v) + self.cross(z, across) - self.cross(turned, r)
+        )
+        by_mass = -w.dot(self.number(2) * self.cross(spin, y) + self.cross(spin, across))
         adjoint.inertial_adjoint[3 * i] = adjoint.inertial_adjoint[3 * i] + by_spin
         adjoint.inertial_adjoint[3 * i + 1] = adjoint.inertial_adjoint[3 * i + 1] - by_u
         by_numbers = self.vector(by_mass, zero, zero, zero)

@@ -1,5 +1,7 @@
 """Weight, loads, springs, cables and foundations at the states that frames show, with derivatives, for outputs."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from diffsim_ti.inputs import Derived
@@ -19,15 +21,16 @@ def at_end(step: int, begins: bool = False) -> Instant:
 
 
 class GivenLoads:
-    """Forces [N], shape (num_vertices, 3): weight, dead loads and those of interactions that do not read velocities, after
-    so many steps: those of the last of these as it ends; with `begins`, as it begins.
+    """Forces [N], shape (num_vertices, 3): weight, dead loads and those of interactions, after so many steps: those of the
+    last of these as it ends; with `begins`, as it begins.
 
+    moving: with those that read velocities v [m/s], which `forces`, `jvp` and `vjp` then are to be told.
     held: the pressures [Pa] of the scene's chambers in a frame, of which those are taken that hold a volume.
     """
 
-    def __init__(self, scene, weight: bool = True):
+    def __init__(self, scene, weight: bool = True, moving: bool = False):
         self.elements, self.num_chambers = scene.mesh.elements, len(scene.terms_of(Chamber))
-        self.hosts = HostForces(force for force in host_forces(scene) if not force.reads_velocities)
+        self.hosts = HostForces(force for force in host_forces(scene) if moving or not force.reads_velocities)
         self.filled = self.hosts.only(HeldPressure)
         gravity = scene.term(Gravity) if weight else None
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
@@ -53,9 +56,12 @@ class GivenLoads:
             return derived.mass
         return np.bincount(self.elements.ravel(), derived.element_masses.sum(2).ravel(), len(derived.mass))
 
-    def _hosts(self, derived: Derived, step: int, begins: bool, held) -> HostForces:
+    def _hosts(self, derived: Derived, x, step: int, begins: bool, held, v) -> HostForces:
         """As they are in a frame."""
-        hosts = self.hosts.take(derived, at_end(step, begins))
+        instant = at_end(step, begins)
+        if v is not None:
+            instant = replace(instant, origin=x - derived.rest - v, gamma=1.0)
+        hosts = self.hosts.take(derived, instant)
         if self.filled and held is not None:
             for law, k in zip(self.filled.laws, self.filled.places):
                 law.multiplier = float(held[k])  # without a penalty, gamma: the pressure whatever the volume
@@ -77,14 +83,14 @@ class GivenLoads:
         places = self.filled.places if self.filled else []
         return [(place, self.filled.unit_forces(x - self.filled.rest, k)) for k, place in enumerate(places)]
 
-    def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False, held=None) -> np.ndarray:
+    def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False, held=None, v=None) -> np.ndarray:
         """At places x [m] after so many steps."""
         out = np.zeros(x.shape)
         if self.gravity is not None:
             out += self._masses(derived)[:, None] * derived.parameters[self.gravity][:3]
         if self.dead:
             out[self.dead.acts_at] += self._dead(step, derived.forces, begins)
-        return out + self._hosts(derived, step, begins, held).forces(x - derived.rest)
+        return out + self._hosts(derived, x, step, begins, held, v).forces(x - derived.rest)
 
     def jvp(
         self,
@@ -95,6 +101,8 @@ class GivenLoads:
         step: int,
         begins: bool = False,
         held=None,
+        v=None,
+        dv=0.0,
     ) -> np.ndarray:
         """Their change, at held pressures."""
         out = np.zeros(x.shape)
@@ -103,13 +111,21 @@ class GivenLoads:
             out += self._masses(moved)[:, None] * g + self._masses(derived)[:, None] * dg
         if self.dead:
             out[self.dead.acts_at] += self._dead(step, moved.forces, begins)
-        hosts = self._hosts(derived, step, begins, held)
-        return out + hosts.jvp(x - derived.rest, dx - moved.rest, np.zeros_like(dx), moved)
+        hosts = self._hosts(derived, x, step, begins, held, v)
+        return out + hosts.jvp(x - derived.rest, dx - moved.rest, dv + np.zeros_like(dx), moved)
 
     def vjp(
-        self, derived: Derived, x: np.ndarray, w: np.ndarray, step: int, adj: Derived, begins: bool = False, held=None
-    ) -> np.ndarray:
-        """Adjoint of x for that of the forces; adds those of all else, but for held pressures, to `adj`."""
+        self,
+        derived: Derived,
+        x: np.ndarray,
+        w: np.ndarray,
+        step: int,
+        adj: Derived,
+        begins: bool = False,
+        held=None,
+        v=None,
+    ) -> tuple:
+        """Adjoints of x and v for that of the forces; adds those of all else, but for held pressures, to `adj`."""
         if self.gravity is not None:
             by_mass = w @ derived.parameters[self.gravity][:3]
             if derived.element_masses is None:
@@ -119,6 +135,6 @@ class GivenLoads:
             adj.parameters[self.gravity.start : self.gravity.start + 3] += self._masses(derived) @ w
         if self.dead:
             self._dead(step, adj.forces, begins)[:] += w[self.dead.acts_at]
-        by_u, _ = self._hosts(derived, step, begins, held).vjp(x - derived.rest, w, adj)
+        by_u, by_v = self._hosts(derived, x, step, begins, held, v).vjp(x - derived.rest, w, adj)
         adj.rest -= by_u
-        return by_u
+        return by_u, by_v

@@ -22,8 +22,9 @@ class Reaction(Output):
 
         R = -sum over the support of Q_i (f_i + m_i g + F_i)
 
-    f: force of the body's stress on a vertex, m_i g its weight, F its loads (of the step that ends in the frame), Q_i: the
-    projector onto the directions in which the support holds it, or, if `support` is no name in the scene's `fixed`, all do.
+    f: force of the body's stress on a vertex, m_i g its weight, F its loads (of the step that ends in the frame), drag and
+    inertial forces at its velocity, Q_i: the projector onto the directions in which the support holds it, or, if `support`
+    is no name in the scene's `fixed`, all do.
     So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero where
     supports share no vertices, or hold them in directions perpendicular to each other.
     What obstacles and self-contact do to held vertices themselves is not in it (ContactForce has the first), nor is the
@@ -68,10 +69,6 @@ class Reaction(Output):
         return f"Reaction({self.support!r}, name={self.name!r})"
 
     def settled(self, scene: "Scene") -> "Reaction":
-        for x in scene.interactions:
-            if x.on_host and x.host().reads_velocities:
-                terms = ", ".join(sorted({type(term).__name__ for term in x.terms}))
-                raise ValueError(f"Reaction does not know {terms}; leave the one or the other out")
         out = copy(self)
         out.vertices = scene.held if self.support is None else scene.mesh.vertex_indices(self.support)
         loose = np.setdiff1d(out.vertices, scene.held)
@@ -80,7 +77,7 @@ class Reaction(Output):
                 f"Reaction: the support must be among the held vertices, but {len(loose) or 'all'} of its "
                 f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
             )
-        out.scene, out.body, out.loads = scene, BodyForces(scene, remembers=True), GivenLoads(scene)
+        out.scene, out.body, out.loads = scene, BodyForces(scene, remembers=True), GivenLoads(scene, moving=True)
         out.reads_law_state = bool(scene.law.state_names)
         out.onto = scene.supports.projectors(out.vertices, self.support)
         return out
@@ -102,10 +99,10 @@ class Reaction(Output):
         """What holds the vertices, shape (frames, k, 3)."""
         derived, out = self.body.load(frames.inputs), []
         for k, x in enumerate(frames.positions.astype(np.float64)):
-            self.body.place(*self._state(frames, k))
-            f = self.body.forces() + self.loads.forces(
-                derived, x, int(frames.steps[k]), held=self._pressures(frames, k)
-            )
+            u, v, z = self._state(frames, k)
+            self.body.place(u, v, z)
+            f = self.loads.forces(derived, x, int(frames.steps[k]), held=self._pressures(frames, k), v=v)
+            f = f + self.body.forces()
             out.append(-self._onto(f[self.vertices]))
         return np.stack(out)
 
@@ -128,10 +125,11 @@ class Reaction(Output):
         dx = zero if change.positions is None else change.positions
         dv = zero if change.velocities is None else change.velocities
         for k in range(len(zero)):
-            self.body.place(*self._state(frames, k))
+            u, v, z = self._state(frames, k)
+            self.body.place(u, v, z)
             df = self.body.jvp(dx[k] - moved.rest, dv[k], tangent)
-            x = frames.positions[k].astype(np.float64)
-            df = df + self.loads.jvp(derived, moved, x, dx[k], int(frames.steps[k]), held=self._pressures(frames, k))
+            x, shown = frames.positions[k].astype(np.float64), dict(held=self._pressures(frames, k), v=v, dv=dv[k])
+            df = df + self.loads.jvp(derived, moved, x, dx[k], int(frames.steps[k]), **shown)
             if change.chamber_pressures is not None and self.scene.holds_volumes:
                 df = df + self.loads.held_jvp(x, change.chamber_pressures[k])
             out.append(-self._onto(df[self.vertices]))
@@ -151,11 +149,14 @@ class Reaction(Output):
         derived, adjoint = self.body.load(frames.inputs), self.body.adjoint()
         rest, by_loads, by_held = np.zeros(positions.shape[1:]), derived.zeros(), []
         for k in range(len(w)):
-            self.body.place(*self._state(frames, k))
+            u, v, z = self._state(frames, k)
+            self.body.place(u, v, z)
             by_u, by_v = self.body.vjp(w[k], adjoint)
             x = frames.positions[k].astype(np.float64)
             held, step = self._pressures(frames, k), int(frames.steps[k])
-            positions[k] += by_u + self.loads.vjp(derived, x, w[k], step, by_loads, held=held)
+            by_x, by_speed = self.loads.vjp(derived, x, w[k], step, by_loads, held=held, v=v)
+            positions[k] += by_u + by_x
+            velocities[k] += by_speed
             if held is not None:
                 by_held.append(self.loads.held_vjp(x, w[k]))
             velocities[k] += by_v

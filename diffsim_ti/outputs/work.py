@@ -110,7 +110,7 @@ class WorkOfLoads(Output):
             for w, x, share, s, begins, shown in self._points(frames, k):
                 held = self._held(frames, shown)
                 mean += w * self.loads.forces(derived, x, s, begins, held)
-                by_x = self.loads.vjp(derived, x, w * gone, s, adjoint, begins, held)
+                by_x, _ = self.loads.vjp(derived, x, w * gone, s, adjoint, begins, held)
                 if held is not None:
                     by_held[shown] += self.loads.held_vjp(x, w * gone)
                 positions[k - 1] += share * by_x
