@@ -124,7 +124,8 @@ class HostForce:
         return float(((self.forces(u) + middle + self.forces(u + step)) * step).sum()) / 6
 
     def row_sums(self, u: np.ndarray) -> np.ndarray:
-        """A bound of the sums of |df/du| over the block row of each vertex [N/m], for the stable step."""
+        """A bound of the sums of |df/du| over the block row of each vertex [N/m]: forces with an energy bound the stable
+        step by it."""
         return np.zeros(len(u))
 
     def resisted(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
