@@ -132,6 +132,18 @@ def test_what_acts_on_bodies(seed):
 ELASTIC = ds.StableNeoHookean(2e4, 0.3)
 
 
+def test_a_pressure_without_gradients_of_the_rest_shape():
+    """Its adjoints of places are there only where the rest shape's are asked for."""
+    solver = ds.SemiImplicitSolver(
+        ds.Scene(MESH, ELASTIC, 1000.0, terms=[ds.Pressure(300.0)], precision="f64"), dt=1e-3
+    )
+    batch, alone = ds.Batch(solver, 2, 3, lanes=True), ds.Rollout(solver, 2)
+    frames, frame = batch.forward(pressure=np.array([300.0, 200.0, 100.0])), alone.forward()
+    seed = np.random.default_rng(3).normal(size=frames.displacements.shape)
+    by, by_alone = batch.vjp(frames, seed)["pressure"], alone.vjp(frame, seed[0])["pressure"]
+    np.testing.assert_allclose(by[0], by_alone, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "material, order, solver",
     [

@@ -88,7 +88,7 @@ class Lanes:
     def unpack_vectors(self, array) -> np.ndarray:
         """What an array of vectors holds: (scenes, ..., k, 3) in its precision."""
         out = self.unpack(array)
-        return out.reshape(*out.shape[:-1], -1, 3)
+        return out[..., : out.shape[-1] // 3 * 3].reshape(*out.shape[:-1], -1, 3)  # an array of none holds one number
 
     def scratch(self, rows: int, num_vertices: int) -> tuple[int, int]:
         """(rows, columns) of what is noted of a vertex while it is worked on: a column for each block (views.Scratch)."""

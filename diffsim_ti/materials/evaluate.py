@@ -28,6 +28,11 @@ def _kernel(law, what: str):
                 P[i] = by_H.matrix()
                 for c in ti.static(range(K)):
                     by_p[i][c] = by[c]
+            elif ti.static(what == "dilatation"):
+                psi[i] = law.dilatation(h)
+                P[i] = law.dilatation_gradient(h).matrix()
+            elif ti.static(what == "dilatation jvp"):
+                P[i] = law.dilatation_gradient_differential(h, w).matrix()
             else:
                 P[i] = law.stress(h, q).matrix()
             if ti.static(what == "energy"):
@@ -71,6 +76,16 @@ class LawOnArrays:
     def vjp(self, H, W, p) -> tuple[np.ndarray, np.ndarray]:
         """(adjoint of H, adjoints of the coefficients, shape (m, K)) for the adjoint W of P."""
         return self._run("vjp", H, W, p, p)[1:]
+
+    def dilatation(self, H) -> tuple[np.ndarray, np.ndarray]:
+        """(theta, shape (m,), dtheta/dF) of a law that has one."""
+        none = np.zeros(self.K)
+        return self._run("dilatation", H, H, none, none)[:2]
+
+    def dilatation_jvp(self, H, dH) -> np.ndarray:
+        """Change of dtheta/dF."""
+        none = np.zeros(self.K)
+        return self._run("dilatation jvp", H, dH, none, none)[1]
 
 
 def evaluate(law, F: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

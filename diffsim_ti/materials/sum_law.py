@@ -38,7 +38,7 @@ class SumLaw(Law):
 
     @traced
     def _terms(self, q) -> list:
-        """(law, what it takes) of all that acts; of one alone the base."""
+        """(law, what it takes) of those that act: both, or the base alone."""
         own, p = self._parts(q)
         return [(self.added, own), (self.base, p)]
 

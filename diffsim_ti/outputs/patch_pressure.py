@@ -7,30 +7,11 @@ so that tetrahedra have the stress P(H; p') + pi dtheta/dF and, as their share o
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-import taichi as ti
 
-from diffsim_ti import runtime
-from diffsim_ti.materials.calculus.tensor import tensor
+from diffsim_ti.materials.evaluate import LawOnArrays
 from diffsim_ti.mesh.patches import volume_patches
-
-
-@lru_cache(maxsize=None)
-def _kernel(law):
-    matrices, scalars = ti.types.ndarray(ti.types.matrix(3, 3, law.fp), 1), ti.types.ndarray(law.fp, 1)
-
-    @runtime.untaped
-    @runtime.kernel
-    def dilatations(H: matrices, W: matrices, theta: scalars, G: matrices, dG: matrices):
-        for i in range(H.shape[0]):
-            h, w = tensor(H[i]), tensor(W[i])
-            theta[i] = law.dilatation(h)
-            G[i] = law.dilatation_gradient(h).matrix()
-            dG[i] = law.dilatation_gradient_differential(h, w).matrix()
-
-    return dilatations
 
 
 @dataclass
@@ -48,12 +29,9 @@ class PatchPressure:
     @classmethod
     def of(cls, scene, derived, H: np.ndarray, W: np.ndarray | None = None) -> "PatchPressure":
         """H, W: shape (frames, points, 3, 3)."""
-        law, number = scene.law.base, runtime.NUMPY[scene.precision]
-        runtime.program()
-        h, w = (np.ascontiguousarray(x.reshape(-1, 3, 3), number) for x in (H, H if W is None else W))
-        theta, G, turned = np.zeros(len(h), number), np.zeros_like(h), np.zeros_like(h)
-        _kernel(law)(h, w, theta, G, turned)
-        theta, G, turned = (x.astype(np.float64) for x in (theta, G, turned))
+        law, (h, w) = scene.law.base, (x.reshape(-1, 3, 3) for x in (H, H if W is None else W))
+        theta, G = LawOnArrays(law).dilatation(h)
+        turned = LawOnArrays(law).dilatation_jvp(h, w)
         K = len(law.coefficient_names)
         factors = np.array([*law.last_without_lam, *[0.0] * K][:K])
         points = scene.mesh.reference.num_points

@@ -40,8 +40,9 @@ class Gas:
             return -np.inf
         m, grown = 1 - self.numbers[3], np.log1p(change / V)
         per_V = grown if abs(m * grown) < 1e-12 else np.expm1(m * grown) / m
-        absolute = gas_law(*self.numbers.tolist(), float(V))[0] + self.numbers[1]
-        return self.share * (absolute * V * per_V - self.numbers[1] * change)
+        p0, outside, V0, n = self.numbers.tolist()
+        absolute = gas_law(p0, 0.0, V0, n, float(V))[0]
+        return self.share * (absolute * V * per_V - outside * change)
 
 
 class Held:

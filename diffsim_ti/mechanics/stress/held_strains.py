@@ -6,7 +6,7 @@ strains of two states do not differ by a rigid turn, so that there is no rate th
 
 import weakref
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 import taichi as ti
@@ -15,7 +15,7 @@ from diffsim_ti import runtime
 from diffsim_ti.materials.calculus.green import green_strain, green_strain_differential, six, six_adjoint
 from diffsim_ti.materials.calculus.tensor import add_to_diagonal
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import Kernel, traced
+from diffsim_ti.runtime import Kernel, kernels_of, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import OF_TETRAHEDRA, SCENE, TANGENT
 from diffsim_ti.state.stage import Stage
@@ -120,12 +120,6 @@ class HeldStrainKernels:
         return Kernel(name, body, self.law.precision, dict(scene=SCENE, at=AT) | arrays, NUMBERS)
 
 
-@lru_cache(maxsize=None)
-def held_strain_kernels(law, features: Features, parallel: bool, lanes: bool) -> HeldStrainKernels:
-    """Kernels for a law and a scene's features."""
-    return HeldStrainKernels(law, features, parallel, lanes)
-
-
 class HeldStrains:
     """The strains that the passes of a run hold, in `potential.held`, with the rate 1 / gamma, zero in statics."""
 
@@ -137,7 +131,7 @@ class HeldStrains:
     def _launch(self, name: str, features, stage: Stage, u: np.ndarray, before, **records) -> None:
         ws, a = self.ws, self.ws.arrays
         runtime.fill(self.u, np.stack([u, u if before is None else before[0]]))
-        kernel = getattr(held_strain_kernels(a.law, features, ws.parallel, a.in_lanes), name)
+        kernel = getattr(kernels_of(HeldStrainKernels, a.law, features, ws.parallel, a.in_lanes), name)
         a0, a1 = (stage.a0, stage.a1) if before is not None else (1.0, 0.0)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices)
         ws.bound(kernel, at=self, **records)(**sizes, a0=a0, a1=a1)
