@@ -79,10 +79,6 @@ class FreeVertices:
             assign(at(array, *slot, first + d), number)
 
     @traced
-    def add(self, array, numbers, *place):
-        self.write(array, [let(a + b) for a, b in zip(self.read(array, *place), numbers)], *place)
-
-    @traced
     def add_number(self, array, number, *place):
         target = at(array, *place)
         assign(target, target + number)
