@@ -49,11 +49,15 @@ class FreeVertices:
 
     @property
     def fp(self):
-        return self.law.fp
+        return PRECISIONS[self.law.precision]
 
     @cached_property
     def lanes(self):
         return ti.types.vector(LANES, self.fp)
+
+    @cached_property
+    def given(self) -> GivenForces:
+        return GivenForces(self.features, self.law.precision)
 
     @property
     def some_special(self) -> bool:
@@ -106,9 +110,10 @@ class FreeVertices:
 
     # ---- forces given on vertices --------------------------------------------------------------------------------------
 
-    @cached_property
-    def given_forces(self) -> GivenForces:
-        return GivenForces(self.features, self.law.precision)
+    @traced
+    def force_at(self, rows, row, place, share):
+        """share of the force in a row."""
+        return [let(share * x) for x in self.read(rows, row, place)]
 
     @traced
     def slot(self, i, b, scene, plan) -> tuple:
@@ -118,20 +123,42 @@ class FreeVertices:
         return let(3 * (let(b * plan.num_loaded) + width * ti.max(k, 0))), loaded
 
     @traced
-    def load(self, i, b, now, scene, forces, plan) -> list:
-        """The force of a pass."""
-        place, loaded = self.slot(i, b, scene, plan)
-        return self.given_forces.mean(lambda row, end: self.read(forces, row, let(place + 3 * end)), now, loaded)
+    def kicks(self, i, b, now, scene, plan) -> list:
+        """(row, place, how far in the step, weight) of both kicks, where forces change within steps."""
+        (place, loaded), out = self.slot(i, b, scene, plan), []
+        for step, weight in ((now.force0, now.share0), (now.force1, now.share1)):
+            share = let(ti.select(step == now.row, now.begin, ti.cast(1, self.fp)))
+            out.append((step if self.features.forces_per_step else 0, place, share, let(weight * loaded)))
+        return out
 
     @traced
-    def add_load(self, i, b, now, scene, forces_adj, f_adj, plan) -> None:
-        """Its transpose."""
+    def load_terms(self, i, b, now, scene, plan) -> list:
+        """(row, place, weight) of the rows of forces that vertex i takes; a weight of zero where it takes none."""
+        F = self.features
+        if F.forces_keyed:
+            out = []
+            for row, place, share, weight in self.kicks(i, b, now, scene, plan):
+                out += [(row, place, let(weight * (1 - share))), (row, let(place + 3), let(weight * share))]
+            return out
         place, loaded = self.slot(i, b, scene, plan)
+        if F.forces_per_step:
+            return [(now.force0, place, let(now.share0 * loaded)), (now.force1, place, let(now.share1 * loaded))]
+        return [(0, place, loaded)]
 
-        def add(row, end, numbers):
-            self.add(forces_adj, numbers, row, let(place + 3 * end))
+    @traced
+    def load(self, i, b, now, scene, forces, plan) -> list:
+        """The force of a pass, with the operations of GivenForces in their order."""
+        if self.features.forces_keyed:
+            parts = [self.keyed_force(forces, *kick) for kick in self.kicks(i, b, now, scene, plan)]
+        else:
+            parts = [self.force_at(forces, *part) for part in self.load_terms(i, b, now, scene, plan)]
+        return parts[0] if len(parts) == 1 else [let(x + y) for x, y in zip(*parts)]
 
-        self.given_forces.mean_vjp(add, f_adj, now, loaded)
+    @traced
+    def keyed_force(self, forces, row, place, share, weight) -> list:
+        """weight times a force of a step that changes from its beginning to its end."""
+        begin, end = self.read(forces, row, place), self.read(forces, row, let(place + 3))
+        return [let(weight * (x + share * (y - x))) for x, y in zip(begin, end)]
 
     # ---- forward -------------------------------------------------------------------------------------------------------
 
@@ -291,7 +318,8 @@ class FreeVertices:
             for d in range(3):
                 self.add_number(adjoint.sums, let(moves * a_adj[d]), F.gravity + d, n)
         if F.forces:
-            self.add_load(i, b, now, scene, adjoint.forces, f_adj, plan)
+            for row, place, weight in self.load_terms(i, b, now, scene, plan):
+                self.add(adjoint.forces, [let(weight * x) for x in f_adj], row, place)
         self.write(adjoint.u, p, 0, first)
         self.write(adjoint.v, v_mid_adj, 0, first)
         self.write(adjoint.w, f_adj, 0, first)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import assign, at, let, number_type, traced, vector_type
+from diffsim_ti.runtime import number_type, traced, vector_type
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.pass_table import between, kicks
 
@@ -13,7 +13,7 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 @dataclass(frozen=True)
 class GivenForces:
-    """Functions of one vertex i, and of lists of numbers for who reads rows of forces in a manner of its own."""
+    """Functions of one vertex i."""
 
     features: Features
     precision: str
@@ -21,43 +21,23 @@ class GivenForces:
     fp, vector = number_type, vector_type
 
     @traced
-    def terms(self, now, has) -> list:
-        """(row, how far in its step, weight) of the forces of a pass: of the two steps that share its kicks, or of all that
-        do not change; no share where they do not change within a step. has: 1, or 0 where there is no force."""
-        F = self.features
-        if not (F.forces_keyed or F.forces_per_step):
-            return [(0, None, has)]
-        return [(r, s if F.forces_keyed else None, let(w * has)) for r, s, w in kicks(now, F.forces_per_step, self.fp)]
+    def kicks(self, now) -> list:
+        """(row, how far in its step the pass lies, weight) of the two steps that share the kicks of a pass."""
+        return kicks(now, self.features.forces_per_step, self.fp)
 
-    @traced
-    def mean(self, read, now, has=1) -> list:
-        """Numbers of the force of a pass: `read(row, end)` gives those of a row, at the beginning of its step (end = 0) or
-        at its end (1)."""
-        total = None
-        for row, share, weight in self.terms(now, has):
-            own = read(row, 0)
-            if share is not None:
-                own = [between(x, y, share) for x, y in zip(own, read(row, 1))]
-            own = [let(weight * x) for x in own]
-            total = own if total is None else [let(x + y) for x, y in zip(total, own)]
-        return total
+    @property
+    def over_time(self) -> bool:
+        return self.features.forces_keyed or self.features.forces_per_step
 
-    @traced
-    def mean_vjp(self, add, by: list, now, has=1) -> None:
-        """Its transpose: `add(row, end, numbers)`."""
-        for row, share, weight in self.terms(now, has):
-            weights = (weight,) if share is None else (let(weight * (1 - share)), let(weight * share))
-            for end, own in enumerate(weights):
-                add(row, end, [let(own * x) for x in by])
-
-    @traced
-    def place(self, k, end: int):
-        """Of force k in a row."""
-        return 2 * k + end if self.features.forces_keyed else k
-
-    @traced
-    def own_force(self, k, now, forces):
-        return self.mean(lambda row, end: [at(forces, row, self.place(k, end))], now)[0]
+    @ti.func
+    def in_step(self, row, k, share, forces: A):
+        """Force k of a step, at a share of it where it changes within steps."""
+        f = self.vector(0)
+        if ti.static(self.features.forces_keyed):
+            f = between(forces[row, 2 * k], forces[row, 2 * k + 1], share)
+        else:
+            f = forces[row, k]
+        return f
 
     @ti.func
     def force(self, i, now: A, scene: A, forces: A):
@@ -65,7 +45,11 @@ class GivenForces:
         f = self.vector(0)
         k = scene.force_slot[i]
         if k >= 0:
-            f = self.own_force(k, now, forces)
+            if ti.static(self.over_time):
+                for row, share, weight in ti.static(self.kicks(now)):
+                    f += weight * self.in_step(row, k, share, forces)
+            else:
+                f = forces[0, k]
         return f
 
     @ti.func
@@ -81,16 +65,16 @@ class GivenForces:
             f = f + scene.corner[c]
         return f
 
-    @traced
-    def add_own(self, k, f_adj, now, adjoint) -> None:
-        def add(row, end, numbers):
-            target = at(adjoint.forces, row, self.place(k, end))
-            assign(target, target + numbers[0])
-
-        self.mean_vjp(add, [f_adj], now)
-
     @ti.func
     def add_vjp(self, i, f_adj, now: A, scene: A, adjoint: A):
         k = scene.force_slot[i]
         if k >= 0:
-            self.add_own(k, f_adj, now, adjoint)
+            if ti.static(not self.over_time):
+                adjoint.forces[0, k] = adjoint.forces[0, k] + f_adj
+            else:
+                for row, share, weight in ti.static(self.kicks(now)):
+                    if ti.static(self.features.forces_keyed):
+                        adjoint.forces[row, 2 * k] = adjoint.forces[row, 2 * k] + weight * (1 - share) * f_adj
+                        adjoint.forces[row, 2 * k + 1] = adjoint.forces[row, 2 * k + 1] + weight * share * f_adj
+                    else:
+                        adjoint.forces[row, k] = adjoint.forces[row, k] + weight * f_adj
