@@ -1,11 +1,13 @@
 """diffsim_ti: a soft-body simulator on tetrahedra whose gradients can be trusted. Public names, in reading order."""
 
 import os
+import sys
+from typing import TYPE_CHECKING
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
-from diffsim_ti.common import interrupts
+from diffsim_ti.common import deprecated, interrupts
 
 interrupts.guard_import()
 
@@ -49,13 +51,13 @@ from diffsim_ti.outputs import (
     ElasticEnergy,
     EnclosedVolume,
     KineticEnergy,
+    Length,
     MaterialPoints,
     Reaction,
     SelfContactForce,
     Strain,
     Stress,
-    TieLength,
-    TieTension,
+    Tension,
     WorkOfLoads,
 )
 from diffsim_ti.outputs.modes import Modes, modes
@@ -174,8 +176,8 @@ __all__ = [
     "Reaction",
     "SelfContactForce",
     "Stress",
-    "TieLength",
-    "TieTension",
+    "Length",
+    "Tension",
     "Strain",
     "EnclosedVolume",
     "ChamberPressure",
@@ -199,3 +201,7 @@ __all__ = [
     "check_gradients",
     "WorkOfLoads",
 ]
+
+sys.meta_path.append(deprecated.MovedModules())
+if not TYPE_CHECKING:  # type checkers report old names
+    __getattr__ = deprecated.package_attribute

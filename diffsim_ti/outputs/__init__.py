@@ -11,7 +11,7 @@ from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.self_contact_force import SelfContactForce
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
-from diffsim_ti.outputs.ties import TieLength, TieTension
+from diffsim_ti.outputs.ties import Length, Tension
 from diffsim_ti.outputs.work import WorkOfLoads
 
 __all__ = [
@@ -30,8 +30,8 @@ __all__ = [
     "SelfContactForce",
     "Strain",
     "Stress",
-    "TieLength",
-    "TieTension",
+    "Length",
+    "Tension",
     "Velocities",
     "WorkOfLoads",
 ]
