@@ -202,7 +202,7 @@ def test_the_scene_chooses_it_by_the_impact():
 
 
 PRESSING = {
-    "muscle": (dict(terms=[ds.Muscle([0, 1, 0], 4e4, 0.0)]), 8e4),  # twice, for what is laid on suddenly
+    "muscle": (dict(terms=[ds.Muscle([0, 1, 0], 4e4, 0.0)]), 8e4),  # twice, for loads that are applied suddenly
     "muscle over time": (dict(terms=[ds.Muscle([0, 1, 0], 2e4, lambda t: 1.5 * t)]), 6e4),
     "pressure": (dict(terms=[ds.Pressure(3e4)]), 6e4),
     "traction": (dict(terms=[ds.Traction(lambda t: (0, -4e4 * t, 3e4 * t))]), 1e5),

@@ -398,15 +398,15 @@ def test_sets_join():
 CUBE = ds.TetrahedralMesh.create_cube(3).with_surface_set("round", lambda x, n: n[:, 0] > -0.5)
 MISTAKES = {
     "no such set": ({"roof": "x"}, None, "no vertex set is called 'roof'"),
-    "axes": ({"xmin": "xw"}, None, r"'xmin' must be held along axes such as \"x\" or \"xyz\".*got 'xw'"),
-    "twice": ({"xmin": "xx"}, None, "must be held along axes"),
+    "axes": ({"xmin": "xw"}, None, r"'xmin' must be fixed along axes such as \"x\" or \"xyz\".*got 'xw'"),
+    "twice": ({"xmin": "xx"}, None, "must be fixed along axes"),
     "shape": ({"xmin": [1, 0]}, None, r"along directions, finite, of shape \(3,\) or \(k, 3\)"),
     "zero": ({"xmin": [0, 0, 0]}, None, "must not be zero"),
     "not flat": ({"round": "normal"}, None, "it is not flat"),
     "motion of none": (
         {"xmin": "x"},
         {"xmax": lambda t: [0, 0, 0]},
-        "motion moves 'xmax', which is not held; fixed has xmin",
+        "motion moves 'xmax', which is not fixed; fixed has xmin",
     ),
     "no names": ("xmin", {"xmin": lambda t: [0, 0, 0]}, "no sets by name"),
     "two motions": (

@@ -134,7 +134,7 @@ def simulate(
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
     velocity: Annotated[tuple[float, float, float], typer.Option(help="at the start [m/s]")] = (0.0, 0.0, 0.0),
     fixed: Annotated[
-        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
+        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")
     ] = None,
     ground: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
     height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a tenth of the size")] = None,
@@ -230,7 +230,7 @@ def check_gradients(
     dt: Annotated[float | None, typer.Option(help="[s]; default half the stable step")] = None,
     solver: Annotated[str, typer.Option(help="semi-implicit or verlet")] = "semi-implicit",
     fixed: Annotated[
-        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
+        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")
     ] = None,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.5,
     backend: Backend = "cpu",

@@ -36,8 +36,8 @@ Density = Annotated[float, typer.Option(help="[kg/m^3]")]
 Arrows = Annotated[
     list[str] | None,
     typer.Option(
-        help="forces to draw as arrows and to write: reaction (of what is held), contact, friction (its part); of a saved "
-        "series what it holds; may be repeated"
+        help="forces to draw as arrows and to write: reaction (of supports), contact, friction (its part); of a saved "
+        "series those that it contains; may be repeated"
     ),
 ]
 Volume = Annotated[

@@ -10,7 +10,7 @@ import typer
 from diffsim_ti.cli.options import fixed_vertices, load_body, make_material
 from diffsim_ti.scene import Scene
 
-Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")]
+Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")]
 Workers = Annotated[int, typer.Option(help="processes that share the work")]
 
 

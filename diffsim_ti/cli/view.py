@@ -46,7 +46,7 @@ def render(
     arrows: Annotated[
         list[str] | None,
         typer.Option(
-            help="vectors of vertices that the series holds, such as forces, to draw as arrows; may be repeated"
+            help="vectors at vertices that the series contains, such as forces, to draw as arrows; may be repeated"
         ),
     ] = None,
 ) -> None:
@@ -88,7 +88,7 @@ def view(
     gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
     fixed: Annotated[
-        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
+        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")
     ] = None,
     floor: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
     friction: Annotated[float, typer.Option(help="Coulomb's coefficient of the floor")] = 0.0,

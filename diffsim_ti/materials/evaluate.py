@@ -1,4 +1,4 @@
-"""A law evaluated for many deformation gradients at once, outside any scene."""
+"""A law evaluated for many deformation gradients together, outside any scene."""
 
 from functools import lru_cache
 

@@ -146,7 +146,7 @@ class Prony(Around):
     (law.py: of first order in its length). The stress has an energy, and what is lost [W/m^3],
     sum g_i / tau_i (E - z_i) : C : (E - z_i), is never negative; crushed elements have it too. Viscosity goes around it:
     `KelvinVoigt(Prony(...), time=...)`.
-    Statics and volume="patches" do not know it.
+    Static solves and volume="patches" do not support it.
     Simo, Hughes, Computational Inelasticity, 1998, ch. 10.3, doi:10.1007/b98904.
     Raises ValueError for numbers out of range, and a material that has a state or a viscosity.
     """

@@ -1,4 +1,4 @@
-"""What a loss may name besides a run's inputs: functions of its frames, one file each, and their interface for others."""
+"""Outputs, which losses use like positions: functions of a run's frames, one file each, and their interface for others."""
 
 from diffsim_ti.outputs.chamber_pressure import ChamberPressure
 from diffsim_ti.outputs.contact_force import ContactForce

@@ -91,10 +91,12 @@ class BodyForces:
         if scene.law.state_names and not remembers:
             raise ValueError(
                 f"{type(scene.law).__name__} has a state ({', '.join(scene.law.state_names)}) that frames do not keep: this "
-                "output knows laws of the displacement and velocity gradients only"
+                "output supports laws of the displacement and velocity gradients only"
             )
         if scene.growing:
-            raise ValueError("forces of the body at frames do not know Growth over time; take Grown(material, growth)")
+            raise ValueError(
+                "forces of the body at frames do not support Growth over time; take Grown(material, growth)"
+            )
         self.scene, self.arrays = scene, SceneArrays(scene)
         a = self.arrays
         self.at, self.change, self.out = (

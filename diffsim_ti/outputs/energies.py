@@ -24,7 +24,7 @@ class ElasticEnergy(Output):
     sets: tetrahedron sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it. The gradient is exact by all inputs.
     With volume="patches" a tetrahedron has pi theta / 2 of its patch's pressure pi in the place of lam theta^2 / 2.
-    Of a law with a state, `Simulator.output` alone knows it. Raises ValueError for laws with rates.
+    Of a law with a state it comes from `Simulator.output` only. Raises ValueError for laws with rates.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 6.1.
     """
 
@@ -35,7 +35,7 @@ class ElasticEnergy(Output):
         law, mesh = scene.law, scene.mesh
         if law.in_steps().reads != ("H",):
             raise ValueError(
-                f"ElasticEnergy knows laws of the displacement gradient, not {law.title}: take a law without rates"
+                f"ElasticEnergy supports laws of the displacement gradient, not {law.title}: take a law without rates"
             )
         self.refuse_growth("ElasticEnergy", scene)
         out = copy(self)

@@ -30,7 +30,7 @@ class SurfaceDrag(Term):
     the four triangles of each face.
     Explicit passes take velocities at their beginning, so that a vertex of mass m needs substeps well below 2 m / (rho c A
     |v|); implicit steps take those of the step, with the exact differential. Weight in water, added mass, and what parts of
-    a body do to each other through it are not in it. Statics refuse it, and so does `Reaction`.
+    a body do to each other through it are not in it. Static solves refuse it, and so does `Reaction`.
     Inputs with gradient: "water_density", "normal_drag", "tangential_drag", "stream", or "<name>.density" ...
     Raises ValueError for other shapes and numbers below zero, and for unknown sets.
     Taylor 1952, Analysis of the swimming of long and narrow animals, doi:10.1098/rspa.1952.0159.

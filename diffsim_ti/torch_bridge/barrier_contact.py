@@ -1,4 +1,4 @@
-"""PyTorch face: contact with a floor as a torch formula, and as the core's term with the same numbers."""
+"""PyTorch interface: contact with a floor as a torch formula, and as the core's term with the same numbers."""
 
 import math
 

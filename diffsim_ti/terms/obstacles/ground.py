@@ -12,7 +12,7 @@ from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
 
 class Ground(Obstacle):
-    """Floor y = height [m], felt by surface vertices through the barrier of their distance d = y - height.
+    """Floor y = height [m], which acts on surface vertices through the barrier of their distance d = y - height.
 
     Stiffness per area [N/m^3] (default: the scene chooses it) or stiffness of every vertex [N/m], width [m], friction and
     path as for every `Obstacle`.
@@ -73,7 +73,7 @@ class TurningGroundForce(ObstacleForce):
 
 @dataclass(frozen=True)
 class GroundForce(TurningGroundForce):
-    """Compile-time twin of Ground; the force is written out, since only one component of it is not zero."""
+    """Device counterpart of Ground; the force is written out, since only one component of it is not zero."""
 
     @ti.func
     def scaled(self, parameters: ti.template(), first, X, u):
