@@ -33,7 +33,7 @@ class Obstacle(Term):
     with 1.19 k width. Or
     stiffness [N/m]: k of every vertex alike, however many there are.
     width [m]: the distance at which the barrier begins to act.
-    Faces of ten-node tetrahedra that are curved in the mesh, by .02 widths or more, are treated as curved as they move, by
+    Faces of ten-node tetrahedra that are curved in the mesh, by 0.02 widths or more, are treated as curved as they move, by
     points on them (curved_faces.py). Friction there is, in explicit steps, a stage after those of the pushes.
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
     friction is smoothed, and with which a vertex that is held may creep.
