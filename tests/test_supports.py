@@ -154,8 +154,8 @@ def test_the_shape_of_a_held_body_moves_its_supports(kind):
 
 
 def test_hanging_bar():
-    """0.05 x 0.05 x 1 m on rollers at its top, one edge guided along z, E 125 kPa, nu 0.25, rho 1000: tip 0.0406034 m and its
-    derivative by E -3.359588747e-7 m/Pa, by integration of the law of a bar under uniaxial stress."""
+    """0.05 x 0.05 x 1 m on rollers at its top, one edge guided along z, E 125 kPa, nu 0.25, rho 1000: tip 0.0406034 m and
+    its derivative by E -3.359588747e-7 m/Pa, by integration of the law of a bar under uniaxial stress."""
     mesh = ds.TetrahedralMesh.create_box((3, 41, 3), (0.05, 1.0, 0.05))
     fixed = {"ymax": "y", "xmin": "x", "zmin": "z"}  # a quarter: planes of symmetry leave the sides free
     scene = ds.Scene(mesh, ds.StableNeoHookean(125e3, 0.25), 1000.0, [ds.Gravity()], fixed, precision="f64")
