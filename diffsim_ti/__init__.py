@@ -1,11 +1,13 @@
 """diffsim_ti: a soft-body simulator on tetrahedra whose gradients can be trusted. Public names, in reading order."""
 
 import os
+import sys
+from typing import TYPE_CHECKING
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
-from diffsim_ti.common import interrupts
+from diffsim_ti.common import deprecated, interrupts
 
 interrupts.guard_import()
 
@@ -49,13 +51,13 @@ from diffsim_ti.outputs import (
     ElasticEnergy,
     EnclosedVolume,
     KineticEnergy,
+    Length,
     MaterialPoints,
     Reaction,
     SelfContactForce,
     Strain,
     Stress,
-    TieLength,
-    TieTension,
+    Tension,
     WorkOfLoads,
 )
 from diffsim_ti.outputs.modes import Modes, modes
@@ -117,7 +119,11 @@ __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", 
 __all__ += ["ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Rollout", "Frames", "Batch"]
 __all__ += ["BatchFrames", "Ensemble", "UnequalSteps", "adaptive_steps", "SolveReport", "Divergence", "Crossing"]
 __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPoints", "ContactForce"]
-__all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "TieLength", "TieTension"]
+__all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
 __all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]
+
+sys.meta_path.append(deprecated.MovedModules())
+if not TYPE_CHECKING:  # type checkers report old names
+    __getattr__ = deprecated.package_attribute

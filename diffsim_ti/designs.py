@@ -137,7 +137,7 @@ def guarded_step(design, d: ArrayLike, step: ArrayLike, least: float = 0.2) -> n
         if smallest_ratio(design.mesh, design.value(np.asarray(d) + step)) >= least:
             return step
         step = step / 2
-    raise ValueError(f"guarded_step: no step keeps the smallest J above {least}; look at the direction")
+    raise ValueError(f"guarded_step: no step keeps the smallest J above {least}; check the direction")
 
 
 def tangential(step: ArrayLike, gradient: ArrayLike) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""PyTorch face: learnable materials, smooth contact, implicit differentiation, checkpointed rollouts."""
+"""PyTorch interface: learnable materials, smooth contact, implicit differentiation, checkpointed rollouts."""
 
 import math
 from functools import lru_cache
@@ -42,7 +42,7 @@ def refuse_state(law, where: str, remedy: str) -> None:
     """Raise ValueError for a law that remembers, where nothing says what."""
     if law.state_names:
         names = ", ".join(law.state_names)
-        raise ValueError(f"{type(law).__name__} has a state ({names}) that {where} does not know: {remedy}")
+        raise ValueError(f"{type(law).__name__} has a state ({names}) that {where} does not support: {remedy}")
 
 
 class TorchMaterial(torch.nn.Module):

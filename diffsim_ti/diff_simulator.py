@@ -1,4 +1,4 @@
-"""PyTorch face: a rollout as one autograd node, and the seeds' DifferentiableSolver and DifferentiableSimulator.
+"""PyTorch interface: a rollout as one autograd node, and the seeds' DifferentiableSolver and DifferentiableSimulator.
 
 No physics lives here: forward is a run of a Rollout's sweep, backward pulls back through it (torch_bridge/).
 """

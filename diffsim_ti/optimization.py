@@ -62,7 +62,7 @@ def load_state(path: str | Path, mesh: TetrahedralMesh) -> dict | None:
                 warnings.warn(f"{reasons[0]}; using {candidate}", stacklevel=2)
             return state
     if reasons:
-        raise ValueError("no usable state: " + "; ".join(reasons) + "; delete the file to start anew")
+        raise ValueError("no usable state: " + "; ".join(reasons) + "; delete the file to start again")
     return None
 
 
@@ -137,7 +137,7 @@ class Optimization:
             return state, None
         return {}, ValueError(
             f"{self.path}: a state without {', '.join(missing)}; another program has written it: take another path, or "
-            "delete the file to start anew"
+            "delete the file to start again"
         )
 
     def run(

@@ -23,7 +23,7 @@ def draw(rng):
     block = ds.TetrahedralMesh.create_box(3 if order == 1 else 2, 0.1)
     block = block.quadratic() if order == 2 else block
     mesh = ds.TetrahedralMesh.joined([block, block.translated([0.103, *rng.uniform(-0.05, 0.05, 2)])])
-    wave = np.sqrt(1.6 * E / 1000)  # of a ratio of .35
+    wave = np.sqrt(1.6 * E / 1000)  # of a ratio of 0.35
     speed, v = rng.uniform(0.05, 0.4) * wave, np.zeros_like(mesh.vertices)
     v[:, 0] = np.where(np.arange(len(v)) < block.num_vertices, 0.5, -0.5) * speed
     contact = dict(width=10 ** rng.uniform(-3.3, -2.6), stiffness=10 ** rng.uniform(1.5, 5))

@@ -1,8 +1,8 @@
 """A body with self-contact of 1 mm falls and comes to rest: python tests/rest_with_self_contact.py MESH [--solver bdf2].
 
-The mesh is scaled to .2 m and let go 2 cm above the floor, with drag: laws of materials damp nothing. Prints a line for each
-frame; exit code 1 if it has not come to rest within the time given, a gap is not positive, or the energy rises by more than
-1 % of weight times height.
+The mesh is scaled to 0.2 m and let go 2 cm above the floor, with drag: laws of materials damp nothing. Prints a line
+for each frame; exit code 1 if it has not come to rest within the time given, a gap is not positive, or the energy rises
+by more than 1 % of weight times height.
 """
 
 import argparse

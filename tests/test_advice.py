@@ -150,7 +150,7 @@ FOLLOWED = {
         lambda: scene(law=ds.Prony(LAW, [0.5], [0.1]), volume="patches"),
         lambda: scene(law=ds.Prony(LAW, [0.5], [0.1]), volume="tetrahedra"),
     ),
-    ("materials/grown.py", "does not know it"): (
+    ("materials/grown.py", "does not support it"): (
         lambda: scene(terms=[ds.Growth(0.1)], volume="patches"),
         lambda: (scene(terms=[ds.Growth(0.1)]), scene(terms=[ds.Growth(0.1)], mesh=CUBE.quadratic())),
     ),
@@ -174,7 +174,7 @@ FOLLOWED = {
         lambda: ds.Reaction(about=(0, 0, 0), per_vertex=True),
         lambda: (ds.Reaction(about=(0, 0, 0)), ds.Reaction(per_vertex=True)),
     ),
-    ("outputs/reaction.py", "must be among the held vertices"): (
+    ("outputs/reaction.py", "must be among the fixed vertices"): (
         lambda: ds.Rollout(verlet(), 1, outputs=[ds.Reaction("xmin")]),
         lambda: ds.Rollout(verlet(fixed="xmin"), 1, outputs=[ds.Reaction("xmin")]),
     ),
@@ -202,7 +202,7 @@ FOLLOWED = {
         lambda: ds.Simulator(verlet()).output(ds.WorkOfLoads(weight=True)),
         lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 0, outputs=[ds.WorkOfLoads(weight=True)]).forward(),
     ),
-    ("mechanics/reduced/body_checks.py", "feel obstacles as a force"): (
+    ("mechanics/reduced/body_checks.py", "take obstacles as a force"): (
         lambda: verlet(**RIGID),
         lambda: verlet(**RIGID, contact="force"),
     ),
@@ -296,7 +296,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("materials/patch_law.py", "does not say what its theta is"): "test_open_laws.py, with a law of one's own",
     ("mesh/checks.py", "in no tetrahedron"): "test_mesh.py",
     ("mesh/enclosure.py", "must not be moved"): "test_chambers.py",
-    ("monitor/chatter.py", "shakes at {} m/s"): "test_contact_friction.py",
+    ("monitor/chatter.py", "vibrates at {} m/s"): "test_contact_friction.py",
     ("monitor/guard.py", "has gained {} J"): "test_energy_watch.py",
     ("monitor/guard.py", "reduce the substep to {} s"): "test_contact_crossing.py, battery_of_impacts.py",
     ("monitor/guard.py", "the barrier cannot stop it"): "test_contact_crossing.py, battery_of_impacts.py",

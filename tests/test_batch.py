@@ -453,7 +453,7 @@ def test_scenes_start_anew():
     np.testing.assert_array_equal(frames.reset()["initial_positions"], frames.end["initial_positions"])
     with pytest.raises(ValueError, match="expected 4 booleans"):
         frames.reset([1, 3])
-    with pytest.raises(ValueError, match="for the scenes that start anew"):
+    with pytest.raises(ValueError, match="for the scenes that restart"):
         frames.reset(mask, np.zeros((3, *there.shape)))
 
 

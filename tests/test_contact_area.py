@@ -202,7 +202,7 @@ def test_the_scene_chooses_it_by_the_impact():
 
 
 PRESSING = {
-    "muscle": (dict(terms=[ds.Muscle([0, 1, 0], 4e4, 0.0)]), 8e4),  # twice, for what is laid on suddenly
+    "muscle": (dict(terms=[ds.Muscle([0, 1, 0], 4e4, 0.0)]), 8e4),  # twice, for loads that are applied suddenly
     "muscle over time": (dict(terms=[ds.Muscle([0, 1, 0], 2e4, lambda t: 1.5 * t)]), 6e4),
     "pressure": (dict(terms=[ds.Pressure(3e4)]), 6e4),
     "traction": (dict(terms=[ds.Traction(lambda t: (0, -4e4 * t, 3e4 * t))]), 1e5),
@@ -266,6 +266,6 @@ def test_backend_transpose_of_areas(solver):
 
 @pytest.mark.backends
 def test_backend_of_areas_in_implicit_steps():
-    """A face on a needle moves up as in float64 on a processor; without the needle it would go .8 mm down."""
+    """A face on a needle moves up as in float64 on a processor; without the needle it would go 0.8 mm down."""
     positions = on_a_needle("f32", stiffness_per_area=1e7).forward().positions
     assert (positions[-1] - positions[0])[:, 1].mean() == pytest.approx(8.3163e-4, rel=1e-3)

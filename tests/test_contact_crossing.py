@@ -58,7 +58,7 @@ def test_the_state_before_is_kept(solver):
 
 @pytest.mark.parametrize("solver", EXPLICIT)
 def test_what_steps_too_long_for_a_squeezed_body_are_told_works(solver):
-    """A soft cube meets a plate at seven times its waves' speed: steps of .7 of the limit at rest make 35 m/s and more."""
+    """A soft cube meets a plate at seven times its waves' speed: steps of 0.7 of the limit at rest make 35 m/s and more."""
 
     def fall(substep):
         mesh = ds.TetrahedralMesh.create_box(2, size=0.08).translated([-0.04, 0.01, -0.04])

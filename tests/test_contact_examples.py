@@ -112,6 +112,6 @@ def test_rough_blocks(tmp_path, capsys):
         way, law, _ = numbers["slides"][friction]
         assert way == pytest.approx(law, rel=off)
     assert 0 < numbers["slides"][0.51][0] < 1e-3 * 0.5
-    # after 1 s and .3 s: a lean that is elastic; what slides freely would have gone .27 m and 26 mm
+    # after 1 s and 0.3 s: a lean that is elastic; what slides freely would have gone 0.27 m and 26 mm
     assert 0.005 < numbers["rough"] < 0.02 < numbers["smooth"]
     assert (tmp_path / "rough_blocks.png").stat().st_size > 10_000 and "tower" in capsys.readouterr().out

@@ -207,7 +207,7 @@ def beta(s):
 
 @pytest.mark.parametrize("solver, damping", [(ds.SemiImplicitSolver, 1.0), (ds.VelocityVerletSolver, 0.02)])
 def test_at_rest_friction_holds_what_coulomb_holds(solver, damping):
-    """A vertex pressed on a slope at tan = 1/2: friction .52 holds it, .48 lets it slide."""
+    """A vertex pressed on a slope at tan = 1/2: friction 0.52 holds it, 0.48 lets it slide."""
     angle = np.arctan(0.5)
     n, down = np.array([-np.sin(angle), np.cos(angle), 0]), np.array([-np.cos(angle), -np.sin(angle), 0])
     turn = np.stack([-down, n, np.cross(-down, n)], 1)

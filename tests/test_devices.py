@@ -122,7 +122,9 @@ def test_backend_that_the_package_does_not_know(monkeypatch):
     monkeypatch.setattr(start, "_ARCHS", {"cuda": ti.cuda})
     monkeypatch.setattr(start.impl, "current_cfg", lambda: type("Config", (), {"arch": ti.opengl}))
     monkeypatch.delitem(start._settings, "runs", raising=False)  # the name of the one before
-    with pytest.raises(RuntimeError, match="Taichi was started on opengl, which diffsim_ti does not know: use one of"):
+    with pytest.raises(
+        RuntimeError, match="Taichi was started on opengl, which diffsim_ti does not support: use one of"
+    ):
         runtime.arch_name()
 
 

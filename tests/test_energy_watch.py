@@ -215,7 +215,7 @@ def test_self_contact_is_counted():
 
 
 def test_the_midpoints_advice_helps():
-    """A cube squeezed to .6, in steps that it cannot follow."""
+    """A cube squeezed to 0.6, in steps that it cannot follow."""
     mesh = ds.TetrahedralMesh.create_box(3, size=0.1)
     squeezed = (mesh.vertices - 0.05) * [1, 0.6, 1] + 0.05
     scene = ds.Scene(mesh, SOFT, 1000.0, initial_positions=squeezed, precision="f64")

@@ -195,7 +195,7 @@ def test_a_curved_ball_rolls_down_a_slope():
     v = (mass * frames.velocities).sum(1)[:, 0] / mass.sum()
     inertia = (mass[:, 0] * (mesh.vertices[:, :2] ** 2).sum(1)).sum()
     expected = 9.81 * np.sin(slope) / (1 + inertia / (mass.sum() * radius**2))
-    assert np.polyfit(frames.times[30:], v[30:], 1)[0] == pytest.approx(expected, rel=0.04)  # .67 of g sin
+    assert np.polyfit(frames.times[30:], v[30:], 1)[0] == pytest.approx(expected, rel=0.04)  # 0.67 of g sin
 
 
 def test_the_stage_adds_no_energy():

@@ -65,7 +65,7 @@ def test_it_does_not_matter_where_a_scene_is(kind, place, vertices_alone):
 
     def at(offset):
         about = tuple(np.array([0.1, 0.2, 0.3]) + offset)
-        outputs = [ds.TieLength("tie"), ds.Reaction(MESH.vertex_indices([1, 2, 3]), about=about)][: 1 + static]
+        outputs = [ds.Length("tie"), ds.Reaction(MESH.vertex_indices([1, 2, 3]), about=about)][: 1 + static]
         rollout = ds.Rollout(solver_of(kind, moved(here, offset)), 2, gradients="all", outputs=outputs)
         return found(rollout)
 

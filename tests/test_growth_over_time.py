@@ -126,5 +126,5 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="patches"):
         ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, [ds.Growth(0.1)], volume="patches")
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, [ds.Growth(0.1)], precision="f64")
-    with pytest.raises(ValueError, match="does not know Growth over time"):
+    with pytest.raises(ValueError, match="does not support Growth over time"):
         ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-4), 1, outputs=ds.Stress())

@@ -51,8 +51,8 @@ def over_hertz(cells: int) -> np.ndarray:
 def test_slow_impact_of_a_ball_converges_to_hertz():
     """First order in the mesh width, as tetrahedra under the edge of the contact are: extrapolated within 5 %.
 
-    Measured with 6, 9, 12 and 20 cells: force 1.097, 1.066, 1.053, 1.043; time .873, .905, .915, .925; depth .868, .908,
-    .927, .943.
+    Measured with 6, 9, 12 and 20 cells: force 1.097, 1.066, 1.053, 1.043; time 0.873, 0.905, 0.915, 0.925; depth 0.868,
+    0.908, 0.927, 0.943.
     """
     coarse, fine = over_hertz(6), over_hertz(9)
     assert np.all(np.abs(fine - 1) < 0.75 * np.abs(coarse - 1) + 0.01)

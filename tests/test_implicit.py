@@ -270,7 +270,7 @@ def test_series_of_bars_with_stiffnesses_over_six_decades():
 
 @pytest.mark.parametrize("force", [0.5, 50.0])
 def test_every_iterate_of_a_compression_keeps_its_orientation(force, monkeypatch):
-    """Fifty times the load that halves the block, laid on at once."""
+    """Fifty times the load that halves the block, applied in one step."""
     from diffsim_ti.mechanics.energy.potential import Potential
 
     smallest, plain = [], Potential.forces

@@ -25,7 +25,7 @@ def test_weight_rests_at_the_gap_where_the_barrier_carries_it(solver, mass):
 
 @solvers
 def test_incline(solver):
-    """R21: friction .50 sticks, but for a creep slower than friction_speed; .49 slides .274198 m in 2.5 s."""
+    """R21: friction 0.50 sticks, but for a creep slower than friction_speed; 0.49 slides 0.274198 m in 2.5 s."""
     from test_contact_friction import on_incline
 
     for friction, slides in ((0.50, False), (0.49, True)):

@@ -1,4 +1,4 @@
-"""The preconditioner of implicit solves and conjugate gradients on the device; equilibria that are laid on in parts."""
+"""The preconditioner of implicit solves and conjugate gradients on the device; equilibria by load stepping."""
 
 import re
 
@@ -213,7 +213,7 @@ def test_what_no_part_leads_to_is_said_in_terms_of_the_problem():
         raise ds.NotConverged("made to fail", [1.0])
 
     workspace.newton.solve = fails
-    with pytest.raises(ds.NotConverged, match="path of equilibria .* goes to 0% of what is laid on.*limit point"):
+    with pytest.raises(ds.NotConverged, match="path of equilibria .* goes to 0% of the step's loads.*limit point"):
         workspace.advance(0, 1, 1)
 
 
@@ -238,9 +238,9 @@ def pressed_beyond(load: str, stress: float, load_steps: int = 1) -> ds.Rollout:
 
 
 def share_named(rollout: ds.Rollout) -> float:
-    with pytest.raises(ds.NotConverged, match="what is laid on in the step") as error:
+    with pytest.raises(ds.NotConverged, match="of the step's loads and prescribed motion") as error:
         rollout.forward()
-    return float(re.search(r"goes to ([\d.e+-]+)% of what is laid on", str(error.value))[1]) / 100
+    return float(re.search(r"goes to ([\d.e+-]+)% of the step's loads", str(error.value))[1]) / 100
 
 
 @pytest.mark.filterwarnings("ignore")

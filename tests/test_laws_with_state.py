@@ -449,7 +449,7 @@ def test_a_state_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="law_state"):
         ds.Rollout(simulator.solver, 1).forward(law_state=np.full((MESH.num_tetrahedra, 6), np.nan))
     plain = ds.Simulator(ds.SemiImplicitSolver(scene(ds.StableNeoHookean(MU, 0.3)), dt=2e-3))
-    with pytest.raises(ValueError, match="StableNeoHookean remembers nothing"):
+    with pytest.raises(ValueError, match="StableNeoHookean has no state"):
         plain.set_state(law_state=np.zeros((MESH.num_tetrahedra, 6)))
     for state in (simulator.state | dict(more=1), {}, plain.state):
         with pytest.raises(ValueError, match="resume: this run has the state displacements"):
@@ -507,8 +507,8 @@ class TwoForOne(FadingLaw):
             lambda: scene(volume="patches").law,
             r"averages energies of displacements, but RelaxingLaw has a state .*; take",
         ),
-        (simulated, r"has a state .* that DifferentiableSimulator does not know: .* rollout_frames"),
-        (energy_of_gradients, r"has a state .* that energy_density\(F\) does not know: ask Simulator"),
+        (simulated, r"has a state .* that DifferentiableSimulator does not support: .* rollout_frames"),
+        (energy_of_gradients, r"has a state .* that energy_density\(F\) does not support: ask Simulator"),
         (lambda: Idle("f64"), r"Idle has a state \(z\) that nothing moves on: write next_state"),
         (lambda: TwoForOne("f64"), r"initial_state has 2 numbers for 1 state_names"),
     ],

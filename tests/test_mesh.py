@@ -546,7 +546,7 @@ def test_sets_of_one_name_are_told_apart_when_bodies_are_joined():
     assert "body_1_tip" not in both.vertex_sets and both.vertex_sets["tip"].tolist() == [8]
     law = ds.StableNeoHookean(1e5, 0.3)
     for fixed in ("xmin", ["tip", "xmin"], {"xmin": "x"}):
-        with pytest.warns(UserWarning, match="'xmin' holds 2 bodies.*'body_0_xmin', 'body_1_xmin'"):
+        with pytest.warns(UserWarning, match="'xmin' contains 2 bodies.*'body_0_xmin', 'body_1_xmin'"):
             ds.Scene(both, law, fixed=fixed)
     with warnings.catch_warnings(action="error"):
         for fixed in ("tip", "body_0_xmin", ["body_0_xmin", "body_1_xmin"], both.vertex_indices("xmin"), None):

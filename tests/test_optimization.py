@@ -61,7 +61,7 @@ def test_damaged_files_are_refused_and_the_previous_one_used(tmp_path, damage, r
 
 def test_another_mesh_is_refused(tmp_path):
     save_state(tmp_path / "run.state", OTHER, state(1.0))
-    with pytest.raises(ValueError, match="made for another mesh.*delete the file to start anew"):
+    with pytest.raises(ValueError, match="made for another mesh.*delete the file to start again"):
         load_state(tmp_path / "run.state", MESH)
 
 

@@ -197,7 +197,7 @@ def test_keyframes():
     half = np.sqrt(0.5)  # three quarters of a turn one way are a quarter the other way
     short = sampled_path("p", ([0, 1], [[0, 0, 0, 1, 0, 0, 0], [0, 0, 0, -half, half, 0, 0]]), [0.5])
     assert np.allclose(rotations.vector(short[:, 3:]), [[-np.pi / 4, 0, 0]])
-    with pytest.raises(ValueError, match="more than half a turn apart and not on one axis; put rows between"):
+    with pytest.raises(ValueError, match="more than half a turn apart and not on one axis; insert keyframes between"):
         sampled_path("p", ([0, 1], [[0, 0, 0, 0, 3, 0], [0, 0, 0, 3, 0, 0]]), [0.0])
     with pytest.raises(ValueError, match="less than a full turn; take shorter steps"):
         PoseColumns(["p"], "path").value(np.array([[0.0] * 6, [0, 0, 0, 0, 7, 0]]))

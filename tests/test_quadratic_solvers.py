@@ -129,7 +129,7 @@ def test_gradients_where_supports_guide_and_move(by_differences):
 
 
 class Peer:
-    """The same body by scikit-fem's elements and bases: StableNeoHookean, E 1e5 Pa, nu .3, 1000 kg/m^3."""
+    """The same body by scikit-fem's elements and bases: StableNeoHookean, E 1e5 Pa, nu 0.3, 1000 kg/m^3."""
 
     def __init__(self, mesh: ds.TetrahedralMesh):
         skfem = pytest.importorskip("skfem")

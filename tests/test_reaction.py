@@ -133,7 +133,7 @@ def test_a_simulator_has_them_step_by_step():
 
 def test_what_does_not_fit_is_refused():
     solver = ds.StaticSolver(scene_of())
-    with pytest.raises(ValueError, match="among the held vertices, but 4 of its 4 vertices are free"):
+    with pytest.raises(ValueError, match="among the fixed vertices, but 4 of its 4 vertices are free"):
         ds.Rollout(solver, 1, outputs=ds.Reaction("xmax"))
     with pytest.raises(ValueError, match="about= or per_vertex=True"):
         ds.Reaction(about=(0, 0, 0), per_vertex=True)

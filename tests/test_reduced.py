@@ -260,7 +260,7 @@ def test_refused(reduced, options, words):
 @pytest.mark.parametrize("kind", ["functions", "fields"])
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
 def test_explicit_steps_refuse_bases(solver, kind):
-    with pytest.raises(ValueError, match="explicit steps know affine and rigid sets.*take an implicit solver"):
+    with pytest.raises(ValueError, match="explicit steps support affine and rigid sets.*take an implicit solver"):
         solver(scene_of({"shell": motions(kind, bar())}), dt=1e-5)
 
 

@@ -204,14 +204,14 @@ def block(mu, kind, slope=0.3, speed=0.0):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_blocks_hold_and_slide(kind):
-    """On a slope of .3: friction .32 holds, but for some creep; .2 slides by g (sin - .2 cos) t^2 / 2."""
+    """On a slope of 0.3: friction 0.32 holds, but for some creep; 0.2 slides by g (sin - 0.2 cos) t^2 / 2."""
     for mu in (0.32, 0.2):
         solver = ds.SemiImplicitSolver(block(mu, kind), dt=0.01, substeps=50, contact="force")
         frames = ds.Rollout(solver, 50, gradients=[]).forward()
         way = frames.positions[-1].mean(0)[0] - frames.positions[0].mean(0)[0]
         angle = np.arctan(0.3)
         if mu > 0.3:
-            assert abs(way) < 2e-3  # of .35 m without friction; what leans on corners rocks at first
+            assert abs(way) < 2e-3  # of 0.35 m without friction; what leans on corners rocks at first
         else:
             assert way == pytest.approx(9.81 * (np.sin(angle) - mu * np.cos(angle)) * 0.5**2 / 2, rel=0.02)
 
@@ -386,8 +386,8 @@ def test_the_benchmark_of_a_stiff_part():
 @pytest.mark.parametrize(
     "terms, options, words",
     [
-        ([ds.Ground(-1.0, stiffness=1e4)], {}, 'feel obstacles as a force in explicit steps.*contact="force"'),
-        ([ds.Sphere([0, -1, 0], 0.01, stiffness=1e4)], dict(contact="force"), "at their vertices alone.*finer mesh"),
+        ([ds.Ground(-1.0, stiffness=1e4)], {}, 'take obstacles as a force in explicit steps.*contact="force"'),
+        ([ds.Sphere([0, -1, 0], 0.01, stiffness=1e4)], dict(contact="force"), "at their vertices only.*finer mesh"),
         ([ds.SelfContact(1e4, 1e-3, friction=0.3)], {}, "no friction in SelfContact in explicit steps"),
     ],
 )

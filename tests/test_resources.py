@@ -178,7 +178,7 @@ def test_second_init_is_noticed():
     lines = out.splitlines()
     assert lines[-1] == "f64 done"
     assert (
-        lines[:-1] == ["ti.init was called again, which destroys all Taichi data: build the scene and solver anew"] * 9
+        lines[:-1] == ["ti.init was called again, which destroys all Taichi data: build the scene and solver again"] * 9
     )
 
 

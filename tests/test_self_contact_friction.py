@@ -51,7 +51,7 @@ def settled():
 
 @pytest.mark.parametrize("solver, dt", [(ds.SemiImplicitSolver, 2.5e-4), (ds.BDF2Solver, 4e-3)])
 def test_slope(solver, dt):
-    """.51 holds, .49 slides, .3 slides as far as Coulomb's law says."""
+    """0.51 holds, 0.49 slides, 0.3 slides as far as Coulomb's law says."""
     steps = round(0.3 / dt)
     end = steps * dt
     assert 0 <= went(solver, dt, on_slope(0.51, settled())[0], steps)[1] <= 1e-3 * end

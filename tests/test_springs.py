@@ -133,7 +133,7 @@ def watched() -> list:
     ties = "struts", "tendon", "slack", "spring", "rope"
     return [
         kind(name, name=f"{what}_{name}")
-        for kind, what in ((ds.TieLength, "length"), (ds.TieTension, "pull"))
+        for kind, what in ((ds.Length, "length"), (ds.Tension, "pull"))
         for name in ties
     ]
 
@@ -195,15 +195,15 @@ def test_tension_is_what_holds_an_anchor():
     mesh, place = lidded(), np.array([0.5, 2.0, 0.4])
     spring = ds.Spring(7, ds.Anchor(place), 900.0, rest_length=0.4)
     of = scene([spring, ds.Gravity()], mesh=mesh, fixed="xmin", initial_positions=None)
-    outputs = [ds.TieLength(spring), ds.TieTension(spring)]
+    outputs = [ds.Length(spring), ds.Tension(spring)]
     frames = ds.Rollout(ds.StaticSolver(of, tolerance=1e-11), 1, outputs=outputs).forward()
     L = np.linalg.norm(frames.positions[:, 7] - place, axis=1)
     np.testing.assert_allclose(frames["length"], L, rtol=1e-12)
     np.testing.assert_allclose(frames["tension"], 900 * (L - 0.4), rtol=1e-10)
     sim = ds.Simulator(ds.VelocityVerletSolver(of, dt=1e-4))
-    assert sim.output(ds.TieTension(spring)) == pytest.approx(frames["tension"][0])
+    assert sim.output(ds.Tension(spring)) == pytest.approx(frames["tension"][0])
     with pytest.raises(ValueError, match="this scene has no spring or cable 'rope'; it has .*: give them a name="):
-        ds.Rollout(sim.solver, 1, outputs=ds.TieLength("rope"))
+        ds.Rollout(sim.solver, 1, outputs=ds.Length("rope"))
 
 
 # ---- energies, forces, momentum ------------------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ def test_every_problem_runs_quickly_and_gets_better_with_smaller_steps(name):
         errors = {(p.cells, p.element): p.error for p in result.points}
         assert all(errors[2, element] < 0.7 * errors[1, element] for element in ("linear", "patches"))
         assert errors[2, "patches"] < 0.9 * errors[2, "linear"]
-        # the drop itself: 6 cells across give .928 of beam theory's (an independent code's value), 4 give .871
+        # the drop itself: 6 cells across give 0.928 of beam theory's (an independent code's value), 4 give 0.871
         for cells, share in ((4, 0.871),):
             scene = problem(name).scene(cells, "five", "f64")
             drop = run(problem(name), make_rollout(problem(name), scene, ds.StaticSolver, 1))[1]

@@ -154,8 +154,8 @@ def test_the_shape_of_a_held_body_moves_its_supports(kind):
 
 
 def test_hanging_bar():
-    """.05 x .05 x 1 m on rollers at its top, one edge guided along z, E 125 kPa, nu .25, rho 1000: tip .0406034 m and its
-    derivative by E -3.359588747e-7 m/Pa, by integration of the law of a bar under uniaxial stress."""
+    """0.05 x 0.05 x 1 m on rollers at its top, one edge guided along z, E 125 kPa, nu 0.25, rho 1000: tip 0.0406034 m and
+    its derivative by E -3.359588747e-7 m/Pa, by integration of the law of a bar under uniaxial stress."""
     mesh = ds.TetrahedralMesh.create_box((3, 41, 3), (0.05, 1.0, 0.05))
     fixed = {"ymax": "y", "xmin": "x", "zmin": "z"}  # a quarter: planes of symmetry leave the sides free
     scene = ds.Scene(mesh, ds.StableNeoHookean(125e3, 0.25), 1000.0, [ds.Gravity()], fixed, precision="f64")
@@ -227,7 +227,7 @@ def cooks_membrane(n: int, layers: int = 2) -> float:
 
 def test_cooks_membrane_in_plane_strain():
     """23.967 is the limit of biquadratic elements (23.9608 with 32 x 32, 23.9650 with 64 x 64); 23.96 in the literature.
-    Errors of linear tetrahedra fall by h^2, which leaves .7 % with 32 x 32; nothing depends on z."""
+    Errors of linear tetrahedra fall by h^2, which leaves 0.7 % with 32 x 32; nothing depends on z."""
     errors = 1 - np.array([cooks_membrane(n) for n in (8, 16, 32)]) / 23.967
     assert np.all(errors > 0) and errors[2] < 0.01 and np.all(errors[:2] / errors[1:] > 3.3), errors
     assert abs(cooks_membrane(12, 3) / cooks_membrane(12) - 1) < 0.02
@@ -398,15 +398,15 @@ def test_sets_join():
 CUBE = ds.TetrahedralMesh.create_cube(3).with_surface_set("round", lambda x, n: n[:, 0] > -0.5)
 MISTAKES = {
     "no such set": ({"roof": "x"}, None, "no vertex set is called 'roof'"),
-    "axes": ({"xmin": "xw"}, None, r"'xmin' must be held along axes such as \"x\" or \"xyz\".*got 'xw'"),
-    "twice": ({"xmin": "xx"}, None, "must be held along axes"),
+    "axes": ({"xmin": "xw"}, None, r"'xmin' must be fixed along axes such as \"x\" or \"xyz\".*got 'xw'"),
+    "twice": ({"xmin": "xx"}, None, "must be fixed along axes"),
     "shape": ({"xmin": [1, 0]}, None, r"along directions, finite, of shape \(3,\) or \(k, 3\)"),
     "zero": ({"xmin": [0, 0, 0]}, None, "must not be zero"),
     "not flat": ({"round": "normal"}, None, "it is not flat"),
     "motion of none": (
         {"xmin": "x"},
         {"xmax": lambda t: [0, 0, 0]},
-        "motion moves 'xmax', which is not held; fixed has xmin",
+        "motion moves 'xmax', which is not fixed; fixed has xmin",
     ),
     "no names": ("xmin", {"xmin": lambda t: [0, 0, 0]}, "no sets by name"),
     "two motions": (

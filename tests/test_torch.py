@@ -1,4 +1,4 @@
-"""The PyTorch face: each input's gradient by gradcheck, what a training loop does to it, and what it refuses."""
+"""The PyTorch interface: each input's gradient by gradcheck, what a training loop does to it, and what it refuses."""
 
 import copy
 import os

@@ -1,4 +1,4 @@
-"""Every solver of the core through the PyTorch face: gradcheck of its motion, and what it refuses."""
+"""Every solver of the core through the PyTorch interface: gradcheck of its motion, and what it refuses."""
 
 import numpy as np
 import pytest

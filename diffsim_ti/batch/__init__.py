@@ -1,4 +1,4 @@
-"""Many scenes at once."""
+"""Many scenes in a batch."""
 
 from diffsim_ti.batch.batch import Batch, BatchFrames
 

@@ -1,4 +1,4 @@
-"""Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents at once."""
+"""Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents together."""
 
 import warnings
 from collections.abc import Iterable
@@ -28,14 +28,14 @@ from diffsim_ti.state.schedule import UnequalSteps
 
 
 class Batch:
-    """`scenes` runs of a solver's scene at once, with numbers of their own where they are given with a leading axis.
+    """`scenes` runs of a solver's scene simultaneously, with numbers of their own where they are given with a leading axis.
 
     solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.
     scenes: how many, >= 1.
-    lanes: None, side by side where the scene allows it, else one after the other: eight scenes at once in the lanes of
-    vector units on CPUs, each on threads of its own on GPUs, neighbouring scenes on neighbouring ones. True: ValueError,
-    which says why, where it does not; False: one after the other. `lanes` then says which it is, and `why_not` what keeps
-    the scene from it.
+    lanes: None, side by side where the scene allows it, else one after the other: eight scenes simultaneously in the
+    lanes of vector units on CPUs, each on threads of its own on GPUs, neighbouring scenes on neighbouring ones. True:
+    ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and
+    `why_not` what keeps the scene from it.
     runs: as of `Rollout`, for `run` under `ti.ad.Tape`.
 
     Every input of `forward` is given once for all scenes, in a shape that `Rollout.forward` takes, or with one more axis of
@@ -107,7 +107,7 @@ class Batch:
 
     @property
     def outputs(self) -> dict[str, Output]:
-        """What a loss may name, of one scene."""
+        """The outputs of one scene."""
         return self.one.outputs
 
     # ---- forward -----------------------------------------------------------------------------------------------------

@@ -82,7 +82,7 @@ class BatchFrames(Sequence):
     def end(self) -> dict[str, np.ndarray]:
         """The last states as inputs of a run that goes on from there, in float64: initial_positions, initial_velocities.
 
-        `reset` starts some scenes anew.
+        `reset` restarts some scenes.
         """
         rest = self.values["rest_positions"]
         rest = np.stack(rest) if isinstance(rest, tuple) else rest
@@ -94,7 +94,7 @@ class BatchFrames(Sequence):
     def reset(
         self, mask: ArrayLike | None = None, positions: ArrayLike | None = None, velocities: ArrayLike | None = None
     ) -> dict[str, np.ndarray]:
-        """`end`, where the scenes of a mask (scenes,), default those that did not come to their end, start anew.
+        """`end`, where the scenes of a mask (scenes,), default those that did not come to their end, restart.
 
         positions [m], velocities [m/s]: where and how, (n, 3) for all of these or (how many they are, n, 3); default the
         start of the scene. Raises ValueError for other shapes, and for numbers that are not finite.
@@ -111,7 +111,7 @@ class BatchFrames(Sequence):
             if rows.shape not in (shape, (int(mask.sum()), *shape)) or not np.isfinite(rows).all():
                 raise ValueError(
                     f"{name.removeprefix('initial_')}: expected finite numbers of shape {shape} or "
-                    f"{(int(mask.sum()), *shape)}, for the scenes that start anew, got {rows.shape}"
+                    f"{(int(mask.sum()), *shape)}, for the scenes that restart, got {rows.shape}"
                 )
             out[name][mask] = rows
         return out

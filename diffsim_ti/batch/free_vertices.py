@@ -10,7 +10,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.loads.explicit import GivenForces
-from diffsim_ti.runtime import LANES, Bundle, assign, at, let, traced, variable
+from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced, variable
 from diffsim_ti.solvers.explicit import kick_drift
 from diffsim_ti.state.features import Features
 
@@ -30,6 +30,28 @@ class Numbers:
 
     def __getitem__(self, k):
         return at(self._array, self._first + k)
+
+
+@traced
+class Component:
+    """A component of vectors of a block: `array[row, k]` is that of vector k, in lanes."""
+
+    _data_oriented = True
+
+    def __init__(self, array, first):
+        self._array, self._first = array, first
+
+    def __getitem__(self, index):
+        return at(self._array, index[0], self._first + 3 * index[1])
+
+
+@dataclass(frozen=True)
+class GivenInLanes(GivenForces):
+    """As GivenForces, of a component in lanes in place of a vector."""
+
+    @property
+    def vector(self):
+        return ti.types.vector(LANES, self.fp)
 
 
 @traced
@@ -54,10 +76,6 @@ class FreeVertices:
     @cached_property
     def lanes(self):
         return ti.types.vector(LANES, self.fp)
-
-    @cached_property
-    def given(self) -> GivenForces:
-        return GivenForces(self.features, self.law.precision)
 
     @property
     def some_special(self) -> bool:
@@ -110,55 +128,21 @@ class FreeVertices:
 
     # ---- forces given on vertices --------------------------------------------------------------------------------------
 
-    @traced
-    def force_at(self, rows, row, place, share):
-        """share of the force in a row."""
-        return [let(share * x) for x in self.read(rows, row, place)]
+    @cached_property
+    def given(self) -> GivenInLanes:
+        return GivenInLanes(self.features, self.law.precision)
 
     @traced
-    def slot(self, i, b, scene, plan) -> tuple:
-        """(where the force of vertex i begins in a row, 1 or 0 if it has none)"""
-        k, width = let(at(scene.force_slot, i)), (2 if self.features.forces_keyed else 1)
-        loaded = let(ti.select(k >= 0, ti.cast(1, self.fp), ti.cast(0, self.fp)))
-        return let(3 * (let(b * plan.num_loaded) + width * ti.max(k, 0))), loaded
+    def given_on(self, b, record, plan) -> list:
+        """Components of the forces on vertices of block b, or of changes or adjoints of them."""
+        first = let(3 * b * plan.num_loaded)
+        return [Bundle(forces=Component(record.forces, let(first + d))) for d in range(3)]
 
     @traced
-    def kicks(self, i, b, now, scene, plan) -> list:
-        """(row, place, how far in the step, weight) of both kicks, where forces change within steps."""
-        (place, loaded), out = self.slot(i, b, scene, plan), []
-        for step, weight in ((now.force0, now.share0), (now.force1, now.share1)):
-            share = let(ti.select(step == now.row, now.begin, ti.cast(1, self.fp)))
-            out.append((step if self.features.forces_per_step else 0, place, share, let(weight * loaded)))
-        return out
-
-    @traced
-    def load_terms(self, i, b, now, scene, plan) -> list:
-        """(row, place, weight) of the rows of forces that vertex i takes; a weight of zero where it takes none."""
-        F = self.features
-        if F.forces_keyed:
-            out = []
-            for row, place, share, weight in self.kicks(i, b, now, scene, plan):
-                out += [(row, place, let(weight * (1 - share))), (row, let(place + 3), let(weight * share))]
-            return out
-        place, loaded = self.slot(i, b, scene, plan)
-        if F.forces_per_step:
-            return [(now.force0, place, let(now.share0 * loaded)), (now.force1, place, let(now.share1 * loaded))]
-        return [(0, place, loaded)]
-
-    @traced
-    def load(self, i, b, now, scene, forces, plan) -> list:
-        """The force of a pass, with the operations of GivenForces in their order."""
-        if self.features.forces_keyed:
-            parts = [self.keyed_force(forces, *kick) for kick in self.kicks(i, b, now, scene, plan)]
-        else:
-            parts = [self.force_at(forces, *part) for part in self.load_terms(i, b, now, scene, plan)]
-        return parts[0] if len(parts) == 1 else [let(x + y) for x, y in zip(*parts)]
-
-    @traced
-    def keyed_force(self, forces, row, place, share, weight) -> list:
-        """weight times a force of a step that changes from its beginning to its end."""
-        begin, end = self.read(forces, row, place), self.read(forces, row, let(place + 3))
-        return [let(weight * (x + share * (y - x))) for x, y in zip(begin, end)]
+    def with_load(self, f, i, b, now, scene, record, plan) -> list:
+        """f, and what is given on vertex i in a pass."""
+        components = self.given_on(b, record, plan)
+        return [let(x + self.given.force(i, now, scene, own.forces)) for x, own in zip(f, components)]
 
     # ---- forward -------------------------------------------------------------------------------------------------------
 
@@ -168,7 +152,7 @@ class FreeVertices:
         first, F = self.first_of(i, b, plan), self.features
         u, v, f = self.read(state.u, s, first), self.read(state.v, s, first), self.read(scene.corner, first)
         if F.forces:
-            f = [let(x + y) for x, y in zip(f, self.load(i, b, now, scene, scene.forces, plan))]
+            f = self.with_load(f, i, b, now, scene, scene, plan)
         inverse = self.inverse_mass(i, b, scene, plan)
         a = [let(inverse * x) for x in f]
         if F.gravity >= 0:
@@ -252,7 +236,7 @@ class FreeVertices:
         first, F, n = self.first_of(i, b, plan), self.features, let(b * plan.num_vertices + i)
         du, dv, df = self.read(tangent.u, 0, first), self.read(tangent.v, 0, first), self.read(scene.corner, first)
         if F.forces:
-            df = [let(x + y) for x, y in zip(df, self.load(i, b, now, scene, tangent.forces, plan))]
+            df = self.with_load(df, i, b, now, scene, tangent, plan)
         inverse, f = self.inverse_mass(i, b, scene, plan), self.read(state.f, s, first)
         dm = let(at(tangent.mass, n))
         da = each(kick_drift.acceleration_jvp, f, df, dm=dm, inverse=inverse)
@@ -318,8 +302,8 @@ class FreeVertices:
             for d in range(3):
                 self.add_number(adjoint.sums, let(moves * a_adj[d]), F.gravity + d, n)
         if F.forces:
-            for row, place, weight in self.load_terms(i, b, now, scene, plan):
-                self.add(adjoint.forces, [let(weight * x) for x in f_adj], row, place)
+            for x, own in zip(f_adj, self.given_on(b, adjoint, plan)):
+                self.given.add_vjp(i, x, now, scene, own)
         self.write(adjoint.u, p, 0, first)
         self.write(adjoint.v, v_mid_adj, 0, first)
         self.write(adjoint.w, f_adj, 0, first)

@@ -77,7 +77,7 @@ def identify(
     size: Size = None,
     gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]; a guess if unknown")] = 0.0,
-    fixed: Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold")] = None,
+    fixed: Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix")] = None,
     pull: Annotated[
         str | None, typer.Option(help="of a force curve: vertex set, or xmin .. zmax, that is moved")
     ] = None,

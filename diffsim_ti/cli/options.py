@@ -36,8 +36,8 @@ Density = Annotated[float, typer.Option(help="[kg/m^3]")]
 Arrows = Annotated[
     list[str] | None,
     typer.Option(
-        help="forces to draw as arrows and to write: reaction (of what is held), contact, friction (its part); of a saved "
-        "series what it holds; may be repeated"
+        help="forces to draw as arrows and to write: reaction (of supports), contact, friction (its part); of a saved "
+        "series those that it contains; may be repeated"
     ),
 ]
 Volume = Annotated[
@@ -48,7 +48,7 @@ Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
 Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
 SUFFIXES = f"{', '.join(WRITERS)} (run_%04d.png: every frame, run.png: the end)"
-Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")]
+Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")]
 Workers = Annotated[int, typer.Option(help="processes that share the work")]
 Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is written")]
 

@@ -58,7 +58,7 @@ class ResultsOfFile:
 
 
 def axis(text: str) -> tuple[str, list[float]]:
-    """E=1e4..1e6:20:log, speed=0..2:5 or nu=.3,.4 as (name, values)."""
+    """E=1e4..1e6:20:log, speed=0..2:5 or nu=0.3,0.4 as (name, values)."""
     name, _, values = (part.strip() for part in text.partition("="))
     try:
         if not name:

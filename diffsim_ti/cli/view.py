@@ -28,7 +28,7 @@ def render(
     arrows: Annotated[
         list[str] | None,
         typer.Option(
-            help="vectors of vertices that the series holds, such as forces, to draw as arrows; may be repeated"
+            help="vectors at vertices that the series contains, such as forces, to draw as arrows; may be repeated"
         ),
     ] = None,
 ) -> None:

@@ -58,14 +58,14 @@ def identify(
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
     method: "Levenberg-Marquardt", which takes the fewest simulations; "L-BFGS-B" (SciPy's) needs gradients alone, so serves
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as
-    `lambda t: torch.optim.Adam(t, lr=0.05)`, for costs that are rough. Both begin anew when resumed.
+    `lambda t: torch.optim.Adam(t, lr=0.05)`, for costs that are rough. Both begin again when resumed.
     starts: how many searches, the first from the unknowns' own start, the others from those of sixteen times as many
     points around it whose cost is least (`around`); or further starts, a list of {unknown: numbers}. The best search is
     returned, `Identification.starts` has all. Default: one, and up to four more, until one explains the data, where the
     residuals of the first are more than three times the noise. max_iterations are of each.
     check_mesh: fit the data again with ten-node tetrahedra of the same mesh, by a few forward runs, and widen the intervals
     by what estimates move (`MeshCheck`). Default: where it costs no more than three times the fit, or takes some seconds.
-    False for data of this very mesh, which know nothing of its error.
+    False for data that this very mesh computed, which do not contain its error.
     Numbers that end a run (Divergence, NotConverged, ValueError) shorten the step.
     Raises ValueError for what does not fit, before any run, and what the first run raises.
     Marquardt 1963, doi:10.1137/0111030; Seber, Wild, Nonlinear Regression, 1989, ch. 5, on intervals.

@@ -157,8 +157,8 @@ class Identification:
             )
         elif self.noise_overstated:
             said.append(
-                f"Residuals are {ratio} of the noise given, less than it explains: it was overstated, or the data are "
-                "synthetic, without noise. Intervals are those of the noise given."
+                f"Residuals are {ratio} of the stated noise, less than it explains: it was overstated, or the data are "
+                "synthetic and have no noise. Intervals are those of the stated noise."
             )
         if not self.converged:
             said.append(f"NOT CONVERGED: {self.stopped}.")
@@ -175,8 +175,8 @@ class Identification:
             )
             if self.mesh.chi_square > 4 * max(self.chi_square, self.degrees):
                 said.append(
-                    f"It fits worse there (chi^2 {self.mesh.chi_square:.4g}): data of this very mesh know nothing of its "
-                    "error, and take check_mesh=False."
+                    f"It fits worse there (chi^2 {self.mesh.chi_square:.4g}): data that this very mesh computed do not "
+                    "contain its error, so pass check_mesh=False."
                 )
         return " ".join(said)
 

@@ -77,7 +77,7 @@ class Input:
     label: how errors of a constructor call it; default `plain`. The unit stands behind if not in it.
     axes: of places, the axis of each of its numbers, "xyz" or such as "y" of a height; "" of all else (origin.py).
     single: whether the value was given in float32.
-    given: what the value was given as, if that is a tensor with a graph; the face to its library takes it from here.
+    given: what the value was given as, if that is a tensor with a graph; the interface to its library takes it from here.
     """
 
     name: str

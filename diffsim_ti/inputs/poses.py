@@ -52,7 +52,7 @@ def between(name: str, rows: np.ndarray) -> np.ndarray:
         k = wrong[0]
         raise ValueError(
             f"{name}: rotation vectors {shown(a[k].tolist())} and {shown(b[k].tolist())}, rows {k} and {k + 1}, are more "
-            "than half a turn apart and not on one axis; put rows between them"
+            "than half a turn apart and not on one axis; insert keyframes between them"
         )
     # out + 2 pi k n, n its direction, nearest to the difference
     n = np.where((size > 1e-9)[:, None], out, b - a)

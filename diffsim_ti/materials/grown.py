@@ -82,7 +82,7 @@ class Grown(Around):
     number, one for each tetrahedron, or by named sets as all numbers of materials; an input with gradient, "growth". A free
     body with uniform growth takes its new size without stress. Mass stays that of the rest shape.
     It holds during a run; a term `Growth` adds what changes in time.
-    volume="patches" does not know it.
+    volume="patches" does not support it.
     Rodriguez, Hoger, McCulloch 1994, Stress-dependent finite growth, doi:10.1016/0021-9290(94)90021-3.
     Raises ValueError for growth of -1 or less, and for a material that has a state or depends on the velocity.
     """
@@ -110,7 +110,7 @@ class Grown(Around):
 def grown(material: Material, volume: str) -> Material:
     """The material if it is Grown, or has a growth within, else `Grown(material, 0)`; for terms that grow it over time."""
     if volume == "patches":
-        raise ValueError('Growth: volume="patches" does not know it; take volume="tetrahedra" or mesh.quadratic()')
+        raise ValueError('Growth: volume="patches" does not support it; take volume="tetrahedra" or mesh.quadratic()')
     if "growth" in material.law("f64").coefficient_names:
         return material
     try:

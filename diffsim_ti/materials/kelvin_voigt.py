@@ -146,7 +146,7 @@ class KelvinVoigt(Around):
     Implicit steps take (E - E_before) / h, a potential of the step: symmetric, zero for a rigid turn; the midpoint's, whose
     middle is no rigid turn, sees tau h omega^2 / 4 of strain in a spin, which does no work. In float32 such a difference has
     lost digits: gradients by viscosity are then good to 1e-3.
-    volume="patches" does not know it.
+    volume="patches" does not support it.
     Simo, Hughes, Computational Inelasticity, 1998, ch. 10, doi:10.1007/b98904.
     Raises ValueError for negative numbers, both spellings at once, and a material with a viscosity of its own.
     """

@@ -69,8 +69,8 @@ class Prony(Around):
     (law.py: of first order in its length). The stress has an energy, and what is lost [W/m^3],
     sum g_i / tau_i (E - z_i) : C : (E - z_i), is never negative; crushed elements have it too. Viscosity goes around it:
     `KelvinVoigt(Prony(...), time=...)`.
-    `Stress`, `Reaction` and `ElasticEnergy` know the state of each frame. Statics and volume="patches" do not know it: what
-    lasts is the material inside.
+    `Stress`, `Reaction` and `ElasticEnergy` take the state of each frame. Static solves and volume="patches" do not support
+    it: what lasts is the material inside.
     Simo, Hughes, Computational Inelasticity, 1998, ch. 10.3, doi:10.1007/b98904.
     Raises ValueError for numbers out of range, and a material that has a state or a viscosity.
     """

@@ -43,7 +43,7 @@ class StableNeoHookean(Material):
     J < J_floor, so that the stress pushes outwards. Above the floor the formula is exact. The limit: that is not full
     recovery. Near F = 0 no law of this form leads every inverted state back; `SmithNeoHookean` recovers from more of them.
 
-    Arguments: see `Material`; J_floor in (0, 1), one number, part of the law (a change compiles kernels anew).
+    Arguments: see `Material`; J_floor in (0, 1), one number, part of the law (a change compiles kernels again).
     Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed. 2008, sec. 6.4.3.
 
     >>> import diffsim_ti as ds

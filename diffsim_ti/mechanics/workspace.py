@@ -132,7 +132,7 @@ class Workspace:
         value, shape = numbers("law_state", law_state), self.arrays.law_state_shape
         names = self.arrays.law.state_names
         if not names:
-            raise ValueError(f"law_state: {self.arrays.law.title} remembers nothing; leave it out")
+            raise ValueError(f"law_state: {self.arrays.law.title} has no state; leave it out")
         if value.shape != shape or not np.all(np.isfinite(value)):
             raise ValueError(
                 f"law_state: expected finite numbers of shape {shape}, in each tetrahedron {', '.join(names)}, "

@@ -212,7 +212,7 @@ def warn_of_orphans(orphans: np.ndarray) -> None:
     if len(orphans):
         vertices = "1 vertex" if len(orphans) == 1 else f"{len(orphans)} vertices"
         warnings.warn(
-            f"{vertices} in no tetrahedron, first {orphans[0]}: without mass, a simulation holds them in place; remove "
+            f"{vertices} in no tetrahedron, first {orphans[0]}: without mass, a simulation keeps them in place; remove "
             "them, or load with from_file(..., drop_orphans=True)",
             stacklevel=4,
         )

@@ -1,4 +1,4 @@
-"""The face of a mesh to its named sets: of vertices, of tetrahedra, and of triangles of the surface."""
+"""The named sets of a mesh: of vertices, of tetrahedra, and of triangles of the surface."""
 
 from collections.abc import Callable, Iterable
 from types import MappingProxyType

@@ -72,8 +72,8 @@ class Chatter:
             damped = f"KelvinVoigt({material}(...), {time:.2g}) as the material"
             remedy = f"{damped}, which damps these vibrations, or {remedy}"
         warnings.warn(
-            f"{ws.when(ws.step_of(now - 1, num_passes))}: what slides on {term!r} at {slide:.3g} m/s shakes at {shake:.3g} "
-            f"m/s, contact opening and closing, in steps that damp nothing: friction then does not point against the "
-            f"sliding, and ways come out some per cent too long; take {remedy}",
+            f"{ws.when(ws.step_of(now - 1, num_passes))}: a body that slides on {term!r} at {slide:.3g} m/s vibrates at "
+            f"{shake:.3g} m/s, and its contact opens and closes, because these steps have no damping: friction then does "
+            f"not oppose the sliding, and sliding distances are a few per cent too long; take {remedy}",
             stacklevel=7,
         )

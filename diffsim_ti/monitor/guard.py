@@ -301,7 +301,7 @@ class Guard:
             f"the substep {self.ws.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: take substeps of "
             f"{self._calm_substep(stable):.3g} s (reduce dt, raise substeps, or use an implicit solver)"
             if not self.ws.substep <= stable
-            else f"the stable step {state} is {stable:.4g} s, so look at forces, contacts, inputs and inverted tetrahedra"
+            else f"the stable step {state} is {stable:.4g} s, so check forces, contacts, inputs and inverted tetrahedra"
         )
         bodies = ws.arrays.bodies
         if bodies is not None and vertex in bodies.vertices[bodies.rigid[bodies.owner]]:

@@ -244,7 +244,7 @@ class Stiffness:
                 return 0.0, 0.0
         if not 0 < size < np.inf:
             raise FloatingPointError(
-                f"the stiffness of this state is {'zero' if size == 0 else 'not finite'} in this precision: look at Young's "
+                f"the stiffness of this state is {'zero' if size == 0 else 'not finite'} in this precision: check Young's "
                 'modulus and the scale of the mesh, or take precision="f64"'
             )
         operator = LinearOperator((3 * n, 3 * n), lambda x: self.product(x.reshape(-1, 3)).ravel(), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What a loss may name besides a run's inputs: functions of its frames, one file each, and their interface for others."""
+"""Outputs, which losses use like positions: functions of a run's frames, one file each, and their interface for others."""
 
 from diffsim_ti.outputs.chamber_pressure import ChamberPressure
 from diffsim_ti.outputs.contact_force import ContactForce
@@ -11,9 +11,9 @@ from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.self_contact_force import SelfContactForce
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
-from diffsim_ti.outputs.ties import TieLength, TieTension
+from diffsim_ti.outputs.ties import Length, Tension
 from diffsim_ti.outputs.work import WorkOfLoads
 
 __all__ = ["ChamberPressure", "Change", "ContactForce", "ContactTraction", "Displacements", "ElasticEnergy"]
-__all__ += ["EnclosedVolume", "KineticEnergy", "MaterialPoints", "Output", "Positions", "Reaction"]
-__all__ += ["SelfContactForce", "Strain", "Stress", "TieLength", "TieTension", "Velocities", "WorkOfLoads"]
+__all__ += ["EnclosedVolume", "KineticEnergy", "Length", "MaterialPoints", "Output", "Positions", "Reaction"]
+__all__ += ["SelfContactForce", "Strain", "Stress", "Tension", "Velocities", "WorkOfLoads"]

@@ -88,7 +88,9 @@ class BodyForces:
 
     def __init__(self, scene):
         if scene.term(Growth):
-            raise ValueError("forces of the body at frames do not know Growth over time; take Grown(material, growth)")
+            raise ValueError(
+                "forces of the body at frames do not support Growth over time; take Grown(material, growth)"
+            )
         self.scene, self.arrays = scene, SceneArrays(scene)
         a = self.arrays
         self.at, self.change, self.out = (

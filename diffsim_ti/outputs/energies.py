@@ -37,7 +37,7 @@ class ElasticEnergy(Output):
         law, mesh = scene.law, scene.mesh
         if law.in_steps().reads != ("H",):
             raise ValueError(
-                f"ElasticEnergy knows laws of the displacement gradient, not {law.title}: take a law without rates"
+                f"ElasticEnergy supports laws of the displacement gradient, not {law.title}: take a law without rates"
             )
         self.refuse_growth("ElasticEnergy", scene)
         out = copy(self)

@@ -1,4 +1,4 @@
-"""What a loss may name: a function of a run's frames and inputs, with its derivatives beside it."""
+"""An output, which losses use like positions: a function of a run's frames and inputs, with its derivatives beside it."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -75,7 +75,7 @@ class Output(ABC):
         """Raise ValueError where tetrahedra grow over time: an output knows frames, not what they had grown by."""
         if scene.term(Growth):
             raise ValueError(
-                f"{output} evaluates the law and does not know Growth over time; take Grown(material, growth), or strains"
+                f"{output} evaluates the law and does not support Growth over time; take Grown(material, growth), or strains"
             )
 
     def remembered(self, frames: "Frames", scene: "Scene") -> np.ndarray:

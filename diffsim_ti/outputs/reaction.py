@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Reaction(Output):
-    """Force [N] with which vertices are held, shape (frames, 3), or of each, (frames, k, 3), at each frame's state.
+    """Force [N] of the supports on fixed vertices, shape (frames, 3), or of each, (frames, k, 3), at each frame's state.
 
         R = -sum over the support of Q_i (f_i + m_i g + F_i)
 
@@ -27,16 +27,16 @@ class Reaction(Output):
     is no name in the scene's `fixed`, all do.
     So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero where
     supports share no vertices, or hold them in directions perpendicular to each other.
-    What obstacles and self-contact do to held vertices themselves is not in it (ContactForce has the first), nor is the
+    What obstacles and self-contact do to fixed vertices themselves is not in it (ContactForce has the first), nor is the
     inertia of vertices that a prescribed motion accelerates. A held volume pushes with what `ChamberPressure` says of it.
 
-    support: which of the held vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
+    support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
     about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
         `mesh.vertex_indices(support)`. name: how a loss calls it.
     The gradient is exact by all inputs. In single precision a reaction is the small sum of large forces of stress: it has an
     error of some 1e-6 of these.
 
-    Raises ValueError for a support that is not held, or for about= and per_vertex=True together.
+    Raises ValueError for a support that is not fixed, or for about= and per_vertex=True together.
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
 
     >>> import diffsim_ti as ds
@@ -73,7 +73,7 @@ class Reaction(Output):
         loose = np.setdiff1d(out.vertices, scene.held)
         if len(out.vertices) == 0 or len(loose):
             raise ValueError(
-                f"Reaction: the support must be among the held vertices, but {len(loose) or 'all'} of its "
+                f"Reaction: the support must be among the fixed vertices, but {len(loose) or 'all'} of its "
                 f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
             )
         out.scene, out.body, out.loads = scene, BodyForces(scene), GivenLoads(scene, moving=True)

@@ -226,7 +226,7 @@ class Stress(_Tensors):
         law = scene.law
         if law.in_steps().reads != ("H",):
             raise ValueError(
-                f"Stress knows laws of the displacement gradient, not {law.title}: take a law without rates"
+                f"Stress supports laws of the displacement gradient, not {law.title}: take a law without rates"
             )
         self.refuse_growth("Stress", scene)
         out = super().settled(scene)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.common.deprecated import renamed_arguments
 from diffsim_ti.mechanics.ties.interaction import SpringsAndCables
 from diffsim_ti.outputs.given_loads import at_end
 from diffsim_ti.outputs.output import Change, Output
@@ -17,19 +18,19 @@ if TYPE_CHECKING:
 
 
 class _OfTies(Output):
-    """A number of each tie of a term, at each frame's state and as the step ends that leads there; shape (frames,) of a
-    cable or a single spring, else (frames, k)."""
+    """One number for each spring or cable of a term, from the state in each frame and the loads at the end of the step that
+    leads to it; shape (frames,) of a cable or a single spring, else (frames, k)."""
 
-    def __init__(self, tie: Tie | str, name: str):
-        self.tie, self.name = tie, name
+    def __init__(self, of: Tie | str, name: str):
+        self.of, self.name = of, name
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.tie!r}, name={self.name!r})"
+        return f"{type(self).__name__}({self.of!r}, name={self.name!r})"
 
     def settled(self, scene: "Scene") -> "_OfTies":
         out = copy(self)
         ties = scene.interaction(SpringsAndCables)
-        number = scene.place_among(ties.terms if ties else (), self.tie, "spring or cable")
+        number = scene.place_among(ties.terms if ties else (), self.of, "spring or cable")
         out.scene, out.own, out.ties = scene, ties.places(number), ties.host()
         out.count = out.own.stop - out.own.start
         return out
@@ -83,20 +84,21 @@ class _OfTies(Output):
         )
 
 
-class TieLength(_OfTies):
+class Length(_OfTies):
     """Length L [m] of a cable along its points, or of springs between theirs, in each frame; shape (frames,), or
     (frames, k) of a `Spring` term with k springs.
 
-    tie: the term's name, or the term as the scene lists it. name: how a loss calls it. The gradient is exact by all inputs;
-    that of a spring without length is given as 0.
-    Raises ValueError for a spring or cable that the scene has not.
+    of: the name of the `Spring` or `Cable`, or the term as the scene lists it. name: what losses call the output.
+    The gradient is exact with respect to all inputs; that of a spring of zero length is set to 0.
+    Raises ValueError for a spring or cable that is not in the scene.
     Zienkiewicz, Taylor 2000, The Finite Element Method, vol. 2, 5th ed., sec. 10.2.
     """
 
     unit = "m"
 
-    def __init__(self, tie: Tie | str, name: str = "length"):
-        super().__init__(tie, name)
+    @renamed_arguments(tie="of")
+    def __init__(self, of: Tie | str, name: str = "length"):
+        super().__init__(of, name)
 
     def _value(self, ties, u):
         return ties.lengths(u)
@@ -110,20 +112,22 @@ class TieLength(_OfTies):
         return by_u, segments, (none, none, none)
 
 
-class TieTension(_OfTies):
-    """Pull T [N] along a cable, or of springs (below zero: a push), in each frame; shape (frames,), or (frames, k) of a
-    `Spring` term with k springs. A given tension as it is when the step ends that leads to the frame.
+class Tension(_OfTies):
+    """Tension T [N] of a cable or of springs (negative in compression), in each frame; shape (frames,), or (frames, k) of a
+    `Spring` term with k springs. A prescribed tension is that at the end of the step that leads to the frame.
 
-    tie: the term's name, or the term as the scene lists it. name: how a loss calls it. The gradient is exact by all inputs;
-    a slack cable's is 0. In single precision it has the error of the positions, some 1e-7 of them times the stiffness.
-    Raises ValueError for a spring or cable that the scene has not.
+    of: the name of the `Spring` or `Cable`, or the term as the scene lists it. name: what losses call the output.
+    The gradient is exact with respect to all inputs; it is 0 for a slack cable. In single precision the tension has
+    the error of the positions, about 1e-7 of them, times the stiffness.
+    Raises ValueError for a spring or cable that is not in the scene.
     Zienkiewicz, Taylor 2000, The Finite Element Method, vol. 2, 5th ed., sec. 10.2.
     """
 
     unit = "N"
 
-    def __init__(self, tie: Tie | str, name: str = "tension"):
-        super().__init__(tie, name)
+    @renamed_arguments(tie="of")
+    def __init__(self, of: Tie | str, name: str = "tension"):
+        super().__init__(of, name)
 
     def _value(self, ties, u):
         return ties.tensions(u)

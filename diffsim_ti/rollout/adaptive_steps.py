@@ -152,7 +152,7 @@ class _Search:
         """What to say of a step that needs too many substeps."""
         return ValueError(
             f"step {step}, t = {step * self.simulator.solver.dt:.4g} s: {MOST} substeps do not keep its error small enough "
-            "for the tolerance: raise it, or look at what is so stiff there"
+            "for the tolerance: raise it, or check what is so stiff there"
         )
 
     def _error(self, coarse: tuple, fine: tuple) -> float:

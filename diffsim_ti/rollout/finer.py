@@ -46,7 +46,7 @@ def on_ten_nodes(scene: Scene, mesh: TetrahedralMesh | None = None) -> Scene:
     if not is_named(given["fixed"]):
         if mesh is not None:
             raise ValueError(
-                "vertices that are held by their indices are not those of a finer mesh: name them as a set"
+                "vertices that are fixed by their indices are not those of a finer mesh: name them as a set"
             )
         base, given["fixed"] = base.with_vertex_set(HELD, given["fixed"]), HELD
     nodes = base.quadratic()

@@ -77,7 +77,7 @@ def check_finite(name: str, adjoint: np.ndarray, save_every: int) -> None:
         frame = int(np.argwhere(~np.isfinite(adjoint))[0][0]) if adjoint.ndim else 0
         raise FloatingPointError(
             f"the loss's gradient by {name} is not finite at step {frame * save_every} "
-            f"(frame {frame}): look at the loss; parameters are unchanged"
+            f"(frame {frame}): check the loss; parameters are unchanged"
         )
 
 

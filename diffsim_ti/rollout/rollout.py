@@ -38,7 +38,7 @@ class Rollout:
     clip: largest norm of the running adjoint; it is scaled back when it exceeds that (the gradient is then no gradient).
     truncate: differentiate only the last so many steps.
     health: keep a report of the adjoint's norm per step (`rollout.health`).
-    outputs: what a loss may name besides positions, velocities and displacements, such as ContactForce, Reaction, Stress,
+    outputs: what losses use besides positions, velocities and displacements, such as ContactForce, Reaction, Stress,
         MaterialPoints (outputs/).
     runs: how many runs one tape may hold, each with frames of its own; see `run`.
     raise_errors: False marks a run that goes wrong instead of raising: `frames.alive`, and of the last run `rollout.alive`,
@@ -216,7 +216,7 @@ class Rollout:
     ) -> dict[str, np.ndarray]:
         """Gradients of a loss by every wanted input, from its gradients by positions, velocities and other outputs.
 
-        Float64 arrays of the inputs' shapes; None for a part that the loss does not name. Further seeds of the same
+        Float64 arrays of the inputs' shapes; None for a part that the loss does not depend on. Further seeds of the same
         frames cost a reverse sweep each: no pass runs forward again unless too few states are kept.
         That by `rest_positions` is of a body whose start, and with it its supports, stay where they are: the gradient by the
         shape of a body that is held is the sum of this and that by `initial_positions`, which a Rollout made with

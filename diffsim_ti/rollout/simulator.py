@@ -1,4 +1,4 @@
-"""Simulator: the step-by-step face of a solver."""
+"""Simulator: the step-by-step interface of a solver."""
 
 import weakref
 
@@ -87,7 +87,7 @@ class Simulator:
 
     def __reduce__(self):
         raise TypeError(
-            "a Simulator holds memory of the device and does not pickle: pickle its solver and its state, and there "
+            "a Simulator owns memory of the device and does not pickle: pickle its solver and its state, and there "
             "Simulator(solver), resume(state)"
         )
 
@@ -205,7 +205,7 @@ class Simulator:
         """Go on from a `state` of this scene and solver with the same bits, as if the run had not stopped.
 
         state: the dictionary, or what np.load makes of its file. The scene, the solver and its substeps must be as they
-        were. Raises ValueError for parts that lack, that nobody knows, or that have other shapes.
+        were. Raises ValueError for parts that are missing, unknown, or of other shapes.
         """
         given, known = {name: np.asarray(state[name]) for name in state}, self.state
         two_step = {"displacements_before", "velocities_before"} if self._has_before else set()
@@ -347,7 +347,9 @@ class Simulator:
     def smallest_gap(self) -> float:
         """Smallest distance [m] of surface primitives that share no vertex; infinite beyond the reach of SelfContact."""
         if self.workspace.pairs is None:
-            raise ValueError("this scene has no SelfContact: add it to the scene's terms to know gaps between surfaces")
+            raise ValueError(
+                "this scene has no SelfContact: add it to the scene's terms to measure gaps between surfaces"
+            )
         return self.workspace.pairs.look(self.workspace.state.u)[1]
 
     def check_surfaces(self) -> None:

@@ -396,7 +396,7 @@ class Sweep:
             now = self.workspace.first_step + step
             raise FloatingPointError(
                 f"the adjoint became not finite in step {now} (t = {self.solver.schedule.time(now):g} s): "
-                "look at the loss and at how long the rollout stays smooth; parameters are unchanged"
+                "check the loss and how long the rollout stays smooth; parameters are unchanged"
             )
         scaled, norm = 1.0, float(np.hypot(by_position, by_velocity))
         if self.clip is not None and norm > self.clip:

@@ -195,7 +195,7 @@ def check_alive(owner: weakref.ref) -> None:
         return
     refuse_fork()
     if not is_alive(owner):
-        raise RuntimeError("ti.init was called again, which destroys all Taichi data: build the scene and solver anew")
+        raise RuntimeError("ti.init was called again, which destroys all Taichi data: build the scene and solver again")
 
 
 def arch_name() -> str:
@@ -209,7 +209,7 @@ def arch_name() -> str:
             _settings["runs"] = owner, name
             return name
     raise RuntimeError(
-        f"Taichi was started on {_core.arch_name(arch)}, which diffsim_ti does not know: "
+        f"Taichi was started on {_core.arch_name(arch)}, which diffsim_ti does not support: "
         f"use one of {', '.join(_ARCHS)}, by diffsim_ti.init or ti.init"
     )
 

@@ -47,13 +47,14 @@ class Scene(MadeAgain):
         nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act one after
         the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
     fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names. Or
-        {name of a vertex or surface set: in which directions it is held}: axes such as "x" or "xyz", a direction (3
+        {name of a vertex or surface set: in which directions it is fixed}: axes such as "x" or "xyz", a direction (3
         numbers) or several, or "normal" of a flat surface set; so are rollers and symmetry planes made.
-    motion: displacement of the held vertices from where they start: a function of time [s] that returns 3 numbers or shape
+    motion: displacement of the fixed vertices from where they start: a function of time [s] that returns 3 numbers or shape
         (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
         directions, only those count. Or a `Pose`, which turns them; or, where `fixed` names sets, {name: such a motion}.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
-        Held vertices stay at initial_positions whatever rest_positions a run takes; `Rollout.forward(shape=...)` moves both.
+        Fixed vertices stay at initial_positions whatever rest_positions a run takes; `Rollout.forward(shape=...)` moves
+        both.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
         on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
@@ -61,10 +62,10 @@ class Scene(MadeAgain):
         (mass_scaling.py): bad tetrahedra then do not rule. Gravity acts on it, so that free fall stays as it is; weight and
         reactions grow by the share. By which factors vertices are heavier is found for the numbers given here, and kept
         whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
-        much was added. Implicit steps and statics add none.
+        much was added. Implicit steps and static solves add none.
     reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, in every
-        solver. "rigid": by six, turned and moved, in every solver. Or a basis, in implicit steps and statics: weights of a
-        `designs.Cage`, the shapes of `modes`. Of a start only what a set can do counts (reduced.py).
+        solver. "rigid": by six, turned and moved, in every solver. Or a basis, in implicit and static solves: weights of a
+        `designs.Cage`, the shapes of `modes`. Of a start only the admissible motions of a set count (reduced.py).
 
     Raises ValueError with rule, value and remedy for what no solver takes, and runs no kernel. What one kind of solver does
     not support its constructor refuses, and what an output does not, that of `Rollout`. Warns where tetrahedra lock, above

@@ -111,11 +111,11 @@ class SemiImplicitSolver(ExplicitSolver):
         super().check_scene(scene)
         if self.viscous_stages > 1 and not scene.law.viscous:
             raise ValueError(
-                f"viscous_stages={self.viscous_stages}: {scene.material.name} has no viscosity, so that further kicks of a "
-                "substep do nothing; put KelvinVoigt around it, or leave viscous_stages out"
+                f"viscous_stages={self.viscous_stages}: {scene.material.name} has no viscosity, so that additional kicks "
+                "in a substep have no effect; put KelvinVoigt around it, or leave viscous_stages out"
             )
         if self.viscous_stages > 1 and (scene.holds_volumes or scene.reduced):
-            what = "a FilledChamber knows" if scene.holds_volumes else "reduced sets know"
+            what = "a FilledChamber takes" if scene.holds_volumes else "reduced sets take"
             raise ValueError(f"viscous_stages: {what} one kick for each substep; take substeps, or an implicit solver")
 
     def describe(self):

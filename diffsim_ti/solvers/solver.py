@@ -63,8 +63,8 @@ class Solver(ABC):
         runtime.check_backend(scene.precision)
         if not self.explicit and scene.law.in_steps().reads != ("H",):
             raise ValueError(
-                f"{type(scene.law).__name__} reads {', '.join(scene.law.reads)}, but {type(self).__name__} knows forces of "
-                "displacements only; take SemiImplicitSolver or VelocityVerletSolver"
+                f"{type(scene.law).__name__} reads {', '.join(scene.law.reads)}, but {type(self).__name__} supports forces "
+                "of displacements only; take SemiImplicitSolver or VelocityVerletSolver"
             )
         self._schedule: UnequalSteps | None = None
         self._equal, self._equal_steps = None, None  # made once for dt and substeps as they are

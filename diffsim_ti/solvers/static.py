@@ -16,11 +16,11 @@ class StaticSolver(ImplicitSolver):
     saddle. Several steps follow prescribed motion and forces per step quasi-statically.
 
     tolerance, max_iterations, preconditioner: as of implicit steps: "block_jacobi", "multigrid" or "auto" for the last.
-    load_steps: in the first step loads and prescribed motion are laid on in so many parts, each starting from the last.
+    load_steps: in the first step loads and prescribed motion are applied in so many parts, each starting from the last.
     Raises ValueError, which names the motions, if supports, springs, cables and foundations leave a piece of the body free
     to move rigidly, or parts that meet at a vertex or an edge alone free to turn, as about a hinge. Where the scene has
     obstacles or SelfContact such a piece goes, as the loads pull it, by up to the body's size to where contact holds it,
-    with a warning; NotConverged if nothing does. NotConverged, too, where the body does not bear what a step lays on, which
+    with a warning; NotConverged if nothing does. NotConverged, too, where the body does not bear the load of a step, which
     names the share of it that it bears. Warns Buckled where it leaves a branch of stable equilibria.
     Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, ch. 3 and 7, doi:10.1007/978-0-387-40065-5.
 
@@ -66,7 +66,7 @@ class StaticSolver(ImplicitSolver):
 
     def check_schedule(self, schedule):
         raise ValueError(
-            "equilibria know no time, so that steps of unequal length mean nothing to them: pass their number"
+            "equilibria do not depend on time, and lengths of steps mean nothing to them: pass the number of steps"
         )
 
     def stage(self, rate, fresh, j):
@@ -78,4 +78,4 @@ class StaticSolver(ImplicitSolver):
         if said and (self.scene.obstacles or self.scene.term(SelfContact)):  # which may: known when it is closed
             self.loose = said.split(": hold")[0]
         elif said:
-            raise ValueError(f"statics: {said}, or use a solver with inertia")
+            raise ValueError(f"static solve: {said}, or use a solver with inertia")

@@ -128,7 +128,7 @@ class SceneArrays:
             self.guides = runtime.upload(scene.supports.guides.reshape(-1, 3), self.vector)
 
     def _twins(self, scene) -> list[tuple]:
-        """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
+        """(device counterpart, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
         parameters, one after the other."""
         widths = [poses.columns_of(term.path_width) for term in scene.moving]
         columns, out = dict(zip(scene.moving, np.cumsum([0, *widths]).tolist())), []

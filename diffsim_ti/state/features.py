@@ -11,7 +11,7 @@ from diffsim_ti.terms import VertexForce
 class ObstacleGroup:
     """Obstacles of one kind, which kernels go through in a loop: the k-th of them has its numbers at first + k size."""
 
-    force: VertexForce  # the compile-time twin of all of them
+    force: VertexForce  # the device counterpart of all of them
     first: int  # where the numbers of the first start in the parameter array
     number: int  # place of the first among all obstacles
     path: int = -1  # column of the first's path among those that move, -1 if they stand still
@@ -29,7 +29,8 @@ class ObstacleGroup:
 
 
 def grouped(obstacles) -> tuple[ObstacleGroup, ...]:
-    """Groups of obstacles given as (twin, first parameter, column of the path or -1), neighbours of one kind together."""
+    """Groups of obstacles given as (counterpart, first parameter, column of the path or -1), neighbours of one kind
+    together."""
     groups, turning = [], 0
     for number, (force, first, path) in enumerate(obstacles):
         last = groups[-1] if groups else None

@@ -53,7 +53,8 @@ class Walls:
             most = np.linalg.norm(path[at.schedule.row_of(path, at.j), c + 2]) * (at.schedule.end(at.j) - at.begin)
             if most > 3.1:
                 raise ValueError(
-                    f"an obstacle turns by {most:.3g} rad in a pass, which must be less than half a turn: take smaller steps"
+                    f"an obstacle turns by {most:.3g} rad in a substep, which must be less than half a turn: take "
+                    "smaller steps"
                 )
 
     def value(self, path: np.ndarray | None, at: Moment | None) -> np.ndarray:

@@ -56,7 +56,7 @@ def on_coarser(scene: Scene, mesh: TetrahedralMesh) -> Scene:
         held[scene.mesh.vertex_indices(fixed)] = 1
         if not np.any(own := at @ held > 1 - 1e-6):
             raise ValueError(
-                "none of its vertices lies between vertices that are held by their indices: name them as a set"
+                "none of its vertices lies between vertices that are fixed by their indices: name them as a set"
             )
         mesh, given["fixed"] = mesh.with_vertex_set(HELD, own), HELD
     nodes = mesh.quadratic()

@@ -38,7 +38,7 @@ def draw_maps(results: list, path: str | Path) -> None:
     for axes in panels[len(results) + 1 :]:
         axes.axis("off")
     silent, total = sum(len(r.silent) for r in results), sum(r.outcomes.size for r in results)
-    figure.suptitle(f"{results[0].axis.name}: {silent} of {total} runs went wrong without a word", fontsize=12)
+    figure.suptitle(f"{results[0].axis.name}: {silent} of {total} runs went wrong without an error", fontsize=12)
     save(figure, path)
 
 

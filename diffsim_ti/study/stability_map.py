@@ -152,7 +152,7 @@ class StabilityMap:
 
     @property
     def silent(self) -> list[str]:
-        """Runs that went wrong without a word."""
+        """Runs that went wrong without an error."""
         return [
             f"{self.solver}, {self.axis.name} {value:g} {self.axis.unit}, dt {share * limit:.3g} s ({share:.2g} of the "
             f"limit): {run.said}; energy rose by {run.rise:.2g} of what moves"

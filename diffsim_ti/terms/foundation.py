@@ -51,7 +51,7 @@ class ElasticFoundation(OnSurface, OnMesh, Term):
     def check(self, mesh: TetrahedralMesh) -> None:
         count, kind = len(self.faces(mesh)), "triangles" if mesh.order == 1 else "faces"
         if count == 0:
-            raise ValueError("ElasticFoundation holds nothing: the set is empty; name a set that has members")
+            raise ValueError("ElasticFoundation acts on nothing: the set is empty; name a set that has members")
         for i in self.described:
             if i.value.ndim and len(i.value) != count:
                 given = f"{i.name} has {len(i.value)} numbers"

@@ -33,10 +33,10 @@ class Growth(OfTetrahedra, Term):
     (times, values), a tuple, linear between; of heat alpha (T - T_0). per: what has a growth of its own: "all" together;
     each "set" of those that `tetrahedra` names; each "tetrahedron": shape (n,), or (steps, n) by steps.
     tetrahedra: a tetrahedron set's name, several, indices or a mask; None: all.
-    In load steps of statics growth is laid on with the loads. Mass stays that of the rest shape. stiffness_matrix, modes and
-    stable_dt take the growth of `Grown` alone; outputs that evaluate the law by frames, and volume="patches", refuse it.
-    Input with gradient: "growth_over_time" or "<name>.growth", of the shape given, (steps + 1, ...) of what is linear within
-    steps.
+    In load steps of static solves growth is applied with the loads. Mass stays that of the rest shape.
+    stiffness_matrix, modes and stable_dt take the growth of `Grown` alone; outputs that evaluate the law by frames, and
+    volume="patches", refuse it. Input with gradient: "growth_over_time" or "<name>.growth", of the shape given, (steps
+    + 1, ...) of what is linear within steps.
     Raises ValueError for other shapes, another `per`, an empty set, and a material that Grown does not take.
     Rodriguez, Hoger, McCulloch 1994, Stress-dependent finite growth, doi:10.1016/0021-9290(94)90021-3.
     """

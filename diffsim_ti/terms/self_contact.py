@@ -32,7 +32,7 @@ class SelfContact(Term):
     no energy, whatever the step (friction_kernels.py); in implicit ones a force, with N and the normal from where
     the step begins. Its forces F act at the two ends of the gap d: a couple d x F, which changes angular momentum by
     less than the width times the impulse of friction. Edges that pass each other are bumps, which take energy: a slab on a
-    slope went as with .0005 more friction at a width of 4 mm, and as with .0001 at 1 mm, whatever friction_speed and step.
+    slope went as with 0.0005 more friction at a width of 4 mm, and as with 0.0001 at 1 mm, whatever friction_speed and step.
     A narrower and stiffer barrier is smoother.
 
     Pairs of one body whose distance D at rest is below twice the width, neighbours along its surface or walls of a slit,

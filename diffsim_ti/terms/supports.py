@@ -124,7 +124,7 @@ class Supports:
         unknown = [name for name in motion if name not in self.by_name]
         if unknown:
             known = ", ".join(self.by_name) or "no sets by name: pass fixed={name: directions}"
-            raise ValueError(f"motion moves {unknown[0]!r}, which is not held; fixed has {known}")
+            raise ValueError(f"motion moves {unknown[0]!r}, which is not fixed; fixed has {known}")
         wanted = np.zeros((len(times), *self._normals.shape[:2]))
         for name, own in motion.items():
             if isinstance(own, Pose):
@@ -136,8 +136,8 @@ class Supports:
         left = np.abs(np.einsum("kji,tki->tkj", self._normals, out) - wanted).max(initial=0.0)
         if left > 1e-9 * np.abs(wanted).max(initial=0.0):
             raise ValueError(
-                f"motion: two sets move a vertex that both hold differently, by {left:.3g} m in one direction; leave the "
-                "vertex out of one set, or hold the sets in other directions"
+                f"motion: two sets move a vertex that both fix differently, by {left:.3g} m in one direction; leave the "
+                "vertex out of one set, or fix the sets in other directions"
             )
         return out
 
@@ -148,7 +148,7 @@ def _warn_of_several_bodies(mesh: TetrahedralMesh, fixed: Fixed | None) -> None:
     for name in (name for name in given if isinstance(name, str)):
         if parts := parts_of_joined(mesh.vertex_sets, name):
             warnings.warn(
-                f"fixed: {name!r} holds {len(parts)} bodies, whose sets of this name were joined; name those that are "
+                f"fixed: {name!r} contains {len(parts)} bodies, whose sets of this name were joined; name those that are "
                 f"meant: {', '.join(map(repr, parts))}",
                 stacklevel=4,
             )
@@ -161,14 +161,14 @@ def _directions(mesh: TetrahedralMesh, name: str, how: str | ArrayLike) -> np.nd
     if isinstance(how, str):
         if not how or set(how) - set(AXES) or len(set(how)) < len(how):
             raise ValueError(
-                f'fixed: {name!r} must be held along axes such as "x" or "xyz", along "normal" of a flat surface set, or '
+                f'fixed: {name!r} must be fixed along axes such as "x" or "xyz", along "normal" of a flat surface set, or '
                 f"along directions, 3 numbers each; got {how!r}"
             )
         return np.eye(3)[[AXES[axis] for axis in how]]
     directions = np.atleast_2d(numbers(f"fixed: directions of {name!r}", how))
     if directions.ndim != 2 or directions.shape[1] != 3 or not np.all(np.isfinite(directions)):
         raise ValueError(
-            f'fixed: {name!r} must be held along axes by letters, such as "x" or "xyz", or along directions, finite, of '
+            f'fixed: {name!r} must be fixed along axes by letters, such as "x" or "xyz", or along directions, finite, of '
             f"shape (3,) or (k, 3), got {shown(how)}"
         )
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
@@ -185,7 +185,7 @@ def _normal(mesh: TetrahedralMesh, name: str) -> np.ndarray:
     off = np.linalg.norm(np.cross(normals, mean), axis=1).max(initial=0.0) / np.linalg.norm(normals, axis=1).max()
     if off > 1e-6:
         raise ValueError(
-            f'fixed: {name!r} is held along its "normal", but it is not flat (normals turn by a sine of {off:.2g}); pass '
+            f'fixed: {name!r} is fixed along its "normal", but it is not flat (normals turn by a sine of {off:.2g}); pass '
             "directions, or name flat parts of it"
         )
     return mean

@@ -25,7 +25,7 @@ class Term(ABC):
     "barrier_stiffness", to which a second such term adds _2.
     A term that the scene does not list leaves no code and no memory behind. What a subclass may write, each optional:
     `links`, where kernels read something else than its inputs as they are; `check`, `settled` and `check_start`, to refuse
-    what does not fit and to choose what is left to the scene; `kernel`, the compile-time twin of a term that acts by a
+    what does not fit and to choose what is left to the scene; `kernel`, the device counterpart of a term that acts by a
     force on each vertex (VertexForce); `drawn`, what pictures, films, the window and series show of it. Gravity, drag and
     external forces are stages of the step itself.
     """
@@ -120,7 +120,8 @@ class Term(ABC):
         return []
 
     def kernel(self, precision: str) -> "VertexForce | None":
-        """Compile-time twin; a term with a table is also given `table`, where it starts in the scene's parameter array."""
+        """The device counterpart; a term with a table is also given `table`, where it starts in the scene's parameter
+        array."""
         return None
 
     def __repr__(self) -> str:
@@ -161,9 +162,9 @@ class OnSurface:
 
 @dataclass(frozen=True)
 class VertexForce(ABC):
-    """Compile-time twin of a term: Taichi functions of one vertex, at rest position X, displacement u, velocity v.
+    """Device counterpart of a term: Taichi functions of one vertex, at rest position X, displacement u, velocity v.
 
-    Vectors have four components, the last zero. Equal twins share compiled kernels, and those of one scene a loop.
+    Vectors have four components, the last zero. Equal counterparts share compiled kernels, and those of one scene a loop.
     `size` numbers start at `first` in the parameter array.
     """
 

@@ -208,7 +208,7 @@ class Cable(GivenOverTime, Tie):
     sampled at the steps and linear within each.
     points: two or more, one after the other: vertices (numbers), material points (3 floats [m] each, at rest), `Anchor`s.
     Each pulls on its point with T towards the next and towards the one before, so that forces sum to zero with those of
-    the anchors. In load steps of statics a given tension grows with the loads, a length does not.
+    the anchors. In load steps of static solves a prescribed tension grows with the loads, a length does not.
     Inputs with gradient: "cable_tension" or "cable_length", "cable_stiffness", "cable_anchors", or "<name>.tension" and
     so on; of the shape given, (steps + 1,) of what is linear within steps. The gradient by a slack cable's numbers is zero.
     Raises ValueError unless either tension, or length and stiffness are given; for fewer than two points, neighbours that

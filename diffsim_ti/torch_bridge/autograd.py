@@ -6,7 +6,7 @@ try:
     import torch
 except ImportError as error:
     raise ImportError(
-        "the PyTorch face of diffsim_ti (diff_physics, diff_simulator) needs torch, which could not be imported "
+        "the PyTorch interface of diffsim_ti (diff_physics, diff_simulator) needs torch, which could not be imported "
         f"({error}): pip install 'torch>=2.2,<2.14' (CPU only: add --index-url https://download.pytorch.org/whl/cpu); "
         "the rest of diffsim_ti works without it"
     ) from error
@@ -29,8 +29,8 @@ def refuse_transforms(tensors) -> None:
     wrapped = getattr(getattr(torch._C, "_functorch", None), "is_functorch_wrapped_tensor", lambda tensor: False)
     if any(isinstance(tensor, torch.Tensor) and wrapped(tensor) for tensor in tensors):
         raise RuntimeError(
-            "torch.func's vmap, grad and jacrev cannot look into a simulation: for many scenes take diffsim_ti.Batch, whose "
-            "inputs have a leading axis, and for gradients tensor.backward() or torch.autograd"
+            "torch.func's vmap, grad and jacrev cannot differentiate a simulation: for many scenes take diffsim_ti.Batch, "
+            "whose inputs have a leading axis, and for gradients tensor.backward() or torch.autograd"
         )
 
 

@@ -1,4 +1,4 @@
-"""PyTorch face: contact with a floor as a torch formula, and as the core's term with the same numbers."""
+"""PyTorch interface: contact with a floor as a torch formula, and as the core's term with the same numbers."""
 
 from diffsim_ti.terms import Ground
 from diffsim_ti.terms.obstacles import barrier

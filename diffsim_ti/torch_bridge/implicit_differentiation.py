@@ -1,4 +1,5 @@
-"""PyTorch face: gradients through solutions of equations, and conjugate gradients. Right for any equation, not only ours."""
+"""PyTorch interface: gradients through solutions of equations, and conjugate gradients. Right for any equation, not
+only ours."""
 
 import warnings
 

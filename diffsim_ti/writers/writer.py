@@ -46,7 +46,7 @@ class View:
         if self.colour is not None:
             field_named(self.colour)
         if not 0.01 <= self.fps <= 1e6:
-            raise ValueError(f"fps: must be from .01 to 1e6 frames per second, got {self.fps:g}; 30 is usual")
+            raise ValueError(f"fps: must be from 0.01 to 1e6 frames per second, got {self.fps:g}; 30 is usual")
         if self.size is not None and min(self.size) < 16:
             raise ValueError(f"size: must be at least 16 pixels a side, got {tuple(self.size)}; try 640 480")
         if not abs(self.elevation) < 90:

@@ -1,7 +1,7 @@
 """A stiff part that moves by few numbers: how much longer and cheaper explicit steps are, and what it does to the motion.
 
 A soft pad on a block a thousand times stiffer, held where the pad ends, swings under its weight for 20 ms. Vertices of the
-block move each by itself, by twelve numbers together (affine) or by six (rigid). Steps are .7 of the stable ones.
+block move each by itself, by twelve numbers together (affine) or by six (rigid). Steps are 0.7 of the stable ones.
 
     python examples/benchmarks/reduced_steps.py             # 16 cells across; minutes
     python examples/benchmarks/reduced_steps.py --cells 6   # seconds

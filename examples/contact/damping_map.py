@@ -1,6 +1,6 @@
 """What the damping of contacts does, at the longest steps: to gradients of a bounce, to energy, where barriers are stiff.
 
-Soft blocks are thrown onto a floor as in bounce_gradients.py, with substeps of .8 of the stable step of the body, on
+Soft blocks are thrown onto a floor as in bounce_gradients.py, with substeps of 0.8 of the stable step of the body, on
 barriers wide and narrow, as stiff as the scene chooses and a hundred times as stiff. `contact_damping` lies between 0, the
 barrier's discrete gradient, and 1, its backward Euler. Of twenty throws there are
 

@@ -1,4 +1,4 @@
-"""A soft slab on an incline of tan = 1/2: friction .50 holds it, .49 lets it slide as far as Coulomb's law says.
+"""A soft slab on an incline of tan = 1/2: friction 0.50 holds it, 0.49 lets it slide as far as Coulomb's law says.
 
 The slab first settles on the incline, in drag, at the friction that just holds it; then it is let go. A soft body on a stiff
 barrier would not do: Coulomb friction makes such a body vibrate (as brakes squeal), and then it slides further.
@@ -38,7 +38,7 @@ def solver(scene: ds.Scene) -> ds.SemiImplicitSolver:
 
 
 def main(picture_folder: str | None = None) -> dict:
-    """Returns how far the slab went [m] at friction .49 and .50, what Coulomb's law says, and the seconds."""
+    """Returns how far the slab went [m] at friction 0.49 and 0.50, what Coulomb's law says, and the seconds."""
     start = time.perf_counter()
     scene, down = slab_scene(SLOPE, drag=30.0)
     settled = ds.Rollout(solver(scene), round(2.5 / DT)).forward().positions[-1]

@@ -55,7 +55,7 @@ def force_of_a_press(resolution: int, kind: dict) -> float:
 
 
 def way_of_sliding(resolution: int, kind: dict, body: ds.TetrahedralMesh | None = None, **options) -> np.ndarray:
-    """How far [m] a slab on a floor with friction .3 has gone, at every millisecond after it is pushed off at .7 m/s.
+    """How far [m] a slab on a floor with friction 0.3 has gone, at every millisecond after it is pushed off at 0.7 m/s.
 
     Of its centre of mass. The slab is flat, so that friction does not tip it, and lies where the barrier carries it.
     """

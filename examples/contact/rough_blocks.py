@@ -1,7 +1,7 @@
 """Soft on soft with friction: a slab on a slope of tan = 1/2, and a tower of five blocks that leans.
 
-Friction .51 holds the slab, .49 lets it slide, and with .3 it goes as far as Coulomb's law says. The tower leans by
-tan = .06 on a rough floor; blocks with friction .4 stand, smooth ones slide apart.
+Friction 0.51 holds the slab, 0.49 lets it slide, and with 0.3 it goes as far as Coulomb's law says. The tower leans by
+tan = 0.06 on a rough floor; blocks with friction 0.4 stand, smooth ones slide apart.
 
     python examples/contact/rough_blocks.py [folder for a picture]
 """
@@ -74,7 +74,7 @@ def tower(friction: float, seconds: float = 1.0) -> tuple[ds.TetrahedralMesh, np
 
 
 def main(picture_folder: str | None = None, duration: float = 2.5) -> dict:
-    """Returns the ways of the slab, and how far the towers' tops went [m] with friction .4 and 0."""
+    """Returns the ways of the slab, and how far the towers' tops went [m] with friction 0.4 and 0."""
     out, towers = {"slides": slides(duration)}, [tower(0.4), tower(0.0, 0.3)]
     if picture_folder:
         mesh, places, angle = towers[0][0], [], np.arctan(LEAN)

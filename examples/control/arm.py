@@ -24,7 +24,7 @@ from diffsim_ti.picture import Arrows, Points, arrows, save_picture
 from diffsim_ti.terms.obstacles.shapes import tube
 
 FINGER = (0.12, 0.02, 0.02)  # [m]
-TABLE = 0.22  # its height; the shoulder's is .3 [m]
+TABLE = 0.22  # its height; the shoulder's is 0.3 [m]
 HOME = (0.0, 1.0, -2.0)  # joint angles before it presses, the tip 2 cm above the table [rad]
 STEPS = 6  # from there
 PLACE, FORCE = np.array([0.36, 0.03]), 2.0  # where the tip is to be (x, z) [m], and with which force on the table [N]
@@ -32,7 +32,7 @@ TOLERANCE = 1e-6  # of the residuals: forces over FORCE, places over a centimetr
 
 
 def arm() -> pk.SerialChain:
-    """A turning base, a shoulder and an elbow; y is up, links of .3, .25 and .2 m."""
+    """A turning base, a shoulder and an elbow; y is up, links of 0.3, 0.25 and 0.2 m."""
     joints = [
         ("base", "turn", "0 0 0", "0 1 0"),
         ("turn", "upper", "0 0.3 0", "0 0 1"),

@@ -1,7 +1,7 @@
 """Find Young's modulus and friction of a soft block from the force on a ball that is pressed in and dragged.
 
 A laboratory records force against displacement. The ball goes down 8 mm, then 12 mm to the side; the force that it feels is
-`ContactForce`. `identify` finds both numbers. Data carry noise of .2 % of the largest force.
+`ContactForce`. `identify` finds both numbers. Data carry noise of 0.2 % of the largest force.
 
     python examples/identify/indentation.py [folder for a picture]
 """

@@ -1,4 +1,4 @@
-"""A pass that obstacles leave no way out of."""
+"""The error of a step that obstacles block."""
 
 import numpy as np
 
@@ -19,13 +19,13 @@ class Blocked(NotConverged):
 
     @classmethod
     def pinched(cls, ws, u, met, left: float, speed: float) -> "Blocked":
-        """What comes to the body has `left` of its way to go, and finds no room."""
+        """An obstacle or a support has the share `left` of its motion to go, and finds no room."""
         term, h = ws.ways.way.terms[met.obstacle], ws.substep
         gap, width = ws.ways.gap_of(met, u), float(term.values["barrier_width"])
         short = min(0.5 * h, width / max(speed, 1e-300))
         message = (
             f"{met} is {gap:.3g} m before {term!r}, they come together at {speed:.4g} m/s, and {left:.0%} of the "
-            f"way in a substep of {h:.4g} s finds no room: take substeps of {short:.3g} s, or give the body room to move"
+            f"motion in a substep of {h:.4g} s finds no room: take substeps of {short:.3g} s, or give the body room to move"
         )
         return cls(message, [], met.vertices, term, gap, speed, None)
 

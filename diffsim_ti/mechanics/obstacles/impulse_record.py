@@ -68,7 +68,7 @@ class ImpulseRecord:
             i = int(np.argmax(own.sum(0)))
             names = " and ".join(type(self.arrays.contacts[o]).__name__ for o in np.array(self.reaching)[own[:, i]])
             raise ValueError(
-                f"{names} push on the faces around vertex {i} in one substep, where explicit steps know only what they do "
+                f"{names} push on the faces around vertex {i} in one substep, where explicit steps record only what they do "
                 "together: take an implicit solver, narrower barriers, or a finer surface, for the force of each"
             )
         own = own.astype(float) if len(own) > 1 else np.ones((len(own), pushes.shape[1]))

@@ -82,8 +82,9 @@ class ObstacleWays:
         met = self.way.met
         speed = self._speed(met, u_star, u_next - u_star, self.rows[::3], drift) / 0.5
         raise Tunnelling(
-            f"beyond the middle of a step, where its forces were taken, {met} meets {self.way.terms[met.obstacle]!r} at "
-            f"{speed:.4g} m/s: take a solver whose steps end where forces are taken, ImplicitEulerSolver or BDF2Solver"
+            f"beyond the middle of a step, where its forces were taken, {met} meets "
+            f"{self.way.terms[met.obstacle]!r} at {speed:.4g} m/s: take a solver whose steps end where forces are "
+            "taken, ImplicitEulerSolver or BDF2Solver"
         )
 
     def _speed(self, met, u, step, places, drift) -> float:

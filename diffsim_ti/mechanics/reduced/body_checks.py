@@ -15,18 +15,18 @@ def check_bodies(scene: "Scene", contact: str) -> None:
     for body in scene.reduced.bodies:
         if body.kind == "basis":
             raise ValueError(
-                f"reduced: explicit steps know affine and rigid sets, and {body.name!r} moves by a basis: take an implicit "
-                "solver"
+                f"reduced: explicit steps support affine and rigid sets, and {body.name!r} moves by a basis: take an "
+                "implicit solver"
             )
     if contact == "stage" and any(term.acts_on_surface for term in scene.terms):
         raise ValueError(
-            f"{said} feel obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
+            f"{said} take obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
             'contact="force"'
         )
     if feels_faces(scene):
         raise ValueError(
-            f"{said} feel obstacles at their vertices alone in explicit steps, and one could reach into a face here: "
-            "take a finer mesh, a wider barrier, or an implicit solver"
+            f"{said} touch obstacles at their vertices only in explicit steps, and an obstacle could reach into a face "
+            "here: take a finer mesh, a wider barrier, or an implicit solver"
         )
     if scene.holds_volumes:
         raise ValueError(f"{said} and FilledChamber do not go together in explicit steps: take an implicit solver")

@@ -234,7 +234,7 @@ class SurfacePairs:
             speed = np.linalg.norm(moved[i]) / h
             error = Tunnelling(
                 f"vertex {i} moves at {speed:.3g} m/s, {np.linalg.norm(moved[i]):.3g} m in one substep of {h:.3g} s: "
-                f"too far for a contact of width {self.width:.3g} m to see what it passes; {remedy}"
+                f"too far for a contact of width {self.width:.3g} m to detect what it passes through; {remedy}"
             )
             error.stable_dt, error.stiffness = enough, stiffness
             raise error

@@ -122,7 +122,7 @@ class ExplicitSolver(Solver):
         """Arrays and bound launches for runs of this solver; bend: see state/bending.py."""
         if bend and self.scene.reduced:
             raise ValueError(
-                f"reduced sets ({self.scene.reduced.describe()}) feel obstacles at their vertices alone in explicit steps, "
+                f"reduced sets ({self.scene.reduced.describe()}) touch obstacles at their vertices only in explicit steps, "
                 f"and ten-node faces bend by {bend / 2:.3g} m where they touch: take a finer mesh, or an implicit solver"
             )
         return ExplicitWorkspace(self, derived, bend)

@@ -63,7 +63,7 @@ class Closing:
         while len(left):
             if not pull > 0 or way > 4 * self.size or np.abs(place - start).max() > self.size:
                 raise NotConverged(
-                    f"statics: but for contact {ws.solver.loose}, and contact leaves {self._words(left)}: hold it by "
+                    f"static solve: but for contact {ws.solver.loose}, and contact leaves {self._words(left)}: hold it by "
                     "fixed=..., bring it nearer to what it is to lie on, let it begin within the barrier where friction is "
                     "to hold it, or use a solver with inertia",
                     [],
@@ -72,7 +72,7 @@ class Closing:
             left = self.left(place)
         if not self.said:
             self.said = True
-            warnings.warn(f"statics: but for contact {ws.solver.loose}; contact holds it", stacklevel=2)
+            warnings.warn(f"static solve: but for contact {ws.solver.loose}; contact holds it", stacklevel=2)
         return place
 
     def _words(self, left: np.ndarray) -> str:

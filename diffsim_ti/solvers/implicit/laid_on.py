@@ -86,20 +86,20 @@ class LaidOn:
         return sizes[0] / sizes[1] if sizes[1] > 0 else share
 
     def _why(self, error: NotConverged, reached: float) -> str:
-        """In terms of the problem, where the path ends: at a share of what the step lays on."""
+        """What the path of equilibria means for the problem; `reached`: the share of the step at which it ends."""
         newton = self.ws.newton
         if reached > 0 and not newton.by_residual and newton.is_unstable():
             end = (
                 "and is unstable there, so that the body buckles or snaps to a state far away: give it an imperfection or "
-                "a small force that chooses the way"
+                "a small force that chooses the direction"
             )
         else:
             end = (
                 "and is not seen to be unstable there: what comes next may lie beyond a limit point, the most that the body "
-                "carries, or be too hard for Newton's method: lay on less"
+                "carries, or be too hard for Newton's method: apply a smaller load"
             )
         return (
-            f"no equilibrium was found: the path of equilibria from the state before goes to {100 * reached:.3g}% of what "
-            f"is laid on in the step (loads, motion of what is held), {end}, or take a solver with inertia, which follows "
-            f"the jump (at once: {len(error.residuals)} rounds, to a relative residual of {error.residuals[-1]:.2g})"
+            f"no equilibrium was found: the path of equilibria from the state before goes to {100 * reached:.3g}% of the "
+            f"step's loads and prescribed motion, {end}, or take a solver with inertia, which follows the jump (without "
+            f"load stepping: {len(error.residuals)} rounds, to a relative residual of {error.residuals[-1]:.2g})"
         )

@@ -169,7 +169,7 @@ class Newton:
         remedy = f"pass max_iterations={max(4 * len(done), 50)}, " if len(done) >= self.max_iterations and gains else ""
         if statics:
             remedy += (
-                "take more load steps or lay on less; where the equilibrium is unstable (it buckles or snaps) follow the "
+                "take more load steps or a smaller load; where the equilibrium is unstable (it buckles or snaps) follow the "
                 "motion to the next one instead, by ImplicitEulerSolver with Drag"
             )
         else:

@@ -281,7 +281,7 @@ class ImplicitWorkspace(GivenInPasses):
         """Raise NotConverged where the last solve has turned a tetrahedron inside out that was far from that at u."""
         if not self.newton.upright and np.any((self.volume_ratios(u) > 0.1) & ~(self.volume_ratios(there) > 0)):
             raise NotConverged(
-                "tetrahedra turn inside out: take smaller steps or lay on less", self.newton.report.residuals
+                "tetrahedra turn inside out: take smaller steps or a smaller load", self.newton.report.residuals
             )
 
     def admissible(self, u: np.ndarray, starts: list, problem: tuple) -> np.ndarray:

@@ -24,7 +24,7 @@ class GroundForce(ObstacleForce):
 
 
 class Ground(Obstacle):
-    """Floor y = height [m], felt by surface vertices through the barrier of their distance d = y - height.
+    """Floor y = height [m], which acts on surface vertices through the barrier of their distance d = y - height.
 
     Stiffness per area [N/m^3] (default: the scene chooses it) or stiffness of every vertex [N/m], width [m], friction and
     path as for every `Obstacle`.

@@ -19,7 +19,7 @@ class MeshObstacle(Obstacle):
 
     position [m]: where its origin lies. The distance is sampled on a cubic grid of `resolution` cells along the longest
     side, by libigl (signs from pseudonormals), and interpolated by cubic B-splines: C2, exact at grid points, with edges
-    rounded within a cell. Beyond 2 cells and a width from the mesh nothing is felt.
+    rounded within a cell. Beyond 2 cells and a width from the mesh there is no force.
 
     Inputs with gradient: "mesh_position", shape (3,), and those of every `Obstacle`, whose other arguments it takes.
     Raises ValueError for a mesh that is not closed or oriented, RuntimeError without libigl (`pip install

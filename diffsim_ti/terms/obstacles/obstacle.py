@@ -20,7 +20,7 @@ PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
 
 
 class Obstacle(Term):
-    """A body that does not deform, felt by surface vertices through the barrier of their distance d [m] to it.
+    """A body that does not deform, which acts on surface vertices through the barrier of their distance d [m] to it.
 
     Energy of a vertex b(d) = -k (d - width)^2 log(d / width) for d < width, exactly zero beyond, and its
     second-order Taylor polynomial below width / 1000 (barrier.py), so that a vertex that got past is pushed out.
@@ -32,8 +32,8 @@ class Obstacle(Term):
     strain that it makes), needs p / (1.2 width): it then stands half a width from the surface, where the barrier pushes
     with 1.19 k width. Or
     stiffness [N/m]: k of every vertex alike, however many there are.
-    width [m]: how far the obstacle is felt.
-    Faces of ten-node tetrahedra that are curved in the mesh, by .02 widths or more, are felt as curved as they move, by
+    width [m]: the distance at which the barrier begins to act.
+    Faces of ten-node tetrahedra that are curved in the mesh, by 0.02 widths or more, are treated as curved as they move, by
     points on them (curved_faces.py). Friction there is, in explicit steps, a stage after those of the pushes.
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
     friction is smoothed, and with which a vertex that is held may creep.
@@ -59,7 +59,7 @@ class Obstacle(Term):
     """
 
     acts_on_surface = True
-    twin: type  # the compile-time twin of the shape
+    twin: type  # the device counterpart of the shape
 
     def __init__(
         self,

@@ -17,7 +17,7 @@ from diffsim_ti.terms.term import VertexForce
 
 @dataclass(frozen=True)
 class ObstacleForce(VertexForce):
-    """Compile-time twin of an obstacle: `count` numbers of its shape, then stiffness, width [, friction, friction_speed].
+    """Device counterpart of an obstacle: `count` numbers of its shape, then stiffness, width [, friction, friction_speed].
 
     per_area: whether stiffness is per area [N/m^3]; what is said here of a vertex is then said of one square metre.
     A shape writes one function, `distance_and_normal`, in numbers of a graph; everything else follows from it. Positions

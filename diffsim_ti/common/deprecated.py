@@ -1,0 +1,102 @@
+"""Old public names, which work for one version: each use gives a DeprecationWarning that names the new one.
+
+Three tables: module paths, names of the package, and arguments (`renamed_arguments`). An entry of a version is deleted when
+the next one is released; tests/test_deprecated.py goes through all of them.
+"""
+
+import functools
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import ParamSpec, TypeVar
+
+# modules at the top of version 0.2.0 -> where they are
+MODULES = {
+    "diffsim_ti.adaptive_run": "diffsim_ti.writers.adaptive_run",
+    "diffsim_ti.adaptive_steps": "diffsim_ti.rollout.adaptive_steps",
+    "diffsim_ti.checked": "diffsim_ti.common.checked",
+    "diffsim_ti.copies": "diffsim_ti.common.copies",
+    "diffsim_ti.differences": "diffsim_ti.common.differences",
+    "diffsim_ti.ensemble": "diffsim_ti.torch_bridge.ensemble",
+    "diffsim_ti.interrupts": "diffsim_ti.common.interrupts",
+    "diffsim_ti.locking": "diffsim_ti.scene.locking",
+    "diffsim_ti.mass_scaling": "diffsim_ti.terms.mass_scaling",
+    "diffsim_ti.modes": "diffsim_ti.outputs.modes",
+    "diffsim_ti.progress": "diffsim_ti.common.progress",
+    "diffsim_ti.ranks": "diffsim_ti.common.ranks",
+    "diffsim_ti.reduced": "diffsim_ti.terms.reduced",
+    "diffsim_ti.rotations": "diffsim_ti.common.rotations",
+    "diffsim_ti.rows": "diffsim_ti.common.rows",
+    "diffsim_ti.simulator": "diffsim_ti.rollout.simulator",
+    "diffsim_ti.slots": "diffsim_ti.runtime.slots",
+    "diffsim_ti.strength": "diffsim_ti.scene.strength",
+    "diffsim_ti.supports": "diffsim_ti.terms.supports",
+    "diffsim_ti.terms_of_scene": "diffsim_ti.terms.terms_of_scene",
+}
+# names of the package -> their new names there
+NAMES = {"TieLength": "Length", "TieTension": "Tension"}
+
+P, R = ParamSpec("P"), TypeVar("R")
+
+
+def warn(old: str, new: str, stacklevel: int = 3) -> None:
+    """Warn that `old` goes with the next version."""
+    warnings.warn(f"{old} is called {new}; the old name goes with the next version", DeprecationWarning, stacklevel)
+
+
+def renamed_arguments(**new: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator of a function or constructor that also takes old names of arguments, old="new"."""
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @functools.wraps(function)
+        def call(*arguments: P.args, **named: P.kwargs) -> R:
+            for old in new.keys() & named.keys():
+                warn(f"{function.__qualname__}: argument {old!r}", repr(new[old]))
+                if new[old] in named:
+                    raise TypeError(
+                        f"{function.__qualname__}: {old!r} and {new[old]!r} are the same argument; give one"
+                    )
+                named[new[old]] = named.pop(old)
+            return function(*arguments, **named)
+
+        return call
+
+    return decorate
+
+
+def package_attribute(name: str) -> object:
+    """What the package's `__getattr__` gives for an old name of a class, function or module."""
+    package, old = import_module("diffsim_ti"), f"diffsim_ti.{name}"
+    if name in NAMES:
+        warn(old, f"diffsim_ti.{NAMES[name]}")
+        return getattr(package, NAMES[name])
+    if old in MODULES:
+        warn(old, MODULES[old])
+        return import_module(MODULES[old])
+    raise AttributeError(f"module 'diffsim_ti' has no attribute {name!r}", name=name, obj=package)
+
+
+class MovedModule(ModuleType):
+    """A module under its old path. A call of it is one of the function of that name: `diffsim_ti.modes` is a function, which
+    an import of the old module `diffsim_ti.modes` hides."""
+
+    def __call__(self, *arguments, **named):
+        return getattr(self, self.__name__.rpartition(".")[2])(*arguments, **named)
+
+
+class MovedModules(MetaPathFinder, Loader):
+    """Finds modules by their old paths, after all other finders, so that imports of others take no longer."""
+
+    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        return ModuleSpec(name, self) if name in MODULES else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return MovedModule(spec.name)
+
+    def exec_module(self, module: ModuleType) -> None:
+        warn(module.__name__, MODULES[module.__name__])
+        own = vars(import_module(MODULES[module.__name__]))
+        vars(module).update({name: value for name, value in own.items() if not name.startswith("__")})
