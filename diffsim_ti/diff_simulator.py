@@ -131,7 +131,7 @@ class DifferentiableSimulator:
         self.reset()
 
     def __getstate__(self) -> dict:
-        """For pickle and copy.deepcopy: the state leaves its graph; what Taichi holds is built anew."""
+        """For pickle and copy.deepcopy: the state leaves its graph; what Taichi holds is built again."""
         state = self.__dict__ | dict(_rollouts={}, _scenes={}, _last=None)
         return state | dict(_displacements=self._displacements.detach(), _velocities=self._velocities.detach())
 
@@ -289,25 +289,25 @@ class DifferentiableSimulator:
         return self.solver.method(scene, **options)
 
     def _contact_rigidity(self, scene: Scene, values: dict) -> float:
-        """Stiffness over mass [1/s^2] of barriers that a vertex may feel: the stiffest, or, where they are forces, all."""
-        derived, felt = scene.inputs.derive(values), []
+        """Stiffness over mass [1/s^2] of barriers that may act on a vertex: the stiffest, or, where they are forces, all."""
+        derived, stiffest = scene.inputs.derive(values), []
         mass = np.where(derived.mass > 0, derived.mass, np.inf)
         for term in scene.terms:
             if isinstance(term, Obstacle | SelfContact):
                 for plain, name in scene.input_names(term).items():
                     if plain in ("barrier_stiffness", "self_contact_stiffness"):
-                        felt.append(float(values[name]) / mass.min())
+                        stiffest.append(float(values[name]) / mass.min())
                     elif plain == PER_AREA:
-                        felt.append(float((values[name] * derived.surface / mass).max()))
+                        stiffest.append(float((values[name] * derived.surface / mass).max()))
         together = sum if self.solver.options.get("contact") == "force" else max
-        return together(felt) if felt else 0.0
+        return together(stiffest) if stiffest else 0.0
 
     def _choose_substeps(self) -> None:
         """What stability and contact ask for at the present numbers; the count only grows, so that losses stay smooth."""
         if not self.solver.method.explicit:
             return
         scene = self._scene(False)
-        tensors = self._inputs() | {name: torch.as_tensor(x) for name, x in scene.given_tensors().items()}
+        tensors = self._inputs() | {name: torch.as_tensor(x) for name, x in scene.input_tensors().items()}
         numbers = {name: x.detach().double().cpu().numpy() for name, x in tensors.items()}
         values = scene.inputs.values | scene.inputs.check(numbers)
         bound = stability.element_limit(scene, values).dt

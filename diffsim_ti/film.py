@@ -40,7 +40,7 @@ def render_series(
     A film (.mp4, .gif) has all frames, a picture (.png) the last one, "name_%04d.png" all, numbered.
     colour: a name in visual/fields.py; fps: frames per second of the film (a GIF keeps time in steps of 10 ms); size:
     pixels, even for .mp4; ground: height of a floor to draw [m], default the run's own, if it had one; azimuth, elevation
-    of the eye [degrees]; backend: "auto", "vulkan" or "software"; say: told once which draws; wireframe: draw edges.
+    of the eye [degrees]; backend: "auto", "vulkan" or "software"; say: called once with what draws; wireframe: draw edges.
     arrows: point data of the series that are vectors, such as forces, to draw as arrows.
     Obstacles, supports, loads and other marks are those that the series holds.
     Raises ValueError for bad arguments or an empty series, RuntimeError if MP4's encoder is not installed.

@@ -4,7 +4,8 @@
 
 Each case runs once; where it raises, what the error advises is done and the case runs again, three times at most.
 --turning: obstacles turn about a point near them as well. --rough: they rub. --reduced: the body, or what comes first of it
-and is stiffer, moves by few numbers, in implicit steps and statics. --order 2: of ten-node tetrahedra, on the same grids.
+and is stiffer, moves by few numbers, in implicit steps and static solves. --order 2: of ten-node tetrahedra, on the
+same grids.
 """
 
 import argparse

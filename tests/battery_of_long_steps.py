@@ -74,13 +74,13 @@ def _reaching(x: float, end: float):
 
 def linear_step(scene: ds.Scene, load: np.ndarray, at: np.ndarray, c: float) -> np.ndarray:
     """u of (c M + K) u = load, with what is held as in `at`."""
-    free = ~held_of(scene).ravel()
+    free = ~frozen_of(scene).ravel()
     A, u = (c * scene.mass_matrix() + scene.stiffness_matrix()).tocsr(), np.where(free, 0.0, at.ravel())
     u[free] = scipy.sparse.linalg.splu(A[free][:, free].tocsc()).solve((load.ravel() - A @ u)[free])
     return u.reshape(-1, 3)
 
 
-def held_of(scene: ds.Scene) -> np.ndarray:
+def frozen_of(scene: ds.Scene) -> np.ndarray:
     held = np.zeros((scene.mesh.num_vertices, 3), bool)
     for name in SUPPORTS:
         held[scene.mesh.vertex_indices(name), "xyz".index(SUPPORTS[name])] = True
@@ -106,7 +106,7 @@ def judge(case: dict) -> str:
     u, said = frames.displacements, []
     if case["strain"] < 1e-3 and case["load"] != "plate" and case["law"] != "KelvinVoigt":
         gamma = 0.5 * h if kind is ds.ImplicitMidpointSolver else h
-        dead = np.where(held_of(scene), 0.0, (scene.stiffness_matrix() @ still.ravel()).reshape(still.shape))
+        dead = np.where(frozen_of(scene), 0.0, (scene.stiffness_matrix() @ still.ravel()).reshape(still.shape))
         at = still * (gamma / h)
         want = linear_step(scene, dead, at, 1 / gamma**2) * (h / gamma)
         off = np.linalg.norm(u[1] - want) / np.linalg.norm(want)

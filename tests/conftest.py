@@ -78,4 +78,4 @@ def pytest_terminal_summary(terminalreporter, config):
 def vertices_alone(monkeypatch):
     """Explicit steps in which nothing but vertices feels obstacles, as for points that happen to have faces between them."""
     kind = "diffsim_ti.solvers.explicit.solver.ExplicitWorkspace"
-    monkeypatch.setattr(f"{kind}.feels_faces", staticmethod(lambda scene, bend: False))
+    monkeypatch.setattr(f"{kind}.has_face_contact", staticmethod(lambda scene, bend: False))

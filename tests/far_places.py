@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 import diffsim_ti as ds
-from diffsim_ti.terms.ties import Tie
+from diffsim_ti.terms.lines import LineTerm
 
 FAR = np.array([1e5, -3e6, 1e7])
 
@@ -28,7 +28,7 @@ def moved_term(term, offset):
         else replace(i, value=i.value + (offset if i.name == "anchors" else i.shift(offset).reshape(i.value.shape)))
         for i in term.described
     )
-    if isinstance(term, Tie):
+    if isinstance(term, LineTerm):
         out._found = None
         for name in ("start", "end"):
             if hasattr(term, name):

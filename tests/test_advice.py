@@ -272,9 +272,9 @@ FOLLOWED = {
         lambda: scene(terms=[ds.Muscle((1, 0, 0), 1.0, np.ones(2), per="tetrahedron")]),
         lambda: scene(terms=[ds.Muscle((1, 0, 0), 1.0, np.ones(CUBE.num_tetrahedra), per="tetrahedron")]),
     ),
-    ("terms/terms_of_scene.py", "give them a name="): (
-        lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0)]), 1, outputs=ds.TieLength("rope")),
-        lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0, name="rope")]), 1, outputs=ds.TieLength("rope")),
+    ("scene/scene.py", "give them a name="): (
+        lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0)]), 1, outputs=ds.Length("rope")),
+        lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0, name="rope")]), 1, outputs=ds.Length("rope")),
     ),
     ("verify.py", "no health report"): (health, lambda: health(health=True)),
     ("mesh/grid.py", "vertices; take at most"): (

@@ -207,7 +207,7 @@ def test_energy_that_only_ever_rises_is_refused_once_it_has_drifted(cube, solver
         monkeypatch.setattr(run.simulator, "compute_energy", lambda: Energy(before.parts | dict(other=gained)))
         if run._complaint(look_up=False):
             break
-        run._look()
+        run._check()
     assert 0 < gained <= (rule.drift + rule.part) * scale
     assert "the energy rose by" in run._complaint(look_up=False)
 

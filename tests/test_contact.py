@@ -19,7 +19,7 @@ def evaluate(term, positions, precision="f64"):
     fp = runtime.PRECISIONS[precision]
     vec = ti.types.vector(4, fp)
     own = dict(table=len(np.concatenate([v.ravel() for v in term.values.values()]))) if term.table.size else {}
-    twin = term.kernel(precision, **own)
+    counterpart = term.kernel(precision, **own)
 
     @ti.kernel
     def look(
@@ -31,9 +31,9 @@ def evaluate(term, positions, precision="f64"):
     ):
         for i in range(x.shape[0]):
             zero = vec(0)
-            gap[i] = twin.gap(parameters, 0, x[i], zero)
-            energy[i] = twin.energy(parameters, 0, x[i], zero)
-            force[i] = twin.force(parameters, 0, x[i], zero, zero)
+            gap[i] = counterpart.gap(parameters, 0, x[i], zero)
+            energy[i] = counterpart.energy(parameters, 0, x[i], zero)
+            force[i] = counterpart.force(parameters, 0, x[i], zero, zero)
 
     numbers = np.concatenate([*(v.ravel() for v in term.values.values()), term.table])
     n = len(positions)

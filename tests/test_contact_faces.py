@@ -7,7 +7,7 @@ import pytest
 from impact_judge import Judge
 
 import diffsim_ti as ds
-from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces
+from diffsim_ti.mechanics.obstacles.face_contact_points import FaceContactPoints
 from diffsim_ti.monitor.stability import Stiffness
 from diffsim_ti.writers.adaptive_run import ForwardRun
 
@@ -263,7 +263,7 @@ def test_obstacles_larger_than_triangles_cost_nothing(obstacle):
 
 
 def test_a_pass_that_cannot_follow_says_so(monkeypatch):
-    monkeypatch.setattr(FeltFaces, "most_parts", 1)
+    monkeypatch.setattr(FaceContactPoints, "most_parts", 1)
     simulator = ds.Simulator(ds.VelocityVerletSolver(pressed("capsule", 2000.0), dt=2e-3))
     with pytest.warns(UserWarning, match=r"of faces was stiffer than the substep 0.002 s .*take substeps of"):
         simulator.run(3)
@@ -287,7 +287,7 @@ def test_the_stable_step_does_not_know_contact_within_faces():
 
 @both
 def test_faces_push_no_vertex_through_a_wall(solver):
-    """A face that a ball pushes takes its corners along, to a wall that they feel themselves (held_back.py)."""
+    """A face that a ball pushes takes its corners along, to a wall that they feel themselves (limited_displacement.py)."""
     wall = ds.HalfSpace((-0.002, 0, 0), (1, 0.3, 0), width=0.004, stiffness=400.0, friction=0.2)
     ball = ds.Sphere(
         (0.05, -0.1, 0.05), 0.1, width=0.004, stiffness=300.0, path=lambda t: [0, 0.2 * t, 0], friction=0.4

@@ -240,9 +240,13 @@ def test_straight_edges_and_linear_tetrahedra_know_nothing_of_it():
         assert not workspace.arrays.features().curved and workspace.potential.faces is None
     bent, width = ball(2), 0.01
     far = ds.Ground(-1, stiffness=1.0, width=width)
-    assert curved_triangles.are_felt(bent, [far]) and not curved_triangles.are_felt(bent.linear().quadratic(), [far])
+    assert curved_triangles.are_treated_as_curved(bent, [far]) and not curved_triangles.are_treated_as_curved(
+        bent.linear().quadratic(), [far]
+    )
     wide = ds.Ground(-1, stiffness=1.0, width=width * curved_triangles.bow(bent) / (0.019 * width))
-    assert not curved_triangles.are_felt(bent, [wide]) and not curved_triangles.are_felt(bent, [])
+    assert not curved_triangles.are_treated_as_curved(bent, [wide]) and not curved_triangles.are_treated_as_curved(
+        bent, []
+    )
 
 
 def test_obstacles_warn_of_no_bow():

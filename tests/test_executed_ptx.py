@@ -210,12 +210,14 @@ def solvers_in_single_precision(cube):
     yield explicit(scene(two_boxes(), SelfContact(2e4, 2e-2), precision="f32"))
     loads = Pressure(lambda t: 10 * t, "ymax"), Traction(lambda t: [t, 0, 0], "ymax")
     fixed = {"xmin": "x", "ymin": [0, 1, 1]}
-    guided = Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity(), *loads], fixed, precision="f32")
-    yield explicit(guided, VelocityVerletSolver)
+    partly_fixed = Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity(), *loads], fixed, precision="f32")
+    yield explicit(partly_fixed, VelocityVerletSolver)
     gas = GasChamber(lambda t: 1.1e5 + t, "cavity")
     yield explicit(Scene(hollow_cube(), SmithNeoHookean(1e5, 0.4), 1000.0, gas, "bottom", precision="f32"))
-    ties = Spring(0, 7, 100.0), Cable([1, Anchor([0.0, 0.5, 0.0]), 6], tension=lambda t: 10 * t)
-    held = Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [*ties, ElasticFoundation(1e4, 1e3, "ymin")], precision="f32")
+    lines = Spring(0, 7, 100.0), Cable([1, Anchor([0.0, 0.5, 0.0]), 6], tension=lambda t: 10 * t)
+    held = Scene(
+        cube, SmithNeoHookean(1e5, 0.4), 1000.0, [*lines, ElasticFoundation(1e4, 1e3, "ymin")], precision="f32"
+    )
     yield explicit(held, VelocityVerletSolver)
     yield ImplicitEulerSolver(scene(cube, precision="f32"), dt=5e-3)
     yield BDF2Solver(scene(cube, precision="f32"), dt=5e-3)

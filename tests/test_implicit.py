@@ -439,7 +439,7 @@ def test_steps_by_a_simulator_are_those_of_a_rollout():
 
 @pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver])
 def test_a_simulator_moves_what_is_prescribed_in_every_step(solver):
-    """Held vertices, obstacles and forces of each step, not those of the first."""
+    """Fixed vertices, obstacles and forces of each step, not those of the first."""
     mesh, steps = ds.TetrahedralMesh.create_box(2, size=0.1), 5
     floor = ds.Ground(height=-0.02, stiffness=1e3, width=0.015, path=lambda t: [0, 200 * t * t, 0])
     push = np.linspace(0, 1, steps)[:, None, None] * np.ones((2, 3))

@@ -119,7 +119,9 @@ CLASSES = {
 OF_BATCHES = "elements of a batch are those of one scene with other places of their numbers"
 WITHIN_FACES = "contact within faces goes on from contact at vertices by one formula at a time"
 DEEP = {  # classes that may stand more than three deep, and why
-    **dict.fromkeys("FaceRows FaceForces FaceWalls FaceKernels FaceDerivatives FaceShares".split(), WITHIN_FACES),
+    **dict.fromkeys(
+        "FaceRows FaceForces LimitedFaceContact FaceKernels FaceDerivatives FaceShares".split(), WITHIN_FACES
+    ),
     **dict.fromkeys(
         "TetrahedronOfEight PatchOfScenes PatchOfEight".split(), "elements of a batch read elements of one scene"
     ),

@@ -138,14 +138,14 @@ def test_forces_balance():
     scene = scene_of()
     outputs = [ds.Reaction("bottom"), ds.ContactForce("wall", name="wall", per_vertex=True)]
     frames = rollout_of(ds.StaticSolver, scene, outputs=outputs).forward()
-    from diffsim_ti.outputs.given_loads import GivenLoads
+    from diffsim_ti.outputs.applied_loads import AppliedLoads
 
     free = np.delete(
         np.arange(BODY.num_vertices), scene.fixed
     )  # what the wall does to others, their support takes up unseen
     derived = scene.inputs.derive(scene.inputs.at_times([0.0, 0.02, 0.04]))
     for k in (1, 2):
-        given = GivenLoads(scene).forces(derived, frames.positions[k], int(frames.steps[k])).sum(0)
+        given = AppliedLoads(scene).forces(derived, frames.positions[k], int(frames.steps[k])).sum(0)
         size = np.abs(given).sum()
         assert np.abs(frames["reaction"][k] + given + frames["wall"][k][free].sum(0)).max() < 1e-7 * size
 

@@ -62,8 +62,8 @@ def test_pressure_stands_on_the_surface_as_it_is():
 def test_springs_cables_foundations_and_gases():
     """Lines from point to point as they are now, anchors and founded vertices as points, the gas's own pressure."""
     X, top = cube().vertices, np.array([0.1, 0.4, 0.1])
-    ties = ds.Spring(0, 1, 10.0), ds.Cable([[0.1, 0.2, 0.1], ds.Anchor(top), 2], tension=1.0, name="tendon")
-    marks = marks_of(scene_of(*ties, ds.ElasticFoundation(1e4, 0.0, "ymax")), 1.5 * X)
+    lines = ds.Spring(0, 1, 10.0), ds.Cable([[0.1, 0.2, 0.1], ds.Anchor(top), 2], tension=1.0, name="tendon")
+    marks = marks_of(scene_of(*lines, ds.ElasticFoundation(1e4, 0.0, "ymax")), 1.5 * X)
     spring, tendon, anchor, founded = marks
     assert [m.label for m in marks] == ["spring", "tendon", "tendon, anchored", "foundation"]
     np.testing.assert_allclose(spring.ends, 1.5 * X[None, [0, 1]])
@@ -148,7 +148,7 @@ def test_lines_and_points_are_drawn_and_named():
 
 
 def test_supports_by_direction_are_cones_outside():
-    """Rollers on three sides: one cone for each direction of each vertex, and the corner held wholly is a disc."""
+    """Rollers on three sides: one cone for each direction of each vertex, and the corner fixed wholly is a disc."""
     scene = scene_of(fixed={"xmin": "x", "ymin": "y", "zmin": "z"})
     with Drawing(scene.mesh, SIZE, fixed=scene.held, held=scene.supports.held, backend="software") as drawing:
         wholly, vertices, axes = drawing._cones

@@ -35,7 +35,7 @@ class RingForce(ObstacleForce):
 class Ring(Obstacle):
     """A ring that lies flat: all points within `thickness` [m] of a circle of `radius` [m] about `center` [m]."""
 
-    twin = RingForce
+    counterpart = RingForce
 
     def __init__(self, center, radius: float, thickness: float, **options):
         super().__init__(dict(ring_center=center, ring_radius=radius, ring_thickness=thickness), **options)

@@ -1,4 +1,4 @@
-"""Paths that are poses: obstacles that turn, and held vertices that do."""
+"""Paths that are poses: obstacles that turn, and fixed vertices that do."""
 
 import imageio.v2 as imageio
 import numpy as np

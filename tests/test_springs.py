@@ -12,7 +12,7 @@ import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
-from diffsim_ti.mechanics.ties.interaction import SpringsAndCables
+from diffsim_ti.mechanics.lines.interaction import SpringsAndCables
 
 STEPS = 4
 TIMES = np.array([0.0, 0.003, 0.1])
@@ -130,11 +130,11 @@ def test_reactions_know_them(kind):
 
 def watched() -> list:
     """Length and tension of each kind of spring and cable."""
-    ties = "struts", "tendon", "slack", "spring", "rope"
+    lines = "struts", "tendon", "slack", "spring", "rope"
     return [
         kind(name, name=f"{what}_{name}")
         for kind, what in ((ds.Length, "length"), (ds.Tension, "pull"))
-        for name in ties
+        for name in lines
     ]
 
 

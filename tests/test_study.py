@@ -141,7 +141,7 @@ def test_runs_that_raise_are_shown_as_refused_and_long_ones_are_named():
 # ---- advice -----------------------------------------------------------------------------------------------------------
 
 
-def held_back(name: str) -> tuple:
+def limited_displacement(name: str) -> tuple:
     """(scene, duration, tolerance) that the advice was not made with."""
     if name == "twist":
         mesh = ds.TetrahedralMesh.create_box((3, 3, 5), (0.1, 0.1, 0.3), "five")
@@ -158,7 +158,7 @@ def held_back(name: str) -> tuple:
 
 @lru_cache
 def advised(name: str, gradients: bool = False):
-    scene, duration, tolerance = held_back(name)
+    scene, duration, tolerance = limited_displacement(name)
     return recommend(
         scene, duration, tolerance, gradients=gradients, budget=8.0 if name == "pull" else 3.0, elements=False
     )
@@ -182,7 +182,7 @@ def relative(motion, right) -> float:
 @pytest.mark.thorough
 def test_advice_is_implicit_where_explicit_steps_are_tiny():
     """Against explicit steps at their limit: as right as promised, and the explicit run takes longer."""
-    (scene, duration, tolerance), advice = held_back("pull"), advised("pull")
+    (scene, duration, tolerance), advice = limited_displacement("pull"), advised("pull")
     assert not advice.solver.explicit and advice.steps < 1000
     stable = ds.VelocityVerletSolver(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True).dt
     rollout = ds.Rollout(
@@ -200,7 +200,7 @@ def test_advice_is_implicit_where_explicit_steps_are_tiny():
 @pytest.mark.parametrize("name", ["twist", "drop"])
 def test_advice_keeps_its_promise(name):
     """Error below the tolerance against an independent converged run: another solver, sixteen times finer."""
-    (scene, duration, tolerance), advice = held_back(name), advised(name)
+    (scene, duration, tolerance), advice = limited_displacement(name), advised(name)
     fine = 16 * -(-advice.steps // 8)
     coarse, fine = (moved(scene, ds.SemiImplicitSolver, "f64", duration, k) for k in (fine, 2 * fine))
     assert relative(from_start(advice.rollout(scene, 8)), 2 * fine - coarse) <= tolerance
@@ -211,7 +211,7 @@ def test_advice_keeps_its_promise(name):
 @pytest.mark.parametrize("name", ["twist", "drop"])
 def test_advice_overlooks_nothing_twice_as_cheap(name):
     """Every explicit solver, precision and step of a ladder: none that meets the tolerance takes half the time."""
-    (scene, duration, tolerance), advice = held_back(name), advised(name)
+    (scene, duration, tolerance), advice = limited_displacement(name), advised(name)
     own = -(-advice.steps // 8)
     right = moved(scene, ds.VelocityVerletSolver, "f64", duration, 16 * own)
     rollouts = {"advised": advice.rollout(scene, 8)}
@@ -236,7 +236,7 @@ def test_advice_overlooks_nothing_twice_as_cheap(name):
 
 
 def test_advice_states_memory_and_keeps_to_it():
-    scene, duration, tolerance = held_back("drop")
+    scene, duration, tolerance = limited_displacement("drop")
     advice = recommend(scene, duration, tolerance, memory=0.05, budget=2.0, elements=False)
     rollout = advice.rollout(scene, 4)
     assert 0 < advice.megabytes <= 0.05 and rollout.memory <= 0.05
@@ -262,13 +262,13 @@ def test_advice_names_patches_where_tetrahedra_lock(bulk_modulus, says):
     "wrong, says", [(dict(duration=0.0), "duration"), (dict(tolerance=2.0), "tolerance"), (dict(memory=-1.0), "memory")]
 )
 def test_advice_refuses_what_is_no_question(wrong, says):
-    scene, duration, tolerance = held_back("drop")
+    scene, duration, tolerance = limited_displacement("drop")
     with pytest.raises(ValueError, match=says):
         recommend(scene, **dict(duration=duration, tolerance=tolerance) | wrong)
 
 
 def test_own_scene_is_charted_against_its_own_converged_motion():
-    scene, duration, _ = held_back("twist")
+    scene, duration, _ = limited_displacement("twist")
     result = chart(
         Problem.of_scene(scene, duration, frames=4), solvers=EXPLICIT, precisions=("f32",), levels=2, repeats=1
     )
@@ -278,7 +278,7 @@ def test_own_scene_is_charted_against_its_own_converged_motion():
 
 
 def test_gradients_of_an_own_scene_are_charted_too():
-    scene, duration, _ = held_back("twist")
+    scene, duration, _ = limited_displacement("twist")
     asked = Problem.of_scene(scene, duration, "twist", frames=4, gradient="youngs_modulus")
     result = chart(asked, solvers=(ds.VelocityVerletSolver,), precisions=("f64",), levels=3, repeats=1)
     errors = [p.error for p in result.points]

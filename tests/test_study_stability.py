@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti.mechanics.obstacles.obstacle_ways import ObstacleWays
+from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.study import boundary, growth, map_picture, power_limit, stability_map
 from diffsim_ti.study.stability_axes import AXES, body
@@ -84,7 +84,7 @@ def test_a_map_would_show_what_is_wrong_silently():
     assert judge(scene, ds.ImplicitMidpointSolver, 3 * limit, 40).outcome == "raises"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ds.ImplicitMidpointSolver, "may_gain_energy", False)
-        patch.setattr(ObstacleWays, "_check_end", lambda *_: None)
+        patch.setattr(ObstacleCollisions, "_check_end", lambda *_: None)
         assert judge(scene, ds.ImplicitMidpointSolver, 3 * limit, 40).outcome == "wrong silently"
 
 

@@ -392,7 +392,7 @@ def test_sets_join():
     at = np.searchsorted(supports.vertices, np.setdiff1d(both, mesh.vertex_sets["zmin"]))
     np.testing.assert_allclose(supports.held[at], np.tile(np.diag([1.0, 1, 0]), (len(at), 1, 1)), atol=1e-12)
     np.testing.assert_allclose(supports.held @ supports.held, supports.held, atol=1e-12)
-    assert set(supports.guided).isdisjoint(supports.fixed) and len(supports.vertices) == len(supports.held)
+    assert set(supports.partly_fixed).isdisjoint(supports.fixed) and len(supports.vertices) == len(supports.held)
 
 
 CUBE = ds.TetrahedralMesh.create_cube(3).with_surface_set("round", lambda x, n: n[:, 0] > -0.5)

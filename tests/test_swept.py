@@ -7,7 +7,7 @@ from impact_judge import Judge, distance_to_segment, overlaps
 
 import diffsim_ti as ds
 from diffsim_ti.mechanics.obstacles.blocked import Blocked
-from diffsim_ti.mechanics.obstacles.way import Way
+from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
 
 DAMPED = pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver], ids=lambda s: s.__name__)
 SOFT = ds.StableNeoHookean(1e5, 0.3)
@@ -167,7 +167,7 @@ def test_distances_of_faces_are_those_of_geometry():
             continue
         scene = ds.Scene(mesh, SOFT, terms=[ds.Capsule(start, end, radius, stiffness=1e3)], precision="f64")
         solver = ds.ImplicitEulerSolver(scene)
-        way = Way(solver.workspace(solver.start_values()).arrays, False)
+        way = CollisionDetection(solver.workspace(solver.start_values()).arrays, False)
         u, places = np.zeros((mesh.num_vertices, 3)), np.zeros((1, 3))
         found = way.nearest(u, places, 1.0).value
         assert 0.5 * exact <= found <= exact + 1e-12

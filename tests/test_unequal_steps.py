@@ -230,7 +230,7 @@ def test_the_benchmark_of_an_impact(capsys):
 
 
 def test_a_search_goes_on_where_a_solve_does_not_converge():
-    """One substep would drive held vertices through a floor's barrier faster than Newton's method can follow."""
+    """One substep would drive fixed vertices through a floor's barrier faster than Newton's method can follow."""
     mesh = ds.TetrahedralMesh.create_box(3, 0.1, origin=(0, 0.02, 0))
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e4, 0.3), terms=[ds.Gravity()], fixed="ymax", precision="f64")
     scene = scene.replace(motion=lambda t: [0, -0.04 * np.sin(np.pi * min(t / 0.1, 1.0)), 0])

@@ -130,7 +130,7 @@ def falling():
 @pytest.fixture
 def live(falling):
     falling.simulator.reset()
-    falling.balance_anew()
+    falling.restart_balance()
     return LiveFrames(falling)
 
 

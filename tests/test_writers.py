@@ -34,7 +34,7 @@ def run():
 @pytest.fixture
 def again(run):
     run.simulator.reset()
-    run.balance_anew()
+    run.restart_balance()
     return run
 
 

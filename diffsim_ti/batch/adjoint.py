@@ -34,7 +34,7 @@ class BatchAdjoint:
         arrays["gradients"] = layout.numbers(9 * a.points * m * shape)
         arrays["volumes"] = layout.numbers(a.points * m * shape)
         arrays["sums"] = layout.numbers(self.features.sums().total, n)
-        arrays["felt"] = layout.vectors(2 * moving * self._steps, n if moving else 1)
+        arrays["path_adjoint"] = layout.vectors(2 * moving * self._steps, n if moving else 1)
         for name in (*OF_STEPS, "anchor"):
             arrays[name] = runtime.array(layout.vector, *getattr(ws.numbers, name).shape)
         if self.features.growing:

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.batch.batch_inputs import change_of, checked_values, spread_given
 from diffsim_ti.batch.frames import BatchFrames, LazyFrames
-from diffsim_ti.batch.given import change_of, checked_values, spread_given
 from diffsim_ti.batch.set_values import gathered_scenes
 from diffsim_ti.batch.side_by_side import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
-from diffsim_ti.batch.taped import BatchTapeFace
+from diffsim_ti.batch.taped import BatchTapeAdapter
 from diffsim_ti.common.checked import as_numbers, instance, whole
 from diffsim_ti.common.copies import made_again
 from diffsim_ti.common.origin import positions_of
@@ -87,7 +87,7 @@ class Batch:
         )
         self.frames: BatchFrames | None = None  # of the last `run`
         self.gradients: dict[str, np.ndarray] = {}
-        self.tape_face = BatchTapeFace(self, runs)
+        self.tape_face = BatchTapeAdapter(self, runs)
         self.steps, self.save_every, self.num_frames = self.one.steps, self.one.save_every, self.one.num_frames
         self.why_not = why_not(self.solver) or (
             f"an output reads {' and '.join(self.one.sweep.noted)} of frames" if self.one.sweep.noted else None

@@ -23,7 +23,7 @@ OF_STEPS = dict(forces="blocks2", motion="blocks2", path="blocks2", anchor="bloc
 
 @dataclass(frozen=True)
 class KickDriftOfEight(KickDrift):
-    """As KickDrift, whose tetrahedra are those of eight scenes, and whose energy nobody follows."""
+    """As KickDrift, whose tetrahedra are those of eight scenes, and whose energy is not monitored."""
 
     counts_work = False
 
@@ -151,7 +151,7 @@ class BlockViews:
     @traced
     def adjoint_of(self, b, lane, adjoint, plan):
         """The adjoints of scene `lane`."""
-        names = ("u", "v", "w", "frames_u", "frames_v", "felt", "corner")
+        names = ("u", "v", "w", "frames_u", "frames_v", "path_adjoint", "corner")
         names += ("rate_corner",) if self.vertex.reads_rates else ()
         states = self.states_of(names, b, lane, adjoint, plan)
         own = self.numbers_of(b, lane, adjoint, plan)

@@ -1,4 +1,4 @@
-"""Vertices at which nothing acts but tetrahedra, gravity, given forces and drag, of eight scenes at once.
+"""Vertices at which nothing acts but tetrahedra, gravity, prescribed forces and drag, of eight scenes simultaneously.
 
 What happens there is what explicit/kick_drift.py says; an obstacle that none of the eight comes near in a pass does nothing
 in it. Vectors are lists of three numbers in lanes here.
@@ -9,7 +9,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.mechanics.loads.explicit import GivenForces
+from diffsim_ti.mechanics.loads.explicit import AppliedForces
 from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced, variable
 from diffsim_ti.solvers.explicit import kick_drift
 from diffsim_ti.state.features import Features
@@ -46,8 +46,8 @@ class Component:
 
 
 @dataclass(frozen=True)
-class GivenInLanes(GivenForces):
-    """As GivenForces, of a component in lanes in place of a vector."""
+class GivenInLanes(AppliedForces):
+    """As AppliedForces, of a component in lanes in place of a vector."""
 
     @property
     def vector(self):
@@ -81,7 +81,7 @@ class FreeVertices:
     def some_special(self) -> bool:
         """Whether something else may act at a vertex."""
         has = self.features
-        return bool(has.groups) or has.motion or has.guided or bool(has.at_vertices)
+        return bool(has.groups) or has.motion or has.partly_fixed or bool(has.at_vertices)
 
     # ---- reading and writing -----------------------------------------------------------------------------------------
 
@@ -188,8 +188,10 @@ class FreeVertices:
     def lane_groups(self) -> tuple:
         """Obstacles whose distance can be told in lanes; none if one cannot."""
         staged = self.features.staged
-        told = len(staged) == len(self.features.groups) and all(g.force.lanes and not g.force.turns for g in staged)
-        return staged if told else ()
+        all_in_lanes = len(staged) == len(self.features.groups) and all(
+            g.force.lanes and not g.force.turns for g in staged
+        )
+        return staged if all_in_lanes else ()
 
     @ti.func
     def hits(self, i, b, moved: A, now: A, scene: A, plan: A):

@@ -25,7 +25,7 @@ SIZES = dict(num_rows="int", num_scenes="int")
 
 @dataclass(frozen=True)
 class KickDriftOfScene(KickDrift):
-    """As KickDrift, whose tetrahedra are those of one scene of many, and whose energy nobody follows."""
+    """As KickDrift, whose tetrahedra are those of one scene of many, and whose energy is not monitored."""
 
     counts_work = False
 

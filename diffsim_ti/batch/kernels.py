@@ -21,7 +21,7 @@ STATE |= dict(stage="vectors2", work="scalars", calm="ints")
 CHANGE = dict.fromkeys(("u", "v", "frames_u", "frames_v"), "blocks2")
 CHANGED = dict.fromkeys(("coefficients", "gradients", "volumes", "mass", "parameters", "rest", "surface"), "blocks")
 ADJOINT = dict.fromkeys(("coefficients", "gradients", "volumes", "corner", "rate_corner"), "blocks")
-ADJOINT |= dict.fromkeys(("w", "sums", "felt"), "blocks2")
+ADJOINT |= dict.fromkeys(("w", "sums", "path_adjoint"), "blocks2")
 SIZES = (
     *("num_tetrahedra", "num_vertices", "num_blocks", "spread"),
     *("num_loaded", "num_held", "num_parameters", "num_passes_shown"),

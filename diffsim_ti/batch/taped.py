@@ -8,15 +8,15 @@ from diffsim_ti import runtime
 from diffsim_ti.batch.sweep import Own
 from diffsim_ti.rollout.field_seed import STATES
 from diffsim_ti.rollout.set_values import split_name
-from diffsim_ti.rollout.taped import SPELLING, TapeFace
+from diffsim_ti.rollout.taped import SPELLING, TapeAdapter
 
 if TYPE_CHECKING:
     from diffsim_ti.batch.batch import Batch
     from diffsim_ti.batch.frames import BatchFrames
 
 
-class BatchTapeFace(TapeFace):
-    """As TapeFace; fields of outputs, and of inputs that are not shared, have the scenes as an axis in front.
+class BatchTapeAdapter(TapeAdapter):
+    """As TapeAdapter; fields of outputs, and of inputs that are not shared, have the scenes as an axis in front.
 
     Values and frames go by way of the host, where those of scenes are taken apart.
     """

@@ -50,7 +50,8 @@ class TetrahedronOfEight(TetrahedronOfScenes):
 
 @dataclass(frozen=True)
 class PatchOfEight(TetrahedronOfEight, PatchedTetrahedron):
-    """A tetrahedron of a patch, of eight scenes at once: eight items in a row are a patch, whose sums the first makes."""
+    """A tetrahedron of a patch, of eight scenes simultaneously: eight items in a row are a patch, whose sums the first
+    makes."""
 
     @traced
     def room_for_sums(self):

@@ -160,7 +160,7 @@ class ItemsOfScenes(Items):
 
 @dataclass(frozen=True)
 class EightScenes(ItemsOfScenes):
-    """A tetrahedron of eight scenes at once; an item is an `Item`."""
+    """A tetrahedron of eight scenes simultaneously; an item is an `Item`."""
 
     @cached_property
     def lanes(self):

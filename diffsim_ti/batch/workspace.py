@@ -171,8 +171,8 @@ class BatchWorkspace:
             out[self.derived[0].surface > 0] = NEAR if free.lane_groups else SPECIAL
         if features.motion:
             out[a.held] = SPECIAL
-        if features.guided:
-            out[self.scene.supports.guided] = SPECIAL
+        if features.partly_fixed:
+            out[self.scene.supports.partly_fixed] = SPECIAL
         for x in a.interactions:
             if not x.kernel(a.values, a.precision, False).at_corners:
                 out[x.acts_at] = SPECIAL

@@ -34,7 +34,6 @@ MODULES = {
     "diffsim_ti.slots": "diffsim_ti.runtime.slots",
     "diffsim_ti.strength": "diffsim_ti.scene.strength",
     "diffsim_ti.supports": "diffsim_ti.terms.supports",
-    "diffsim_ti.terms_of_scene": "diffsim_ti.terms.terms_of_scene",
 }
 # names of the package -> their new names there
 NAMES = {"TieLength": "Length", "TieTension": "Tension"}

@@ -67,9 +67,9 @@ def warn_of_coarse_places(scene) -> None:
         return
     away = inputs.values["initial_positions"] - inputs.values["rest_positions"]
     warn_of_rounding("initial displacements", away.astype(np.float32), scene.mesh, START_NEARER)
-    felt = [term for term in scene.obstacles if "barrier_width" in term.values]
-    parameters, places = inputs.derive(inputs.values).parameters if felt else (), scene.places(0.0)
-    for term in felt:
+    barriers = [term for term in scene.obstacles if "barrier_width" in term.values]
+    parameters, places = inputs.derive(inputs.values).parameters if barriers else (), scene.places(0.0)
+    for term in barriers:
         known = [i for i in term.described if i.value is not None]
         lengths = np.repeat([i.unit == "m" for i in known], [i.value.size for i in known])
         largest = float(np.abs(parameters[inputs.parameters.of(term)][lengths]).max())

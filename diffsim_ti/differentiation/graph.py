@@ -121,9 +121,9 @@ class Number:
 class Graph:
     """Numbers in the order in which they were made; `fp` is the scene's float, `parameters` its parameter array.
 
-    waits: sums, products and quotients are found where they are first asked for, and not at all if nobody asks; what only
-    one sum has is part of it, and no variable. The time in which a kernel compiles grows with the square of their number.
-    What a loop or a branch of a kernel asks for is unknown behind it: `within`.
+    waits: sums, products and quotients are found where they are first asked for, and not at all if they are not asked
+    for; what only one sum has is part of it, and no variable. The time in which a kernel compiles grows with the square
+    of their number. What a loop or a branch of a kernel asks for is unknown behind it: `within`.
     """
 
     def __init__(self, fp, parameters=None, waits: bool = False):

@@ -35,14 +35,16 @@ def l_bfgs_b(search: Search, record: Callable, tolerance: float) -> tuple[str, b
         except FAILURES:  # numbers that end a run: the line search comes back
             return 2 * search.cost + 10, np.zeros_like(t)
 
-    def told(t):
+    def note_iteration(t):
         costs.append(search.cost)
         record()
         if len(costs) > SMALL_STEPS and costs[-1 - SMALL_STEPS] - costs[-1] < SMALL_STEPS * least:
             raise StopIteration
 
     options = dict(maxiter=10**6, maxfun=10**6, maxcor=20, ftol=0.0, gtol=0.0)
-    found = minimize(cost_and_gradient, search.point.t, jac=True, method="L-BFGS-B", callback=told, options=options)
+    found = minimize(
+        cost_and_gradient, search.point.t, jac=True, method="L-BFGS-B", callback=note_iteration, options=options
+    )
     if len(costs) > SMALL_STEPS and costs[-1 - SMALL_STEPS] - costs[-1] < SMALL_STEPS * least:
         return "converged", True
     return f"L-BFGS-B finds no lower cost ({found.message})", False

@@ -1,4 +1,4 @@
-"""An experiment before it is made: how well would it tell the unknowns, and which of several does so best."""
+"""An experiment before it is made: how well would it determine the unknowns, and which of several does so best."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Expectation:
 
     @property
     def unseen(self) -> list[dict[str, float]]:
-        """Directions that such data would not tell."""
+        """Directions that such data would not determine."""
         return self.information.unseen
 
     @property

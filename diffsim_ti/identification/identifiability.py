@@ -1,4 +1,4 @@
-"""Which inputs the frames' positions can tell at all: eigenvalues of the Fisher matrix."""
+"""Which inputs the frames' positions can determine at all: eigenvalues of the Fisher matrix."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -142,7 +142,7 @@ class Identification:
 
     @property
     def unseen(self) -> list[dict[str, float]]:
-        """Directions of free variables that the data do not tell."""
+        """Directions of free variables that the data do not determine."""
         return [] if self.information is None else self.information.unseen
 
     @property

@@ -21,7 +21,7 @@ class Unknown:
     start: a guess, one number or one per group, or of the input's shape, which then are numbers of their own. range: (low,
     high). scale: a change that matters, in the input's unit, one or one for each number.
     regions: names of the mesh's sets of tetrahedra, a number for each, what lies in none keeps the scene's value; "each" for
-    one per tetrahedron; or whole numbers of the input's shape, equal ones for what changes together, -1 for what is held.
+    one per tetrahedron; or whole numbers of the input's shape, equal ones for what changes together, -1 for what is fixed.
     input: its name; default the unknown's own. "time_offset" [s] is added to the times of measurements.
     experiments: indices of the rollouts that it acts in; default all.
     Errors are ValueErrors before any run. Seber, Wild, Nonlinear Regression, 1989, sec. 2.8, on such transformations.

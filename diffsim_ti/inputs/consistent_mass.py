@@ -1,4 +1,5 @@
-"""Consistent masses of ten-node tetrahedra, M_ab = integral of rho N_a N_b: what statics, implicit steps and modes take.
+"""Consistent masses of ten-node tetrahedra, M_ab = integral of rho N_a N_b: what static solves, implicit steps and
+modes take.
 
 Lumped masses, which explicit steps divide by, put an element's weight where its stresses cannot carry it evenly: strains of
 a hanging bar would fall short by an order. Zienkiewicz, Taylor, Zhu, The Finite Element Method, 6th ed., 16.2.4.

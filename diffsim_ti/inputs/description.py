@@ -107,7 +107,7 @@ class Input:
         """The unit behind a blank; nothing where it is not said."""
         return f" [{self.unit}]" if self.unit else ""
 
-    def check_given(self, kind: str) -> None:
+    def check_value(self, kind: str) -> None:
         """Raise ValueError unless the value that a constructor was given (`kind`: its class) is finite and fits."""
         value, label = self.value, f"{kind}: {self.label or self.plain}"
         unit = "" if "[" in label else self.in_brackets

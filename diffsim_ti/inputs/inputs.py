@@ -11,9 +11,9 @@ from diffsim_ti.common.origin import FAR, ROUNDING, far_part, warn_of_rounding
 from diffsim_ti.common.rows import Rows
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
-from diffsim_ti.inputs.clamps import ClampedMotion
 from diffsim_ti.inputs.consistent_mass import ElementMasses
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, length_per_step, speed
+from diffsim_ti.inputs.posed_supports import PosedMotion
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.inputs.rest_shape import RestShape, StressPoints
 from diffsim_ti.inputs.rigid_start import RigidDisplacement, RigidVelocity
@@ -135,10 +135,10 @@ class Inputs:
     def _at_last(self) -> list[Input]:
         """What stands at the end of the list: the rest shape, whose gradient costs extra, and the prescribed motion."""
         out = [Input("rest_positions", self.mesh.vertices, (("vertices", 3),), "m", change=length, axes="xyz")]
-        for clamp, pose in self.scene.clamps:
+        for support, pose in self.scene.posed_supports:
             shape = ("steps + 1", pose.width)
-            out.append(Input(clamp.pose, None, (shape,), "m, rad", change=length_per_step))
-            out.append(Input(clamp.about, pose.about, ((3,),), "m", change=length, axes="xyz"))
+            out.append(Input(support.pose, None, (shape,), "m, rad", change=length_per_step))
+            out.append(Input(support.about, pose.about, ((3,),), "m", change=length, axes="xyz"))
         if self.scene.translates:
             shape = ("steps + 1", len(self.scene.held), 3)
             out.append(Input("prescribed_motion", None, (shape,), "m", change=length))
@@ -202,8 +202,8 @@ class Inputs:
         out.append(links.Placed(places, "parameters", shift))
         if self.paths:
             out.append(PoseColumns(self.paths, "path", self.away.values()))
-        if scene.clamps:
-            out.append(ClampedMotion([clamp for clamp, _ in scene.clamps], len(scene.held), scene.translates))
+        if scene.posed_supports:
+            out.append(PosedMotion([support for support, _ in scene.posed_supports], len(scene.held), scene.translates))
         elif scene.motion is not None:
             out.append(links.Same("prescribed_motion", "motion"))
         return out
@@ -225,7 +225,7 @@ class Inputs:
         """The values of a run, with those that are sampled at its times [s]."""
         scene = self.scene
         rows = {"prescribed_motion": scene.motion_rows(times)} if scene.translates else {}
-        rows |= {clamp.pose: pose.rows(clamp.pose, times) for clamp, pose in scene.clamps}
+        rows |= {support.pose: pose.rows(support.pose, times) for support, pose in scene.posed_supports}
         rows |= scene.path_rows(times) | {name: term.rows(times) for name, term in self.keyed}
         return self.values | {name: frozen(value) for name, value in rows.items()}
 

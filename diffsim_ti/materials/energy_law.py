@@ -22,7 +22,7 @@ class EnergyLaw(Law):
 
     A law with a state (`state_names`, law.py) writes `psi(H, p, z)` and `next_state(H, p, z, h)`, z being a list of the S
     numbers: z is held while psi gives stresses, and next_state is what it becomes in a pass of length h [s]. Write that
-    as the exact solution for a held H where there is one: relaxation towards H within a time tau is
+    as the exact solution for a frozen H where there is one: relaxation towards H within a time tau is
     z + (1 - exp(-h / tau)) (H - z). `lame` of its material says the moduli of what is fast, all springs together.
 
     The graph is Griewank, Walther, Evaluating Derivatives, ch. 3 and 5, doi:10.1137/1.9780898717761.
@@ -52,7 +52,7 @@ class EnergyLaw(Law):
     def dissipation(self, H: Tensor, H_dot: Tensor, p: list) -> Number:
         """phi [W/m^3] of a law that reads ("H", "H_dot"): its stress is dpsi/dF + dphi/dF_dot, F_dot = H_dot.
 
-        For explicit solvers, which take the velocity before the kick; their limit of steps does not know phi. What shows
+        For explicit solvers, which take the velocity before the kick; their stable step does not include phi. What shows
         stresses shows those of psi.
         """
         raise NotImplementedError(f"{type(self).__name__} reads H_dot: it writes dissipation(H, H_dot, p)")

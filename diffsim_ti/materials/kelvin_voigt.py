@@ -31,7 +31,7 @@ class ViscousLaw(EnergyLaw):
         return ("H",) if self.in_step else ("H", "H_dot")
 
     @property
-    def held_names(self):
+    def frozen_names(self):
         return SIX if self.in_step else ()
 
     def psi(self, H, p):
@@ -68,8 +68,8 @@ class KelvinVoigtLaw(SumLaw):
         return self.added.reads
 
     @property
-    def held_names(self):
-        return self.added.held_names
+    def frozen_names(self):
+        return self.added.frozen_names
 
     def in_steps(self):
         return replace(self, in_step=True)
@@ -140,9 +140,9 @@ class KelvinVoigt(Around):
     number, one per tetrahedron or by sets, an input with gradient: viscous_time, or shear_viscosity and bulk_viscosity.
 
     S is free of any rigid motion, S : E_dot is never negative, and nothing in it is divided by, so that crushed elements
-    have it too. What shows stresses and energies shows those of the material; statics leave it out. Explicit steps take the
-    velocity before the kick, which is of first order; their limit is (2 / omega) (sqrt(1 + xi^2) - xi), xi = tau omega / 2.
-    Where xi is above 2, `SemiImplicitSolver(..., viscous_stages=)` goes further with less work.
+    have it too. What shows stresses and energies shows those of the material; static solves leave it out. Explicit
+    steps take the velocity before the kick, which is of first order; their limit is (2 / omega) (sqrt(1 + xi^2) - xi),
+    xi = tau omega / 2. Where xi is above 2, `SemiImplicitSolver(..., viscous_stages=)` goes further with less work.
     Implicit steps take (E - E_before) / h, a potential of the step: symmetric, zero for a rigid turn; the midpoint's, whose
     middle is no rigid turn, sees tau h omega^2 / 4 of strain in a spin, which does no work. In float32 such a difference has
     lost digits: gradients by viscosity are then good to 1e-3.

@@ -40,7 +40,7 @@ class Law:
     reads = ("H",)
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
     viscous = False  # whether it has a `viscous_differential`
-    held_names = ()  # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
+    frozen_names = ()  # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
     short = False  # whether its kernels are so short that Taichi's own passes over them pay (runtime/launch.py)
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 
@@ -88,8 +88,8 @@ class Law:
 
     def in_steps(self) -> "Law":
         """The law as implicit passes take it, of the displacement gradient alone. One that reads rates can be an energy
-        there, of the change from what is held in a pass, numbers of `held_names`, and of a rate [1/s]: they follow the state
-        in p. Itself, where it does not know how."""
+        there, of the change from what is held in a pass, numbers of `frozen_names`, and of a rate [1/s]: they follow
+        the state in p. Itself, where it does not know how."""
         return self
 
     @traced

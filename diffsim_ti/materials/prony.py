@@ -16,7 +16,7 @@ from diffsim_ti.materials.sum_law import SumLaw
 
 @dataclass(frozen=True)
 class BranchesLaw(EnergyLaw):
-    """psi = sum_i g_i (mu |E - z_i|^2 + lam/2 tr(E - z_i)^2); dz_i/dt = (E - z_i) / tau_i, solved exactly for a held E."""
+    """psi = sum_i g_i (mu |E - z_i|^2 + lam/2 tr(E - z_i)^2); dz_i/dt = (E - z_i) / tau_i, solved exactly for a frozen E."""
 
     terms: int = 1
 
@@ -62,8 +62,9 @@ class Prony(Around):
     S the second Piola-Kirchhoff stress, E Green's strain, C : E = 2 mu E + lam tr(E) 1 with the moduli of small strains of
     the isotropic part. `Prony(material, shares, times)`: g_i >= 0 [-], of the moduli that last, which are the material's,
     and tau_i > 0 [s], N numbers for all or of shape (num_tetrahedra, N); inputs with gradient, prony_shares and
-    prony_times. At once the body is 1 + sum g_i times as stiff, and a held strain relaxes by exp(-t / tau_i). A series given
-    as shares a_i of what is stiff at once, E_0, has g_i = a_i / (1 - sum a), and the material E = (1 - sum a) E_0.
+    prony_times. At once the body is 1 + sum g_i times as stiff, and at constant strain the stress relaxes by exp(-t /
+    tau_i). A series given as shares a_i of what is stiff at once, E_0, has g_i = a_i / (1 - sum a), and the material E
+    = (1 - sum a) E_0.
 
     z_i are numbers of each tetrahedron that a run keeps with its state, moved on exactly for the strain of each substep
     (law.py: of first order in its length). The stress has an energy, and what is lost [W/m^3],

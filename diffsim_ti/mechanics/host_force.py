@@ -17,7 +17,7 @@ from diffsim_ti.state.schedule import EqualSteps, Schedule
 class Instant:
     """When in a run forces are taken: at a `share` of the step of pass j of a schedule; by default as the run begins.
 
-    load: share of the loads that statics have applied; laid: share of what pass j applies that is there (laid_on.py).
+    load: share of the loads that statics have applied; laid: share of what pass j applies that is there (load_stepping.py).
     origin, gamma: velocities are (u - origin) / gamma; without an origin they are zero.
     """
 

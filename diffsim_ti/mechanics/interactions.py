@@ -4,11 +4,11 @@ from diffsim_ti.mechanics.chambers.interaction import FilledChambers, Gases
 from diffsim_ti.mechanics.fluid.interaction import FluidDrag
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interaction import Interaction
+from diffsim_ti.mechanics.lines.interaction import Foundations, SpringsAndCables
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.pressure.interaction import Pressures
 from diffsim_ti.mechanics.rotating_frame import InertialForces
 from diffsim_ti.mechanics.stress.interaction import Growths
-from diffsim_ti.mechanics.ties.interaction import Foundations, SpringsAndCables
 
 # in the order in which vertices gather their corners: what is no load comes first
 KINDS: tuple[type[Interaction], ...] = (

@@ -17,8 +17,8 @@ from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.bending import Bending
 from diffsim_ti.state.history import History, first_bad_vertex
+from diffsim_ti.state.obstacle_poses import Moment
 from diffsim_ti.state.solve_report import SolveReport
-from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.watch import ContactWatch
 
 
@@ -54,7 +54,7 @@ class Workspace:
         self.owner = runtime.program()
         explicit = solver.explicit
         self.arrays = SceneArrays(
-            self.scene, solver.stages_contact, self.feels_faces(self.scene, bend), explicit, not explicit, bend
+            self.scene, solver.stages_contact, self.has_face_contact(self.scene, bend), explicit, not explicit, bend
         )
         self.parallel = solver.runs_parallel()
         self.pairs = pairs_of(self.pairs_kind, self.arrays, self.parallel) if self.arrays.self_contact else None
@@ -66,11 +66,11 @@ class Workspace:
         self.load(derived)
 
     @staticmethod
-    def feels_faces(scene, bend: float = 0.0) -> bool:
+    def has_face_contact(scene, bend: float = 0.0) -> bool:
         """Whether passes take forces at points within faces."""
         return False
 
-    def look_between_points(self, now: int) -> None:
+    def check_between_points(self, now: int) -> None:
         """Note what contact within faces may have missed before pass `now`."""
 
     def history(self, num_slots: int, record: bool = False) -> History:
@@ -110,7 +110,7 @@ class Workspace:
         return values.mass[:, None]
 
     def kept(self, name, make):
-        """make(), kept until launches must be bound anew."""
+        """make(), kept until launches must be bound again."""
         if name not in self._launches:
             self._launches[name] = make()
         return self._launches[name]
@@ -192,7 +192,8 @@ class Workspace:
         raise NotImplementedError
 
     def chamber_pressures(self, num_frames: int, save_every: int):
-        """Pressures [Pa] of chambers whose volume is held, shape (frames, chambers), frames `save_every` steps apart."""
+        """Pressures [Pa] of chambers whose volume is constrained, shape (frames, chambers), frames `save_every` steps
+        apart."""
         raise NotImplementedError
 
     def make_record(self, num_slots: int) -> History:
@@ -218,9 +219,9 @@ class Workspace:
         if arrays.obstacles[k][2] < 0:
             return np.zeros(3)
         begin = schedule.begin(j)
-        rows = arrays.walls.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
+        rows = arrays.poses.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
         position = arrays.values.rest[vertex] + runtime.fetch(self.state.u)[0, vertex]
-        return arrays.walls.velocity_at(k, rows, position, self.watch.contacts[k].about)
+        return arrays.poses.velocity_at(k, rows, position, self.watch.contacts[k].about)
 
     def restore_to_record(self) -> None:
         """Copy the current state to slot 0 of the record."""

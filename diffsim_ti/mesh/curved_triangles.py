@@ -17,7 +17,9 @@ SIX = np.array([[0, 3, 5, 1, 4, 2], [1, 4, 3, 2, 5, 0], [2, 5, 4, 0, 3, 1], [3, 
 # (end, middle, end) of the edges that are parallel to their sides, of the three triangles and of the inner one
 EDGES = ((0, 1, 3), (0, 2, 5), (3, 4, 5)), ((3, 2, 4), (3, 0, 5), (5, 1, 4))
 STRAIGHT = 1e-5  # of its length: what an edge may be off that is straight, in files of single precision too
-FELT = 0.02  # of a barrier's width: how far curved faces lie from their triangles before obstacles feel it
+NOTABLE = (
+    0.02  # of a barrier's width: how far curved faces lie from their triangles before contact takes it into account
+)
 
 
 def nodes_of_triangles(mesh) -> np.ndarray:
@@ -43,8 +45,8 @@ def curved_faces(mesh) -> np.ndarray:
     return off > STRAIGHT * longest
 
 
-def are_felt(mesh, terms, bend: float = 0.0) -> bool:
-    """Whether obstacles feel that faces are curved at rest or bend by `bend` [m]: else they feel the triangles, flat as
-    they are."""
+def are_treated_as_curved(mesh, terms, bend: float = 0.0) -> bool:
+    """Whether contact takes into account that faces are curved at rest or bend by `bend` [m]: else it takes the
+    triangles, flat as they are."""
     widths = [float(t.values["barrier_width"]) for t in terms if "barrier_width" in t.values]
-    return mesh.order == 2 and bool(widths) and max(bow(mesh), bend) > FELT * min(widths)
+    return mesh.order == 2 and bool(widths) and max(bow(mesh), bend) > NOTABLE * min(widths)

@@ -93,7 +93,7 @@ class Elements:
     def linear(self) -> "TetrahedralMesh":
         """Linear tetrahedra of the same corners; a mesh of order 1 is returned as it is.
 
-        Mid-edge vertices are left out, the others numbered anew in their order, as `corners` says. A face stays in a surface
+        Mid-edge vertices are left out, the others renumbered in their order, as `corners` says. A face stays in a surface
         set where all of its four triangles are in it.
         """
         if self.order == 1:

@@ -41,7 +41,7 @@ class Enclosure:
     whose normals point into the volume.
 
     faces: the surface, (k, 3) or (k, 6). triangles: (k, 3), of weight w = 1, after those of the surface, `num_own` of them,
-    those of lids: a rim that is held wholly, or in one plane, is closed by triangles from its first vertex. One in several
+    those of lids: a rim that is fixed wholly, or in one plane, is closed by triangles from its first vertex. One in several
     planes is closed by parts of these, which add nothing where o is the point that the planes share, `point`. Otherwise o
     is the first vertex, and V the same from anywhere. The volume under a face of six nodes is cubic in their places: all 20
     triangles of its nodes with weights, and three for a curved edge of a lid.

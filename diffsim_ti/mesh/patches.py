@@ -48,7 +48,7 @@ def _find_patches(mesh) -> np.ndarray:
 
 
 def _pieces(labels: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Labels anew, so that tetrahedra of one label hang together by shared vertices."""
+    """Labels again, so that tetrahedra of one label hang together by shared vertices."""
     m = len(tets)
     corners, place = np.unique(labels[:, None] * (tets.max() + 1) + tets, return_inverse=True)
     label = components(np.repeat(np.arange(m), 4), m + place.ravel(), m + len(corners))

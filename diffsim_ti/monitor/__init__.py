@@ -1,1 +1,1 @@
-"""What looks at a run: energies and stresses, the largest stable step, and the guard that stops a run gone wrong."""
+"""What monitors a run: energies and stresses, the largest stable step, and the guard that stops a run gone wrong."""

@@ -1,4 +1,4 @@
-"""Bodies that slide and shake in explicit steps, so that friction does not point against the sliding.
+"""Bodies that slide and vibrate in explicit steps, so that friction does not point against the sliding.
 
 Steps that damp nothing let the vibrations of a stiff body grow where it rests on an obstacle: contact opens and closes in
 most substeps, vertices move to and fro as fast as the body slides, and it slides too far. A block of 1 MPa that stopped from
@@ -18,7 +18,7 @@ VISCOUS = 0.1  # of the stable step
 
 
 class Chatter:
-    """Looks at what slides on obstacles with friction, and warns once."""
+    """Monitors bodies that slide on obstacles with friction, and warns once."""
 
     def __init__(self, workspace):
         self.ws, self.warned = weakref.proxy(workspace), False
@@ -31,7 +31,7 @@ class Chatter:
         rough = any(term.has_friction for term in workspace.watch.contacts)
         return cls(workspace) if workspace.solver.explicit and rough and not workspace.scene.reduced else None
 
-    def look(self, now: int, num_passes: int) -> None:
+    def check(self, now: int, num_passes: int) -> None:
         """Before pass `now`."""
         ws = self.ws
         ws.place_obstacles(now)
@@ -44,7 +44,7 @@ class Chatter:
             own = np.flatnonzero(touched[k] < width)
             if self.warned or not term.has_friction or not own.size or not np.isfinite(v).all():
                 continue
-            gap = term.gap(x[own], arrays.walls.row_of(k, places))
+            gap = term.gap(x[own], arrays.poses.row_of(k, places))
             slide = float(np.linalg.norm(v[own].mean(0) - ws.velocity_of_obstacle(k, now, own[0])))
             self.fastest[k] = max(self.fastest[k], slide)
             few, near = (gap < width).mean() < OPEN, np.median(gap) < NEAR * width

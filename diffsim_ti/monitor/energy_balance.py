@@ -23,12 +23,12 @@ class Window:
     changes: int
     substep: float
     level: float | None
-    walls: np.ndarray | None = None
+    poses: np.ndarray | None = None
     passes: int = 0
 
 
 class EnergyBalance:
-    """Follows T + V less the work of what is outside, as it is at looks, every few hundred passes.
+    """Follows T + V less the work of what is outside, as it is at checks, every few hundred passes.
 
     T is the kinetic energy of free vertices, V that of strains, weight, contacts, and of cables and muscles that pull
     steadily. Both swap within an oscillation, by a quarter of (omega h)^2, which is no gain. So the velocity v- of half a
@@ -45,9 +45,12 @@ class EnergyBalance:
     doi:10.1017/S0962492902000144, 4.1 and 5.
     """
 
-    usual = 800  # passes from look to look at least; a look costs about as much as six of them
-    first = 20  # where cables and muscles set a body in motion; twice as many from look to look
-    small, seldom = 1000, 2.5  # tetrahedra below which a look costs more than that, and comes up to so much more seldom
+    usual = 800  # passes from check to check at least; a check costs about as much as six of them
+    first = 20  # where cables and muscles set a body in motion; twice as many from check to check
+    small, seldom = (
+        1000,
+        2.5,
+    )  # tetrahedra below which a check costs more than that, and comes up to so much more seldom
 
     def __init__(self, workspace: Workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
@@ -67,7 +70,7 @@ class EnergyBalance:
         self.steady, self._rows = True, None  # whether cables pull as they did at first, and with what (their rows)
         self._soon = self.first if self.ws.arrays.features().pulled else np.inf
         self.gained, self.moving = 0.0, 0.0  # [J]
-        self._risen, self._lowest = 0.0, 0.0  # the level against that of the first look
+        self._risen, self._lowest = 0.0, 0.0  # the level against that of the first check
 
     @property
     def share(self) -> float:
@@ -108,19 +111,19 @@ class EnergyBalance:
         self.window = Window(first, num_passes, self.ws.changes, self.ws.substep, level)
         if level is None and self.ws.arrays.features().moving:
             self.ws.place_obstacles(first)
-            self.window.walls = runtime.fetch(self.ws.arrays.offsets)
+            self.window.poses = runtime.fetch(self.ws.arrays.offsets)
 
     def after(self, now: int, num_passes: int, count: int) -> None:
         """`count` passes are done, up to pass `now`, by the run alone."""
         window = self.window
         window.passes, window.changes = window.passes + count, self.ws.changes
         if window.passes >= min(self.every, self._soon):
-            self._look(now, num_passes)
+            self._check(now, num_passes)
             self._soon *= 2
             window.changes = self.ws.changes
 
     @np.errstate(all="ignore")  # of a run that blows up
-    def _look(self, now: int, num_passes: int) -> None:
+    def _check(self, now: int, num_passes: int) -> None:
         window, features = self.window, self.ws.arrays.features()
         work = self._noted_work() if features.driven else 0.0
         if features.moving and self.ws.faces:
@@ -149,25 +152,25 @@ class EnergyBalance:
         here = ws.history(1)
         ws.save(here, 0)
         ws.restore(self._start, 0)
-        level = self._level(window.first, window.num_passes, window.walls)
+        level = self._level(window.first, window.num_passes, window.poses)
         ws.restore(here, 0)
         return level
 
-    def _level(self, now: int, num_passes: int, walls: np.ndarray | None = None) -> float:
+    def _level(self, now: int, num_passes: int, poses: np.ndarray | None = None) -> float:
         """The level [J] of the current state, which is that before pass `now`."""
         ws, a = self.ws, self.ws.arrays
         values, h = a.values, ws.substep
-        if walls is None:
+        if poses is None:
             ws.place_obstacles(now)
         else:
-            runtime.fill(a.offsets, walls)
+            runtime.fill(a.offsets, poses)
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (ws.state.u, ws.state.v))
         free = runtime.fetch(a.inverse_mass) > 0
         mass, features = values.mass[:, None] * free[:, None], a.features()
         weight = mass * values.parameters[features.gravity :][:3] if features.gravity >= 0 else 0 * mass
         kinetic = 0.5 * float((mass * a.supports.free(v) ** 2).sum())
         stored = quantities.elastic_energy(ws) + sum(quantities.attached_energies(ws).values())
-        if features.groups:  # a stage does not act on vertices that are held
+        if features.groups:  # a stage does not act on fixed vertices
             stored += float((quantities.barrier_energies(ws) * (free if features.num_staged else 1)).sum())
         if ws.faces:
             stored += float(ws.faces.energies().sum())

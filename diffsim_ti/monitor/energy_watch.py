@@ -71,12 +71,12 @@ class EnergyWatch:
 
     def _note(self, u, u_star, u_next, v_next, places, kinetic) -> None:
         potential, energies = self.ws.potential, []
-        drift = self.ws.arrays.walls.drift(places[0], places[2])
+        drift = self.ws.arrays.poses.drift(places[0], places[2])
         for displacement, place in ((u, places[0]), (u_next, places[2])):
-            self.ws.ways.put(place)
+            self.ws.collisions.put(place)
             potential.place(displacement)
             energies.append(potential.energy()[0])
-        self.ws.ways.put(places[1])
+        self.ws.collisions.put(places[1])
         potential.place(u_star)
         work = float((potential.forces()[0] * (u_next - u)).sum()) - self._work_of_obstacles(u_star, places[1], drift)
         self.gained += energies[1] - energies[0] + work + kinetic
@@ -86,13 +86,14 @@ class EnergyWatch:
         """dE/dw (w' - w) [J], by differences over a hundredth of the smallest gap."""
         if not drift.any():
             return 0.0
-        near = self.ws.ways.way.nearest(u_star, places, self.ws.ways.way.widest)
-        gap = self.ws.ways.way.narrowest if near is None else min(near.value, self.ws.ways.way.narrowest)
+        detection = self.ws.collisions.detection
+        near = detection.nearest(u_star, places, detection.widest)
+        gap = detection.narrowest if near is None else min(near.value, detection.narrowest)
         share, energies = min(0.5, 0.01 * gap / np.abs(drift).max()), []
         for sign in (1, -1):
-            self.ws.ways.put(self.ws.arrays.walls.moved(places, drift, sign * share))
+            self.ws.collisions.put(self.ws.arrays.poses.moved(places, drift, sign * share))
             energies.append(self.ws.potential.energy()[0])
-        self.ws.ways.put(places)
+        self.ws.collisions.put(places)
         return (energies[0] - energies[1]) / (2 * share)
 
     @property

@@ -47,13 +47,13 @@ class Crossing(Divergence):
 
 
 class Guard:
-    """Looks at a run every so many passes: is the state finite, did a vertex cross an obstacle, is the step still stable?
+    """Checks a run every so many passes: is the state finite, did a vertex cross an obstacle, is the step still stable?
 
     Keeps the last good state, from which `diagnose` finds the exact step. Looking costs 2 to 7 %; where the step is
-    within a tenth of the stable one it looks more often, for beyond it a motion soon grows e-fold in ten passes.
+    within a tenth of the stable one it checks more often, for beyond it a motion soon grows e-fold in ten passes.
     """
 
-    usual, close, first = 400, 50, 10  # passes between two looks; the first one where a start is deformed or pulled
+    usual, close, first = 400, 50, 10  # passes between two checks; the first one where a start is deformed or pulled
 
     def __init__(self, workspace: Workspace):
         self.ws = workspace
@@ -64,7 +64,7 @@ class Guard:
         self.restart()
 
     def restart(self) -> None:
-        """A new run: looks come at the same passes whatever ran before, and sooner where it starts deformed or pulled."""
+        """A new run: checks come at the same passes whatever ran before, and sooner where it starts deformed or pulled."""
         solver = self.ws.solver
         if solver.explicit and self.ws.energy_watch:
             self.ws.energy_watch.clear()
@@ -79,14 +79,14 @@ class Guard:
         self._seen = self.ws.watch.rows() if self.ws.watch.contacts else None
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
-        """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
+        """Passes first .. last - 1, monitored; recording, slot j of the record holds the state before pass j."""
         for begin, end in self._stretches(first, last):
             self._advance(begin, end, num_passes, save_every, recording)
 
     def advance_again(
         self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False
     ) -> None:
-        """The same of a run that was looked after before, and came to its end: it takes the same way again."""
+        """The same of a run that was monitored before, and came to its end: it takes the same way again."""
         for begin, end in self._stretches(first, last):
             self._pass(begin, end, num_passes, save_every, recording)
 
@@ -116,9 +116,9 @@ class Guard:
                 balance.before(first, num_passes)
             self.mark(first)
             self._pass(first, stop, num_passes, save_every, recording)
-            self.ws.look_between_points(stop)
+            self.ws.check_between_points(stop)
             if self.ws.bending and self.ws.solver.explicit:
-                self.ws.bending.look(stop, runtime.fetch_row(self.ws.state.u, 0))
+                self.ws.bending.check(stop, runtime.fetch_row(self.ws.state.u, 0))
             if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
                 self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
@@ -131,8 +131,8 @@ class Guard:
             if self._passes >= self.every:
                 self._passes = 0
                 if self.chatter:
-                    self.chatter.look(stop, num_passes)
-                self._look_at_step(stop, num_passes)
+                    self.chatter.check(stop, num_passes)
+                self._check_step(stop, num_passes)
             first = stop
 
     def _warn_of_stiff_contact(self, now: int, num_passes: int) -> None:
@@ -170,7 +170,7 @@ class Guard:
         about = watch.gained, watch.share, step, float(solver.schedule.time(step)), enough
         warnings.warn(EnergyGained(said, *about), stacklevel=5)
 
-    def _look_at_step(self, now: int, num_passes: int) -> None:
+    def _check_step(self, now: int, num_passes: int) -> None:
         solver = self.ws.solver
         if solver.allow_unstable or not solver.explicit:
             return
@@ -220,7 +220,7 @@ class Guard:
         for j in range(self.good_pass, bad_by):
             self.mark(j)
             ws.advance(j, j + 1, num_passes)
-            ws.look_between_points(j + 1)
+            ws.check_between_points(j + 1)
             crossing = ws.watch.crossing()
             if crossing is not None:
                 break
@@ -272,7 +272,7 @@ class Guard:
         force, first, _ = arrays.obstacles[k]
         stiffness, width = arrays.stiffness_of(k, [vertex]), float(arrays.values.parameters[first + force.index.width])
         self.ws.place_obstacles(self.good_pass)
-        offset = arrays.walls.row_of(k, runtime.fetch(arrays.offsets).astype(np.float64))
+        offset = arrays.poses.row_of(k, runtime.fetch(arrays.offsets).astype(np.float64))
         position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
         gap = float(self.ws.watch.contacts[k].gap(position[None], offset)[0])
         held = stiffness * width**2 * beta(np.clip(gap / width, 1e-3, 1))

@@ -41,7 +41,7 @@ class OwnWork:
         return self._energy - before + work
 
     def _own_energy(self) -> float:
-        """V [J]; the weight of vertices that are held is carried by what holds them."""
+        """V [J]; the weight of fixed vertices is carried by what holds them."""
         ws, a = self.ws, self.ws.arrays
         out = quantities.elastic_energy(ws) + sum(quantities.attached_energies(ws).values())
         at = a.features().gravity

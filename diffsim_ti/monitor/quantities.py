@@ -162,9 +162,9 @@ def barrier_energies(workspace: Workspace) -> np.ndarray:
     def bind():
         out = SimpleNamespace(contact=runtime.array(a.fp, a.num_vertices))
         no_friction = runtime.array(a.vector, 2, 1)
-        walls = SimpleNamespace(walls=a.offsets, lag=no_friction, pressed=no_friction)
+        poses = SimpleNamespace(poses=a.offsets, lag=no_friction, pressed=no_friction)
         kernel = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes).barrier_energy
-        return out, kernel.bind(scene=a, pass_=walls, at=workspace.state, out=out)
+        return out, kernel.bind(scene=a, pass_=poses, at=workspace.state, out=out)
 
     out, launch = workspace.kept("barriers", bind)
     launch(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)

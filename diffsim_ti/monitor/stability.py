@@ -143,13 +143,13 @@ class Stiffness:
         self.ws = workspace
         a = workspace.arrays
         self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
-        self.walls, self.lag = a.offsets, runtime.array(a.vector, 2, 1)
+        self.poses, self.lag = a.offsets, runtime.array(a.vector, 2, 1)
         self.pressed = self.lag  # no friction
         features = a.features()
-        felt = replace(features, groups=features.pressing)  # a stage limits no step
+        without_stages = replace(features, groups=features.pressing)  # a stage limits no step
         law = workspace.scene.law  # as explicit passes take it
         self.viscous, self.rate = law.viscous, runtime.array(a.fp, 1)
-        kernels = potential_kernels(law, felt, workspace.parallel, a.in_lanes)
+        kernels = potential_kernels(law, without_stages, workspace.parallel, a.in_lanes)
         at = (workspace.state, self)
         self._multiply = kernels.stiffness.bind(a.in_vectors, scene=a, pass_=self, at=at, out=self)
         self.vector, self._random = None, np.random.default_rng(1)

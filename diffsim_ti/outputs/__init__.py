@@ -5,13 +5,13 @@ from diffsim_ti.outputs.contact_force import ContactForce
 from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.enclosed_volume import EnclosedVolume
 from diffsim_ti.outputs.energies import ElasticEnergy, KineticEnergy
+from diffsim_ti.outputs.lines import Length, Tension
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.self_contact_force import SelfContactForce
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
-from diffsim_ti.outputs.ties import Length, Tension
 from diffsim_ti.outputs.work import WorkOfLoads
 
 __all__ = ["ChamberPressure", "Change", "ContactForce", "ContactTraction", "Displacements", "ElasticEnergy"]

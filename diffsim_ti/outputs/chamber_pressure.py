@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 
 class ChamberPressure(Output):
-    """Pressure [Pa] of a chamber on the body, shape (frames,): of a gas p - p_out, of a held volume what that takes.
+    """Pressure [Pa] of a chamber on the body, shape (frames,): of a gas p - p_out, of an incompressible fluid the
+    multiplier of its volume.
 
     chamber: its name, or the term as the scene lists it. name: how a loss calls it.
 

@@ -123,7 +123,7 @@ def free_directions(scene: Scene):
     held = np.zeros((scene.mesh.num_vertices, 3, 3))
     held[scene.held] = scene.supports.held
     held[scene.mesh.unused_vertices] = np.eye(3)  # which have no mass
-    values, vectors = np.linalg.eigh(held)  # of a vertex that is free or held wholly, the axes
+    values, vectors = np.linalg.eigh(held)  # of a vertex that is free or fixed wholly, the axes
     vertex, which = np.nonzero(values < 0.5)
     rows = 3 * vertex[:, None] + np.arange(3)
     columns = np.repeat(np.arange(len(vertex)), 3)

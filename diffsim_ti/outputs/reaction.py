@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.outputs.applied_loads import AppliedLoads
 from diffsim_ti.outputs.body_forces import BodyForces
-from diffsim_ti.outputs.given_loads import GivenLoads
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
 
@@ -28,7 +28,8 @@ class Reaction(Output):
     So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero where
     supports share no vertices, or hold them in directions perpendicular to each other.
     What obstacles and self-contact do to fixed vertices themselves is not in it (ContactForce has the first), nor is the
-    inertia of vertices that a prescribed motion accelerates. A held volume pushes with what `ChamberPressure` says of it.
+    inertia of vertices that a prescribed motion accelerates. An incompressible fluid pushes with what `ChamberPressure`
+    says of it.
 
     support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
     about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
@@ -76,7 +77,7 @@ class Reaction(Output):
                 f"Reaction: the support must be among the fixed vertices, but {len(loose) or 'all'} of its "
                 f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
             )
-        out.scene, out.body, out.loads = scene, BodyForces(scene), GivenLoads(scene, moving=True)
+        out.scene, out.body, out.loads = scene, BodyForces(scene), AppliedLoads(scene, moving=True)
         out.onto = scene.supports.projectors(out.vertices, self.support)
         return out
 

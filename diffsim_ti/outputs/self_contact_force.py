@@ -1,4 +1,4 @@
-"""Forces of surfaces that press and rub on each other: what a soft hand does to what it holds."""
+"""Forces of surfaces that press and slide on each other: what a soft hand does to what it holds."""
 
 from copy import copy
 from typing import TYPE_CHECKING
@@ -78,7 +78,7 @@ class SelfContactForce(Output):
         out.num_obstacles = len(scene.obstacles)
         out.vertices = np.arange(n) if self.on is None else np.unique(scene.mesh.vertex_indices(self.on))
         out.pairs, out.surface = pairs_of(ImplicitPairs, out.arrays, False), scene.mesh.surface_vertices
-        out.rubs = None if self.part == "normal" else out.pairs.friction
+        out.pair_friction = None if self.part == "normal" else out.pairs.friction
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
@@ -93,17 +93,22 @@ class SelfContactForce(Output):
     def _place(self, frames, k: int) -> tuple[np.ndarray, bool]:
         """Go to frame k; its displacements [m], and whether friction is that of the state."""
         u, v = frames.displacements[k].astype(np.float64), frames.velocities[k].astype(np.float64)
-        rubs = bool(self.rubs) and not self._is_noted(frames, k)
+        pair_friction = bool(self.pair_friction) and not self._is_noted(frames, k)
         self.pairs.begin(u)
-        if rubs:
-            self.rubs.begin(u, u - v, 1.0)
+        if pair_friction:
+            self.pair_friction.begin(u, u - v, 1.0)
         self.pairs.place(self.pairs.next)
-        return u, rubs
+        return u, pair_friction
 
     def _is_noted(self, frames, k: int) -> bool:
         """Whether friction of frame k is what the run noted in the last row of its contact forces."""
         noted = frames.contact_forces
-        return bool(self.rubs) and frames.steps[k] > 0 and noted is not None and noted.shape[1] > self.num_obstacles
+        return (
+            bool(self.pair_friction)
+            and frames.steps[k] > 0
+            and noted is not None
+            and noted.shape[1] > self.num_obstacles
+        )
 
     def _at_corners(self) -> np.ndarray:
         """What the pairs have put into the last corners, of all vertices."""
@@ -115,10 +120,10 @@ class SelfContactForce(Output):
         self.arrays.load(self.scene.inputs.derive(frames.inputs))
         out = []
         for k in range(len(frames.positions)):
-            u, rubs = self._place(frames, k)
+            u, pair_friction = self._place(frames, k)
             f = self._at_corners() if self.part != "friction" else np.zeros(u.shape)
             f = f + frames.contact_forces[k, -1, 1] if self._is_noted(frames, k) else f
-            out.append(f + self.rubs.forces(u) if rubs else f)
+            out.append(f + self.pair_friction.forces(u) if pair_friction else f)
         return np.stack(out)
 
     def _of(self, frames, f: np.ndarray) -> np.ndarray:
@@ -140,14 +145,14 @@ class SelfContactForce(Output):
         dx = zero if change.positions is None else change.positions
         dv = zero if change.velocities is None else change.velocities
         for k in range(len(zero)):
-            (u, rubs), du, df = self._place(frames, k), dx[k] - moved.rest, np.zeros(zero.shape[1:])
+            (u, pair_friction), du, df = self._place(frames, k), dx[k] - moved.rest, np.zeros(zero.shape[1:])
             if self.part != "friction":
                 runtime.fill(self.pairs.step, du[None])
                 self.pairs.product(self.pairs.next, 0, self.pairs.step, self.arrays.corner, numbers.rest, by)
                 df += self._at_corners()
             if self._is_noted(frames, k) and change.contact_forces is not None:
                 df = df + change.contact_forces[k, -1, 1]
-            out.append(df + self.rubs.jvp(u, du, du - dv[k], du, numbers) if rubs else df)
+            out.append(df + self.pair_friction.jvp(u, du, du - dv[k], du, numbers) if pair_friction else df)
         if self.about is None:
             return self._of(frames, np.stack(out))
         own, x = np.stack(out)[:, self.vertices], frames.positions[:, self.vertices]
@@ -165,7 +170,7 @@ class SelfContactForce(Output):
         self.pairs.clear_sums()
         rest, noted = np.zeros(positions.shape[1:]), None
         for k in range(len(w)):
-            (u, rubs), by_u = self._place(frames, k), np.zeros(rest.shape)
+            (u, pair_friction), by_u = self._place(frames, k), np.zeros(rest.shape)
             if self.part != "friction":
                 runtime.fill(self.pairs.step, w[k][None])
                 self.pairs.vjp(self.pairs.next, 0, self.pairs.step, self.arrays.corner)
@@ -173,8 +178,8 @@ class SelfContactForce(Output):
             if self._is_noted(frames, k):
                 noted = np.zeros(frames.contact_forces.shape) if noted is None else noted
                 noted[k, -1, 1] = w[k]
-            if rubs:
-                by_v, _, by_begin = self.rubs.vjp(u, w[k])
+            if pair_friction:
+                by_v, _, by_begin = self.pair_friction.vjp(u, w[k])
                 by_u, velocities[k] = by_u + by_begin, by_v
             positions[k] += by_u
             rest -= by_u

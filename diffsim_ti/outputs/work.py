@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.outputs.given_loads import GivenLoads
+from diffsim_ti.outputs.applied_loads import AppliedLoads
 from diffsim_ti.outputs.output import Change, Output
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class WorkOfLoads(Output):
     for such ways; for loads that are constant and dead (and weight), and for a constant pressure on a closed surface (minus
     p times the change of volume), whatever the way. Else its error falls as the square of the time between frames; with
     save_every=1 loads for each step are those of their step. Loads that change between frames further apart are not seen
-    there. What moves held vertices, obstacles and drag do no work of loads.
+    there. What moves fixed vertices, obstacles and drag do no work of loads.
 
     weight: whether gravity counts. name: how a loss calls it. The gradient is exact by all inputs.
     Raises ValueError for a scene without such loads.
@@ -43,7 +43,7 @@ class WorkOfLoads(Output):
 
     def settled(self, scene: "Scene") -> "WorkOfLoads":
         out = copy(self)
-        out.scene, out.loads = scene, GivenLoads(scene, weight=self.weight)
+        out.scene, out.loads = scene, AppliedLoads(scene, weight=self.weight)
         if not out.loads.any:
             raise ValueError(
                 "WorkOfLoads: the scene has no load: add a Traction, BodyForce, ExternalForce or Pressure, or count gravity "

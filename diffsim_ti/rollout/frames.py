@@ -14,7 +14,7 @@ class Frames:
     """Saved states of one run: positions [m] (far from the origin in float64), velocities [m/s], displacements from the rest
     shape [m] (which keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
 
-    `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them.
+    `outputs` has what the Rollout was asked to compute besides, by name; `frames["name"]` gives any of them.
 
     `contact_resolution` says how near the body came to obstacles and how finely the steps resolve that (state/watch.py).
 
@@ -25,8 +25,8 @@ class Frames:
 
     `computed` are these outputs themselves, as settled for the scene; `sets`: those of inputs that were given by named sets.
 
-    `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is held, shape (frames, chambers),
-    of the substep that ends in the frame; others, and the first frame, have none (0).
+    `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is constrained, shape (frames,
+    chambers), of the substep that ends in the frame; others, and the first frame, have none (0).
 
     `law_state`, where an output reads it: what the law remembers of each tetrahedron, shape (frames, num_tetrahedra, S), or
     (frames, num_tetrahedra, 4, S) at the points of ten-node tetrahedra, in the order of the law's `state_names`.

@@ -17,7 +17,7 @@ from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
 from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.rollout.sweep import Sweep
-from diffsim_ti.rollout.taped import TapeFace
+from diffsim_ti.rollout.taped import TapeAdapter
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
 from diffsim_ti.state.solve_report import SolveReport
@@ -96,7 +96,7 @@ class Rollout:
         self.computed = {output.name: self.outputs[output.name] for output in given}  # besides the states themselves
         self._options = options | dict(outputs=given, runs=runs)
         self.gradients: dict[str, np.ndarray] = {}
-        self.tape_face = TapeFace(self, runs)
+        self.tape_face = TapeAdapter(self, runs)
         self.torch_face = None  # made by the first run from tensors (torch_bridge/tensors.py)
 
     def __reduce__(self):

@@ -1,6 +1,6 @@
 """The shape of the whole body as one input of runs, `shape`, which moves rest and initial positions together.
 
-Held vertices stay at `initial_positions`, so a change of `rest_positions` alone strains the body at its supports, and the
+Fixed vertices stay at `initial_positions`, so a change of `rest_positions` alone strains the body at its supports, and the
 gradient by it is mostly of that strain. What a designer changes moves both, and has the sum of their gradients.
 """
 

@@ -143,8 +143,8 @@ class Simulator:
         arrays, values = self.workspace.arrays, self._start
         if values.motion is not None:
             times, inputs = [self.time, self.time + self.solver.dt], self.scene.inputs
-            clamped = inputs.derive(inputs.at_times(times)).motion if self.scene.clamps else None
-            arrays.load_rows(motion=self.scene.motion_rows(times) if clamped is None else clamped)
+            posed = inputs.derive(inputs.at_times(times)).motion if self.scene.posed_supports else None
+            arrays.load_rows(motion=self.scene.motion_rows(times) if posed is None else posed)
         if values.path is not None:
             rows, away = self.scene.path_rows([self.time, self.time + self.solver.dt]), self.scene.inputs.away.values()
             arrays.load_rows(path=PoseColumns(rows, "path", away).value(*rows.values())[0])
@@ -188,8 +188,8 @@ class Simulator:
     @property
     def state(self) -> dict[str, np.ndarray]:
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
-        two-step solvers the displacements and velocities before, pressures of held volumes in implicit steps, and the forces
-        that `set_forces` gave. `np.savez(file, **simulator.state)` keeps it, to the bit."""
+        two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps,
+        and the forces that `set_forces` gave. `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:
@@ -198,7 +198,7 @@ class Simulator:
             before = (runtime.fetch(x)[0] for x in (state.before.u, state.before.v))
             out["displacements_before"], out["velocities_before"] = before
         if self.workspace.last_multipliers is not None:
-            out["held_pressures"] = self.workspace.last_multipliers
+            out["constraint_pressures"] = self.workspace.last_multipliers
         return out | self._set
 
     def resume(self, state: dict) -> None:
@@ -211,7 +211,7 @@ class Simulator:
         two_step = {"displacements_before", "velocities_before"} if self._has_before else set()
         term = self.scene.term(ExternalForce)
         forces = set() if term is None else {self.scene.input_names(term)["external_forces"]}
-        held = {"held_pressures"} if self.workspace.volumes and not self.solver.explicit else set()
+        held = {"constraint_pressures"} if self.workspace.volumes and not self.solver.explicit else set()
         optional = two_step | forces | held
         lacking, more = known.keys() - optional - given.keys(), given.keys() - known.keys() - optional
         if lacking or more or len(given.keys() & two_step) == 1:
@@ -244,7 +244,7 @@ class Simulator:
             now.fresh[0] = False
         self.step_count = int(count)
         if held & given.keys():
-            self.workspace.go_on_from(given["held_pressures"].copy(), self.step_count)
+            self.workspace.go_on_from(given["constraint_pressures"].copy(), self.step_count)
         self.workspace.place_obstacles(int(self.solver.schedule.first(1)) if count else 0)
 
     @property

@@ -384,12 +384,12 @@ class Sweep:
             at_step = begin == schedule.first(step) and begin < passes  # and not where a segment happens to begin
             adjoint.reverse(first, last, self.num_passes, save, begin, at_step and begin > 0)
             if at_step:
-                self._look_at_adjoint(step)
+                self._check_adjoint(step)
                 if begin > end:
                     adjoint.reverse_kick(begin, first, self.num_passes)
             last = begin
 
-    def _look_at_adjoint(self, step: int) -> None:
+    def _check_adjoint(self, step: int) -> None:
         """Between steps: report the running adjoint, and scale it back to `clip`."""
         by_position, by_velocity = self._adjoint.norm()
         if not np.isfinite(by_position + by_velocity):

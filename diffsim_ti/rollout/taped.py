@@ -23,7 +23,7 @@ START = ("initial_positions", "initial_velocities")
 SPELLING = {"initial_displacements": "initial_positions"}  # less the rest positions; they keep their digits in float32
 
 
-class TapeFace:
+class TapeAdapter:
     """Fields of inputs and outputs of a Rollout, and which of its runs the present tape holds (of a Batch: batch/taped.py).
 
     Frames (but not on Vulkan) and, where nothing else depends on them, initial positions and velocities are copied on the
@@ -186,7 +186,7 @@ class TapeFace:
             runtime.check_alive(self._program)
         start = [name for name in (*START, *SPELLING) if name in self._fields]
         scene = rollout.scene
-        simple = scene.motion is None and not len(scene.supports.guided) and not scene.reduced
+        simple = scene.motion is None and not len(scene.supports.partly_fixed) and not scene.reduced
         direct = simple and "rest_positions" not in self._fields
         out = {}
         for name, field in self._fields.items():
@@ -273,7 +273,7 @@ class TapeFace:
 class FieldStart:
     """The start that the fields gave to a run, also after kernels have overwritten them."""
 
-    def __init__(self, face: TapeFace):
+    def __init__(self, face: TapeAdapter):
         self.face, self._kept = face, None
 
     def __call__(self, workspace) -> None:

@@ -5,14 +5,19 @@ What is used of Taichi's internals, by which module, and what Quadrants has inst
 
 | used | by | for | Quadrants |
 | --- | --- | --- | --- |
-| `impl.get_runtime()`: `prog`, `target_tape`, `grad_replaced`, `materialize` | start, field_pool, threads, launch | whether Taichi runs, its tape, its program | `_prog` |
+| `impl.get_runtime()`: `prog`, `target_tape`, `grad_replaced`, `materialize` | start, field_pool, threads, launch |
+whether Taichi runs, its tape, its program | `_prog` |
 | `impl.current_cfg`, `prog.config()` and its options | start, launch | backend, options of one kernel | the same |
-| `kernel._primal`, `ensure_compiled`, `compiled_kernels`, `prog.compile_kernel`, `launch_kernel`, launch contexts | launch | launches with bound arguments | plain calls, which keep their arguments |
+| `kernel._primal`, `ensure_compiled`, `compiled_kernels`, `prog.compile_kernel`, `launch_kernel`, launch contexts |
+launch | launches with bound arguments | plain calls, which keep their arguments |
 | two pointers in a launch context | argument_buffer | launches on CUDA | not used |
 | layout of a compiled kernel | repeated_loops | several substeps in a launch on CUDA | not used |
-| `Ndarray`, `VectorNdarray`, `ScalarNdarray`, `prog.create_ndarray`, `delete_ndarray`, `fill_uint`, `get_ndarray_data_ptr_as_int` | arrays | arrays that are freed, NumPy's view of them | its constructors |
-| `impl.expr_init`, `impl.subscript`, `Expr`, `_assign`, `_is_taichi_function` | language | functions that build code while kernels compile | `_is_quadrants_function`; dataclasses handed on whole |
-| `kernel_impl._get_tree_and_ctx`, `transform_tree`, `ASTTransformerContext`, `ops.cast`, `core.make_const_expr_fp` | sources | faster tracing | not used |
+| `Ndarray`, `VectorNdarray`, `ScalarNdarray`, `prog.create_ndarray`, `delete_ndarray`, `fill_uint`,
+`get_ndarray_data_ptr_as_int` | arrays | arrays that are freed, NumPy's view of them | its constructors |
+| `impl.expr_init`, `impl.subscript`, `Expr`, `_assign`, `_is_taichi_function` | language | functions that build code
+while kernels compile | `_is_quadrants_function`; dataclasses handed on whole |
+| `kernel_impl._get_tree_and_ctx`, `transform_tree`, `ASTTransformerContext`, `ops.cast`, `core.make_const_expr_fp` |
+sources | faster tracing | not used |
 | `ASTTransformer.build_Assign`, annotations of a function's parameters | variables | fewer variables | not used |
 | `kernel_impl.Kernel.__call__` | threads | threads take turns | the same |
 | `core.with_cuda`, `with_vulkan`, `arch_name` | start, device | which backends there are | the same |

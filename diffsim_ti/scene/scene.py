@@ -108,7 +108,7 @@ class Scene(MadeAgain):
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
         self.reduced = Reduced(mesh, reduced, self.held)
-        self.motion, (self.clamps, self.translates) = motion, self.supports.parts_of(motion)
+        self.motion, (self.posed_supports, self.translates) = motion, self.supports.parts_of(motion)
         self._check_terms()
         self._given = self.arguments["terms"] = self.terms
         settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
@@ -142,8 +142,8 @@ class Scene(MadeAgain):
     own_numbers = tuple(NUMBERS)  # arrays of `Derived` that known kinds of interactions have of their own
 
     def with_consistent_mass(self) -> "Scene":
-        """The scene as statics, implicit steps and modes have it: ten-node tetrahedra with consistent masses and weight, and
-        no mass that was added for the sake of an explicit step."""
+        """The scene as static solves, implicit steps and modes have it: ten-node tetrahedra with consistent masses and
+        weight, and no mass that was added for the sake of an explicit step."""
         if (self.mesh.order == 1 or self.consistent) and self.mass_scaling is None:
             return self
         out, names = self._twin(), ("density", "initial_positions", "initial_velocities")
@@ -216,7 +216,7 @@ class Scene(MadeAgain):
                 return self.inputs.names_of(terms.index(term))
         raise ValueError(f"this scene does not list {term!r}; it has {', '.join(map(repr, self.terms)) or 'no terms'}")
 
-    def given_tensors(self) -> dict[str, object]:
+    def input_tensors(self) -> dict[str, object]:
         """{name of an input: tensor} of the terms' numbers that were given as tensors; their graphs stay with them."""
         return {
             self.inputs.names_of(k)[plain]: tensor
@@ -225,7 +225,8 @@ class Scene(MadeAgain):
         }
 
     def motion_rows(self, times: ArrayLike) -> np.ndarray:
-        """Displacement of the held vertices from their start, without that of poses, shape (len(times), num_held, 3) [m]."""
+        """Displacement of the fixed vertices from their start, without that of poses, shape (len(times), num_held, 3)
+        [m]."""
         return self.supports.rows(self.motion, times)
 
     def path_rows(self, times: ArrayLike) -> dict[str, np.ndarray]:
@@ -245,7 +246,7 @@ class Scene(MadeAgain):
 
     @property
     def obstacles(self) -> tuple[Term, ...]:
-        """What the surface feels by distance, in the order of frames' contact forces."""
+        """The terms that act on the surface by distance, in the order of frames' contact forces."""
         return tuple(t for t in self.ordered_terms if t.acts_on_surface)
 
     def place_of(self, obstacle: Term | str) -> int:
@@ -333,7 +334,7 @@ class Scene(MadeAgain):
                 f"terms: {terms}",
                 *([str(self.mass_scaling)] if self.mass_scaling else []),
                 f"fixed vertices: {len(self.fixed)}"
-                + (f", in some directions {len(self.supports.guided)}" if len(self.supports.guided) else "")
+                + (f", in some directions {len(self.supports.partly_fixed)}" if len(self.supports.partly_fixed) else "")
                 + (", moving" if self.motion is not None else ""),
                 *([f"moving by few numbers: {self.reduced.describe()}"] if self.reduced else []),
                 *chosen,

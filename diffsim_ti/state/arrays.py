@@ -7,15 +7,15 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived, poses
-from diffsim_ti.mesh.curved_triangles import are_felt
+from diffsim_ti.mesh.curved_triangles import are_treated_as_curved
 from diffsim_ti.mesh.patches import in_eights, volume_patches
 from diffsim_ti.runtime import LANES
 from diffsim_ti.state.bodies import BodyArrays
 from diffsim_ti.state.corners import clear_from, slots, vertex_corners, with_more_corners, with_own_corner
 from diffsim_ti.state.features import Features, grouped
 from diffsim_ti.state.numbers import PARTS, on_device
+from diffsim_ti.state.obstacle_poses import Moment, ObstaclePoses
 from diffsim_ti.state.schedule import Schedule
-from diffsim_ti.state.walls import Moment, Walls
 from diffsim_ti.terms import Drag, Gravity, Obstacle, SelfContact
 
 
@@ -26,7 +26,7 @@ class SceneArrays:
         self,
         scene,
         stages_contact: bool = False,
-        feels_faces: bool = False,
+        has_face_contact: bool = False,
         presses: bool = False,
         in_steps: bool = False,
         bend: float = 0.0,
@@ -44,15 +44,20 @@ class SceneArrays:
         self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
-        self.fixed, self.held, self.supports, self.feels_faces = scene.fixed, scene.held, scene.supports, feels_faces
+        self.fixed, self.held, self.supports, self.has_face_contact = (
+            scene.fixed,
+            scene.held,
+            scene.supports,
+            has_face_contact,
+        )
         self.interactions = tuple(x for x in scene.interactions if x.in_kernels) if presses else ()
         self._all = scene.interactions
         self.own = {name: kind for x in self._all for name, kind in x.derived.items()}  # their numbers
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene, presses)
         rows = scene.inputs.parameters
-        self.obstacles = self._twins(scene)
-        self.curved, self.bend = are_felt(mesh, self.contacts, bend), bend
+        self.obstacles = self._counterparts(scene)
+        self.curved, self.bend = are_treated_as_curved(mesh, self.contacts, bend), bend
         self._features = dict(
             order=mesh.order,
             curved=self.curved,
@@ -62,7 +67,7 @@ class SceneArrays:
             gravity=rows.first(scene.term(Gravity)),
             drag=rows.first(scene.term(Drag)),
             motion=scene.motion is not None,
-            guided=bool(len(scene.supports.guided)),
+            partly_fixed=bool(len(scene.supports.partly_fixed)),
             num_parameters=rows.total,
             reduced=presses and bool(scene.reduced),
             rigid=presses and bool(scene.reduced.rigid),
@@ -71,8 +76,10 @@ class SceneArrays:
         self.bodies = BodyArrays(scene, fp, self.vector) if self._features["reduced"] else None
         vars(self).update(self.bodies.arrays if self.bodies else {})
         self.origin, away = scene.origin, [scene.inputs.away.get(term, np.zeros(3)) for term in self.contacts]
-        self.walls = Walls(self.obstacles, np.reshape(away, (-1, 3)))  # (potential/) as one looks between passes
-        self.offsets = runtime.array(self.vector, self.walls.size)
+        self.poses = ObstaclePoses(
+            self.obstacles, np.reshape(away, (-1, 3))
+        )  # (potential/) as they are evaluated between passes
+        self.offsets = runtime.array(self.vector, self.poses.size)
         self.values: Derived | None = None
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
         self.rows: dict[str, np.ndarray | None] = {}  # numbers as the device has them, of steps too
@@ -123,11 +130,11 @@ class SceneArrays:
         self.corner = runtime.array(self.vector, num_corners)
         if scene.motion is not None:
             self.motion_slot = runtime.upload(slots(scene.held, n), ti.i32)
-        if len(scene.supports.guided):
-            self.guide_slot = runtime.upload(slots(scene.supports.guided, n), ti.i32)
-            self.guides = runtime.upload(scene.supports.guides.reshape(-1, 3), self.vector)
+        if len(scene.supports.partly_fixed):
+            self.sliding_slot = runtime.upload(slots(scene.supports.partly_fixed, n), ti.i32)
+            self.sliding_supports = runtime.upload(scene.supports.sliding_supports.reshape(-1, 3), self.vector)
 
-    def _twins(self, scene) -> list[tuple]:
+    def _counterparts(self, scene) -> list[tuple]:
         """(device counterpart, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
         parameters, one after the other."""
         widths = [poses.columns_of(term.path_width) for term in scene.moving]
@@ -136,14 +143,14 @@ class SceneArrays:
         self.tables = np.concatenate([np.zeros(0), *(t.table for t in self.contacts)])
         for term in self.contacts:
             rows = scene.inputs.parameters.of(term)
-            twin = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
+            counterpart = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
             if isinstance(term, Obstacle):
-                twin = replace(twin, per_area=term.per_area, turns=term.turns)
-            if twin.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
+                counterpart = replace(counterpart, per_area=term.per_area, turns=term.turns)
+            if counterpart.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
                 raise AssertionError(
-                    f"the kernel of {term!r} has {twin.size} numbers, its term {rows.stop - rows.start}"
+                    f"the kernel of {term!r} has {counterpart.size} numbers, its term {rows.stop - rows.start}"
                 )
-            out.append((twin, rows.start, columns.get(term, -1)))
+            out.append((counterpart, rows.start, columns.get(term, -1)))
             at += term.table.size
         return out
 
@@ -175,7 +182,7 @@ class SceneArrays:
         )
 
     def load(self, values: Derived) -> bool:
-        """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
+        """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound again."""
         old, before = self.values, None if self.values is None else self.features()
         self.values, self._known_features = values, {}
         self.rows = values.parts()
@@ -237,8 +244,8 @@ class SceneArrays:
 
     def stiffness_of(self, obstacle: int, vertices) -> float:
         """Stiffness [N/m] of an obstacle's barrier at vertices, on average."""
-        twin, first, _ = self.obstacles[obstacle]
-        return float(self.values.parameters[first + twin.index.stiffness]) * self.area_of(obstacle, vertices)
+        counterpart, first, _ = self.obstacles[obstacle]
+        return float(self.values.parameters[first + counterpart.index.stiffness]) * self.area_of(obstacle, vertices)
 
     def stiffer(self, obstacle: int, vertices, stiffness: float) -> str:
         """In words, the number of an obstacle that gives its barrier a stiffness [N/m] at vertices."""
@@ -252,10 +259,10 @@ class SceneArrays:
         return out
 
     def place_obstacles(self, schedule: Schedule, j: int) -> None:
-        """Put what looks at a state between passes where the obstacles are when pass j begins."""
+        """Put what evaluates a state between passes where the obstacles are when pass j begins."""
         if self.rows["path"] is not None:
             begin = schedule.begin(j)
-            runtime.fill(self.offsets, self.walls.value(self.rows["path"], Moment(schedule, j, begin, begin)))
+            runtime.fill(self.offsets, self.poses.value(self.rows["path"], Moment(schedule, j, begin, begin)))
 
     # ---- numbers of tetrahedra in blocks -----------------------------------------------------------------------------
 
@@ -288,9 +295,9 @@ class SceneArrays:
         rows = len(self.law.state_names) * self.points * self.num_blocks
         return runtime.array(self.lanes, num_slots, rows) if rows else None
 
-    def held_numbers(self):
+    def frozen_numbers(self):
         """Room for what the law holds in a pass; None if that is nothing."""
-        rows = len(self.law.held_names) * self.points * self.num_blocks
+        rows = len(self.law.frozen_names) * self.points * self.num_blocks
         return runtime.array(self.lanes, 1, rows) if rows else None
 
     def initial_state_blocks(self) -> np.ndarray:

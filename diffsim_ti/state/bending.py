@@ -23,7 +23,7 @@ class FacesBend(Exception):
 
 
 class Bending:
-    """Looks at the faces of a run."""
+    """Checks the bending of the faces of a run."""
 
     def __init__(self, workspace):
         self.ws, a = weakref.proxy(workspace), workspace.arrays
@@ -41,7 +41,7 @@ class Bending:
         a = workspace.arrays
         return cls(workspace) if a.mesh.order == 2 and (a.contacts or a.self_contact) else None
 
-    def look(self, now: int, u: np.ndarray) -> None:
+    def check(self, now: int, u: np.ndarray) -> None:
         """Raise FacesBend if displacements u before pass `now` ask for it."""
         a = self.ws.arrays
         nodes = (a.values.rest + u)[self.faces]
@@ -63,7 +63,7 @@ class Bending:
         for k, (term, limit) in enumerate(zip(a.contacts, self.limits)):
             far = np.flatnonzero(off > limit)
             points = points_of_bow(nodes[far]).reshape(-1, 3)
-            gaps = term.gap(points, a.walls.row_of(k, places)).reshape(len(far), -1).min(1)
+            gaps = term.gap(points, a.poses.row_of(k, places)).reshape(len(far), -1).min(1)
             near = gaps < float(term.values["barrier_width"])
             if near.any():
                 raise FacesBend(float(off[far][near].max()))

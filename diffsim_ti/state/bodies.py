@@ -17,7 +17,7 @@ from diffsim_ti.inputs import Derived
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))  # entries of J in their order
 NUMBERS = 16  # of each body: M, X_, J^-1, J
 SUMS = 7  # adjoints of M and J
-FELT = 4  # of each vertex of a body: adjoints of y and m
+SIZE = 4  # of each vertex of a body: adjoints of y and m
 # what kernels read of them; reach: of all vertices, an inverse mass [1/kg], of a body's as an impulse there feels it at most
 BODIES = dict.fromkeys(("body_first", "body_vertex", "body_kind", "body_of"), "ints") | dict(
     body_place="vectors", body_mass="scalars", body_reach="scalars", body_numbers="doubles", body_force="vectors2"
@@ -90,13 +90,13 @@ class BodyArrays:
     def adjoint(self) -> dict:
         """{name: array} of sums, zero."""
         return dict(
-            body_felt=runtime.array(ti.f64, FELT * len(self.vertices)),
+            body_adjoints=runtime.array(ti.f64, SIZE * len(self.vertices)),
             body_sums=runtime.array(ti.f64, SUMS * len(self.bodies)),
         )
 
     def collect(self, felt: dict, out: Derived) -> None:
         """Add what the sums say of masses and rest positions."""
-        of_vertices = runtime.fetch(felt["body_felt"]).reshape(-1, FELT)
+        of_vertices = runtime.fetch(felt["body_adjoints"]).reshape(-1, SIZE)
         sums = runtime.fetch(felt["body_sums"]).reshape(-1, SUMS)
         by_y, by_mass = of_vertices[:, :3], of_vertices[:, 3]
         by_J = np.zeros_like(self.J)
@@ -114,7 +114,8 @@ class BodyArrays:
         rest[self.vertices[moved]] = by_place[moved]
         out.mass, out.rest = out.mass + mass, out.rest + rest
 
-    # ---- on the host, for what looks between passes --------------------------------------------------------------------
+    # ---- on the host, for what is evaluated between passes
+    # --------------------------------------------------------------------
 
     def pulled(self, forces: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Forces [N] on all vertices with those that hold the bodies together, at displacements u."""

@@ -59,13 +59,13 @@ class Features:
     growth_per_step: bool = False
     growth_uniform: bool = True
     motion: bool = False
-    guided: bool = False  # whether vertices are held in some directions alone
+    partly_fixed: bool = False  # whether vertices are fixed in some directions only
     reduced: bool = False  # whether explicit passes take sets of vertices by few numbers
     rigid: bool = False
     moving: int = 0  # columns of the paths that obstacles follow
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra
-    curved: bool = False  # whether faces are curved, as obstacles feel (mesh/curved_triangles.py)
+    curved: bool = False  # whether faces are curved, as contact takes them (mesh/curved_triangles.py)
     recorded: bool = False  # whether a loss names what a contact stage does
     balanced: bool = False  # whether the work of the body's own forces is counted
     density: bool = False  # the last two: adjoints that cost extra, only if asked for

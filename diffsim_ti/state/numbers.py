@@ -2,7 +2,7 @@
 
 The same description serves three records: the values (state/arrays.py), their changes (`Tangent`), their adjoints
 (`Adjoint`). Interactions describe what they have of their own (mechanics/interaction.py). Numbers of tetrahedra lie in
-blocks of eight. Adjoints of numbers that many vertices feel are summed per vertex first, in rows (`Features.sums`).
+blocks of eight. Adjoints of numbers that many vertices share are summed per vertex first, in rows (`Features.sums`).
 """
 
 from collections.abc import Callable
@@ -76,10 +76,10 @@ def _absent(has) -> set[str]:
     obstacles = has.groups or has.reduced
     read = {
         ("force_slot", "forces"): has.forces,
-        ("motion_slot", "motion", "anchor"): has.motion or has.guided,
+        ("motion_slot", "motion", "anchor"): has.motion or has.partly_fixed,
         ("growths",): has.growing,
         ("surface", "seen", "path"): obstacles,
-        ("felt",): has.moving,
+        ("path_adjoint",): has.moving,
         ("rest",): obstacles or has.shape or any(x.reads_rest for x in has.interactions),
         ("parameters",): obstacles or has.num_parameters,
         ("stage",): has.num_staged,
@@ -108,13 +108,13 @@ def with_state(arrays: dict, law) -> dict:
 def with_pass(arrays: dict, law) -> dict:
     """The arrays of a state in a pass, with what a law holds there and its rate."""
     arrays = with_state(arrays, law) | (dict(rate="scalars") if law.viscous else {})
-    return arrays | dict(held="blocks2") if law.held_names else arrays
+    return arrays | dict(held="blocks2") if law.frozen_names else arrays
 
 
-def with_held(arrays: dict, law) -> dict:
+def with_frozen(arrays: dict, law) -> dict:
     """Changes or adjoints of these."""
     arrays = with_state(arrays, law)
-    return arrays | dict(held="blocks2") if law.held_names else arrays
+    return arrays | dict(held="blocks2") if law.frozen_names else arrays
 
 
 def on_device(arrays, name: str, derived: Derived):

@@ -129,8 +129,8 @@ class Schedule(ABC):
         """What tetrahedra have grown by, of rows (steps, 2, m), at a share of the step of pass j."""
         return between(*rows[self.load_row(rows, j)], share)
 
-    def ties(self, rows: np.ndarray, j: int, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(tension, slack, stiffness) of springs and cables (inputs/ties.py) at a share of the step of pass j."""
+    def lines(self, rows: np.ndarray, j: int, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(tension, slack, stiffness) of springs and cables (inputs/lines.py) at a share of the step of pass j."""
         row = rows[self.load_row(rows, j)]
         tension, slack = (between(part[:, 0], part[:, 1], share) for part in (row[0::2], row[1::2]))
         return tension, slack, row[0::2, 2]
@@ -152,8 +152,8 @@ class Schedule(ABC):
         """Adjoint of `growth`."""
         add_between(*rows_adj[self.load_row(rows_adj, j)], share, adjoint)
 
-    def add_ties(self, rows_adj: np.ndarray, j: int, share: float, adjoint: tuple) -> None:
-        """Adjoint of `ties`."""
+    def add_lines(self, rows_adj: np.ndarray, j: int, share: float, adjoint: tuple) -> None:
+        """Adjoint of `lines`."""
         row, (tension, slack, stiffness) = rows_adj[self.load_row(rows_adj, j)], adjoint
         for part, by in ((row[0::2], tension), (row[1::2], slack)):
             add_between(part[:, 0], part[:, 1], share, by)

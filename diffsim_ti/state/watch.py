@@ -99,7 +99,7 @@ class ContactWatch:
         self.ws, arrays = weakref.proxy(workspace), workspace.arrays  # which holds this: no circle
         self.contacts, self._obstacles = arrays.contacts, arrays.obstacles
         self._shown = [repr(term) for term in self.contacts]
-        self._corners = arrays.mesh.surface_triangles if arrays.feels_faces else np.zeros((0, 3), int)
+        self._corners = arrays.mesh.surface_triangles if arrays.has_face_contact else np.zeros((0, 3), int)
         n = arrays.num_vertices + len(self._corners) if self.contacts else 1  # faces after vertices
         self.seen = runtime.array(arrays.fp, 3 * len(self.contacts), n)
         self.clear()
@@ -140,7 +140,8 @@ class ContactWatch:
         return (int(k), int(i), -float(gaps[k, i])) if gaps[k, i] <= 0 else None
 
     def note(self, met, face: int) -> None:
-        """A face, or where that is negative a vertex, that was found in an obstacle (mechanics/obstacles/way.py)."""
+        """A face, or where that is negative a vertex, that was found in an obstacle
+        (mechanics/obstacles/collision_detection.py)."""
         rows = self.rows()
         place = self.ws.arrays.num_vertices + face if face >= 0 else met.vertices[0]
         rows[3 * met.obstacle, place] = min(met.value, rows[3 * met.obstacle, place])
@@ -208,9 +209,9 @@ class ContactWatch:
         """Depths in the barriers, in widths, that stop vertices with these speeds: m v^2 / 2 = k w^2 beta(1 - depth)."""
         area = np.where(values.surface > 0, values.surface, 1.0)
         stiffness = [
-            (values.parameters[first + twin.index.stiffness] if twin.watched else 1.0)
-            * (area if twin.per_area else np.ones_like(area))
-            for twin, first, _ in self._obstacles
+            (values.parameters[first + counterpart.index.stiffness] if counterpart.watched else 1.0)
+            * (area if counterpart.per_area else np.ones_like(area))
+            for counterpart, first, _ in self._obstacles
         ]
         faces = self._corners
         mass = np.concatenate([values.mass, values.mass[faces].min(1, initial=np.inf)])

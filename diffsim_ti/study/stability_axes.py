@@ -101,7 +101,7 @@ def pulled(ratio: float) -> Scene:
     return body(E=1e5, terms=[Muscle([0, 1, 0], ratio * 1e5, 1.0)])
 
 
-def rubbing(friction: float) -> Scene:
+def sliding_blocks(friction: float) -> Scene:
     """A soft cube that comes down askew on another one and slides on it, as far as they rub."""
     mesh = TetrahedralMesh.create_box(3, 0.2, "five")
     velocity = 0.05 * np.random.default_rng(0).standard_normal((2 * mesh.num_vertices, 3))
@@ -123,5 +123,5 @@ AXES = {
     "compression": Axis("stretch at the start", "-", STRETCH, lambda s: body(squeeze=s)),
     "viscosity": Axis("damping ratio of the fastest motion", "-", (0.01, 0.1, 0.3, 1.0, 3.0, 20.0), viscous),
     "activation": Axis("pull of muscles over Young's modulus", "-", (0.01, 0.03, 0.1, 0.3, 0.5, 1.0, 2.0), pulled),
-    "friction": Axis("friction of soft on soft", "-", (0.0, 0.1, 0.3, 0.6, 1.0, 10.0), rubbing),
+    "friction": Axis("friction of soft on soft", "-", (0.0, 0.1, 0.3, 0.6, 1.0, 10.0), sliding_blocks),
 }

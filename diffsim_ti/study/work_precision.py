@@ -71,7 +71,7 @@ class Chart:
         return pareto_front(self.points)
 
     def with_points(self, more: list[Point]) -> "Chart":
-        """The same with more runs, and with the front marked anew."""
+        """The same with more runs, and with the front marked again."""
         out = replace(self, points=[*self.points, *more])
         front = out.front
         for p in out.points:

@@ -6,6 +6,7 @@ from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.growth import Growth
+from diffsim_ti.terms.lines import Anchor, Cable, Spring
 from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
 from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
@@ -19,7 +20,6 @@ from diffsim_ti.terms.rotating_frame import RotatingFrame
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.surface_drag import SurfaceDrag
 from diffsim_ti.terms.term import Term, VertexForce
-from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
 LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, Muscle)

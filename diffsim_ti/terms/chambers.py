@@ -23,7 +23,7 @@ ATMOSPHERE = 101325.0  # [Pa]
 class Chamber(GivenOverTime, OnSurface, Term):
     """A cavity, by a surface of the body around it, whose filling pushes on it with one pressure.
 
-    The surface is closed, or has rims that are held wholly or move in planes (supports by component), which close it there.
+    The surface is closed, or has rims that are fixed wholly or move in planes (supports by component), which close it there.
     Its triangles are those of the body, whose normals point out of the body and so into the chamber: a positive pressure
     inflates it. The forces are those of `Pressure`, p dV/dx, V the volume inside.
     Subclasses say what is given over time: its `argument`, what was `given`, its `unit` and its plain name.
@@ -72,8 +72,8 @@ class GasChamber(Chamber):
     outside: p_out [Pa], absolute; default one atmosphere. exponent: n, 1 of an isothermal gas, 1.4 of air that moves too
         fast to exchange heat.
     Inputs with gradient: "gas_pressure", "outside_pressure", "gas_exponent", or "<name>.pressure", ".outside", ".exponent".
-    The gas has no mass and one pressure everywhere. Statics lay p on in load steps. Explicit steps sum the volume before
-    each substep, in a launch of its own; what the gas adds to the stiffness counts in the stable step.
+    The gas has no mass and one pressure everywhere. Static solves apply p in load steps. Explicit steps sum the volume
+    before each substep, in a launch of its own; what the gas adds to the stiffness counts in the stable step.
     Raises ValueError for surfaces that enclose no volume, numbers that are not positive, and what does not fit.
     Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 8.5.2; Rumpel, Schweizerhof 2003,
     Volume-dependent pressure loading and its influence on the stability of structures, doi:10.1002/nme.561.
@@ -110,13 +110,13 @@ class FilledChamber(Chamber):
     surface: as in `GasChamber`.
     Input with gradient: "chamber_volume" or "<name>.volume". The pressure is a result: `ChamberPressure`, with gradient.
     Implicit and static solvers hold V at the end of each substep (the midpoint rule in the middle of it), by a Lagrange
-    multiplier: so a chamber is followed beyond the largest pressure that it bears. Statics go from the volume at rest in
-    load steps. Explicit solvers hold V at the end of each substep too, as velocity Verlet does in the manner of SHAKE and
-    RATTLE: a stage after contact, on the host, to round-off and without a penalty, that no step is too large for. There a
-    volume that jumps is reached within one substep: give keyframes. A contact of the chamber's own wall is pushed after it.
-    Raises ValueError for surfaces that enclose no volume, numbers that are not positive, and what does not fit.
-    Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, 17.3 and 18.4, doi:10.1007/978-0-387-40065-5; Leimkuhler, Reich,
-    Simulating Hamiltonian Dynamics, 2004, 7.2, doi:10.1017/CBO9780511614118.
+    multiplier: so a chamber is followed beyond the largest pressure that it bears. Static solves go from the volume at
+    rest in load steps. Explicit solvers hold V at the end of each substep too, as velocity Verlet does in the manner of
+    SHAKE and RATTLE: a stage after contact, on the host, to round-off and without a penalty, that no step is too large
+    for. There a volume that jumps is reached within one substep: give keyframes. A contact of the chamber's own wall is
+    pushed after it. Raises ValueError for surfaces that enclose no volume, numbers that are not positive, and what does
+    not fit. Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, 17.3 and 18.4, doi:10.1007/978-0-387-40065-5;
+    Leimkuhler, Reich, Simulating Hamiltonian Dynamics, 2004, 7.2, doi:10.1017/CBO9780511614118.
     """
 
     holds, row_names = True, ("volume", "rest")

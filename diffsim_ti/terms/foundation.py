@@ -6,9 +6,9 @@ from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.foundation import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.lines import AT_LEAST_0
 from diffsim_ti.terms.marks import MOST, Points, spread
 from diffsim_ti.terms.term import OnMesh, OnSurface, Term
-from diffsim_ti.terms.ties import AT_LEAST_0
 
 
 class ElasticFoundation(OnSurface, OnMesh, Term):

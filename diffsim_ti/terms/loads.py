@@ -79,7 +79,7 @@ class BodyForce(Load):
     """Force per volume at rest b [N/m^3], or per mass [m/s^2], on some of a body: dead loads f_i = b V_i or b m_i.
 
     V_i and m_i are a fourth of the volume and mass of each tetrahedron around vertex i; of ten-node ones integrals of N_i
-    in statics and implicit steps, and shares of lumped masses in explicit ones, so that free fall stays rigid. Uniform
+    in static solves and implicit steps, and shares of lumped masses in explicit ones, so that free fall stays rigid. Uniform
     weight is `Gravity`.
 
     force: 3 numbers, over time as in `Traction`; per: "volume" or "mass". tetrahedra: a tetrahedron set's name, several,

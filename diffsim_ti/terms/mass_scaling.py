@@ -107,7 +107,7 @@ def stiffness_at_rest(scene: "Scene", mu, lam, patches: bool) -> "bsr_matrix":
 
         K_ab = sum_e V [lam N_a (x) N_b + mu N_b (x) N_a + mu (N_a . N_b) 1],  N_a = grad N_a.
 
-    zero where a vertex is held wholly, which limits no step, and without elements that lie in a rigid set. A mean over
+    zero where a vertex is fixed wholly, which limits no step, and without elements that lie in a rigid set. A mean over
     patches takes stiffness away from volume changes, so that lam may be that of the stiffest of a patch.
     """
     from scipy.sparse import bsr_matrix

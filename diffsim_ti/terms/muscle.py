@@ -7,16 +7,16 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers, present
 from diffsim_ti.inputs import Input, Link
+from diffsim_ti.inputs.lines import LineRows, Segments
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.inputs.muscles import MuscleTension
-from diffsim_ti.inputs.ties import Segments, TieRows
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.paths import Paths
+from diffsim_ti.terms.lines import AT_LEAST_0, Cable
 from diffsim_ti.terms.marks import MOST, Lines, spread
 from diffsim_ti.terms.of_tetrahedra import OfTetrahedra
 from diffsim_ti.terms.over_time import OverTime
 from diffsim_ti.terms.term import Term, nonempty
-from diffsim_ti.terms.ties import AT_LEAST_0, Cable
 
 
 class Muscle(OfTetrahedra, Cable):
@@ -30,7 +30,7 @@ class Muscle(OfTetrahedra, Cable):
     that `tetrahedra` names; each "tetrahedron". Then alpha has one number for each, shape (n,), or (steps, n) by steps.
     tetrahedra: a tetrahedron set's name, several, indices or a mask; None: all.
     Forces and their moments sum to zero in each tetrahedron. If the rest shape changes, fibres go along with it.
-    In load steps of statics activations grow with the loads. Energy that a muscle gives counts as work of a load.
+    In load steps of static solves activations grow with the loads. Energy that a muscle gives counts as work of a load.
     Inputs with gradient: "activation" and "muscle_stress", or "<name>.activation" and "<name>.stress", of the shape given,
     (steps + 1, ...) of what is linear within steps; the rest shape.
     Raises ValueError for other shapes, another `per`, an empty set, directions without length, and numbers below zero.
@@ -105,5 +105,5 @@ class Muscle(OfTetrahedra, Cable):
             Segments(paths, mesh.num_vertices, None, segments),
             InTime(names["activation"], activation, self.ndim, self.keyed),
             MuscleTension(activation, names["muscle_stress"], segments, self._points(mesh), group, tension),
-            TieRows(paths, segments, f"{own} rows", tension=tension),
+            LineRows(paths, segments, f"{own} rows", tension=tension),
         ]

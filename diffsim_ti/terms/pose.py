@@ -13,11 +13,11 @@ from diffsim_ti.terms.motion import Motion, sampled
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A motion of held vertices as of a rigid body, c + t + R (x - c): a clamp that turns.
+    """A motion of fixed vertices as of a rigid body, c + t + R (x - c): a clamp that rotates.
 
     path: a function of time [s], or keyframes (times, poses), of 6 numbers, a displacement t [m] and a rotation vector
     [rad], or of 7, t and a quaternion (w, x, y, z) of any length, as a path of an `Obstacle`. It is sampled at the steps,
-    within which held vertices go straight: by turns of phi in a step at the radius r, r phi^2 / 8 within the arc.
+    within which fixed vertices go straight: by turns of phi in a step at the radius r, r phi^2 / 8 within the arc.
     about [m]: the point c.
     Raises ValueError for a path of other numbers.
     """

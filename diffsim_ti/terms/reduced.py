@@ -67,9 +67,9 @@ class Reduced:
     affine: displacements A X + t of the mesh's places X, twelve numbers, u = B q; `x -> of(x)` is the nearest such to any
     x, a projection. B is that of the mesh, whatever rest_positions a run takes.
     rigid: places R X + t of the rest positions X of a run, six numbers. A start is the nearest such (inputs/rigid_start.py).
-    a basis, in implicit steps and statics, of all the mesh's vertices, of which those of the set count: m functions for
-    each component, shape (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m fields of
-    displacements, (m, num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
+    a basis, in implicit steps and static solves, of all the mesh's vertices, of which those of the set count: m
+    functions for each component, shape (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m
+    fields of displacements, (m, num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
 
     The set moves by u = B q alone, so that forces do what B^T f says, and what B lacks is held as by a support. Linear
     momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule, where
@@ -77,14 +77,14 @@ class Reduced:
     they are for what stays where it is and does not turn far.
 
     Raises ValueError for what is no {name: kind or basis}, bases of other shapes or of which some are all but combinations
-    of others, sets that are not known, lie in a plane, or share vertices with each other or with what is held.
+    of others, sets that are not known, lie in a plane, or share vertices with each other or with what is fixed.
     """
 
     def __init__(self, mesh: TetrahedralMesh, given: Mapping[str, str | ArrayLike] | None, held: np.ndarray):
         if not isinstance(given, Mapping | None):
             raise ValueError(f'reduced: must be {{name of a set: "affine", "rigid" or a basis}}, got {shown(given)}')
         self.bodies = tuple(self._body(mesh, name, kind) for name, kind in (given or {}).items())
-        taken = {int(i): "what is held (fixed=)" for i in held}
+        taken = {int(i): "what is fixed (fixed=)" for i in held}
         for body in self.bodies:
             both = [i for i in body.vertices if int(i) in taken]
             if both:

@@ -25,8 +25,8 @@ class SelfContact(Term):
     faces (mesh/collision_surface.py), whose new vertices are in the sets that all of their nodes are in.
 
     friction [-]: Coulomb's coefficient of pairs that press with N = m |db/dd|; 0 compiles none. A dict has that of pairs of
-    sets of vertices or tetrahedra, {("palm", "ball"): 0.6}, and other pairs do not rub; a pair whose corners are in several
-    sets belongs to those of its vertex, or of each edge's first one, and of the triangle's first one.
+    sets of vertices or tetrahedra, {("palm", "ball"): 0.6}, and other pairs have no friction; a pair whose corners are
+    in several sets belongs to those of its vertex, or of each edge's first one, and of the triangle's first one.
     friction_speed [m/s]: the speed of sliding below which friction is smoothed, and with which what is held may creep:
     mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each pass that adds
     no energy, whatever the step (friction_kernels.py); in implicit ones a force, with N and the normal from where
@@ -47,7 +47,7 @@ class SelfContact(Term):
 
     Inputs with gradient: "self_contact_stiffness", "self_contact_width", with friction "self_contact_friction_speed" and
     "self_contact_friction", of a dict shape (pairs,); or "<name>.stiffness" and so on.
-    One per scene. Implicit solvers keep surfaces apart on the whole way of every step; ImplicitMidpointSolver raises
+    One per scene. Implicit solvers keep surfaces apart during the whole motion of every step; ImplicitMidpointSolver raises
     Tunnelling where the end of a step lies beyond a contact.
 
     Raises ValueError for stiffness, width or friction_speed <= 0, friction < 0, names that are no sets, sets of a dict that
@@ -67,16 +67,16 @@ class SelfContact(Term):
         friction: float | Mapping[tuple[str, str], float] = 0.0,
         friction_speed: float = 1e-3,
     ):
-        self.rubbing = tuple(friction) if isinstance(friction, Mapping) else None
+        self.friction_pairs = tuple(friction) if isinstance(friction, Mapping) else None
         numbers("friction_speed", 0.0 if hasattr(friction_speed, "detach") else friction_speed)
         speed = positive("friction_speed", friction_speed, "m/s", "self_contact_friction_speed")
         value, shape = numbers("friction", friction) if friction is None else friction, ()
-        if self.rubbing is not None:
-            self._check_pairs(self.rubbing)
+        if self.friction_pairs is not None:
+            self._check_pairs(self.friction_pairs)
             value, shape = numbers("friction", list(friction.values())), (len(friction),)
         mu = Input("friction", value, (shape,), "-", NOT_NEGATIVE, plain="self_contact_friction")
         for described in (speed, mu):  # also of what is smooth
-            described.check_given("SelfContact")
+            described.check_value("SelfContact")
         self.has_friction = bool(np.any(mu.value > 0))
         super().__init__(
             positive("stiffness", stiffness, "N/m", "self_contact_stiffness"),
@@ -111,9 +111,9 @@ class SelfContact(Term):
     def labels(self, mesh: TetrahedralMesh) -> tuple[np.ndarray, np.ndarray]:
         """(a label of each surface vertex, which coefficient two labels have, or -1: shape (labels, labels))."""
         label = np.zeros(mesh.num_vertices, int)
-        if self.rubbing is None:
+        if self.friction_pairs is None:
             return label[mesh.surface_vertices], np.zeros((1, 1), int)
-        names = sorted({name for pair in self.rubbing for name in pair})
+        names = sorted({name for pair in self.friction_pairs for name in pair})
         for k, name in enumerate(names, start=1):
             if name not in mesh.vertex_sets and name not in mesh.tetrahedron_sets:
                 raise ValueError(
@@ -131,7 +131,7 @@ class SelfContact(Term):
                 )
             label[members] = k
         rows = np.full((len(names) + 1, len(names) + 1), -1)
-        for k, pair in enumerate(self.rubbing):
+        for k, pair in enumerate(self.friction_pairs):
             a, b = (names.index(name) + 1 for name in pair)
             rows[a, b] = rows[b, a] = k
         return label[mesh.surface_vertices], rows

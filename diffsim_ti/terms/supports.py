@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers, shown
-from diffsim_ti.inputs.clamps import Clamp
+from diffsim_ti.inputs.posed_supports import PosedSupport
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.sets import parts_of_joined
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.pose import Pose
 
-# a vertex set's name, several, indices or a mask: held wholly; or {name of a set: in which directions it is held}
+# a vertex set's name, several, indices or a mask: fixed wholly; or {name of a set: in which directions it is fixed}
 Fixed = str | ArrayLike | Mapping[str, str | ArrayLike]
 AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -22,8 +22,8 @@ AXES = {"x": 0, "y": 1, "z": 2}
 class Supports:
     """What holds a body.
 
-    vertices: sorted indices of all that are held in some direction, shape (k,).
-    held: projectors Q onto the directions in which each of them is held, shape (k, 3, 3); the identity where all are.
+    vertices: sorted indices of all that are fixed in some direction, shape (k,).
+    held: projectors Q onto the directions in which each of them is fixed, shape (k, 3, 3); the identity where all are.
     """
 
     def __init__(self, mesh: TetrahedralMesh, fixed: Fixed | None):
@@ -58,25 +58,25 @@ class Supports:
 
     @property
     def fixed(self) -> np.ndarray:
-        """Sorted indices of the vertices that are held in all directions."""
+        """Sorted indices of the vertices that are fixed in all directions."""
         return self.vertices[self.wholly]
 
     @property
-    def guided(self) -> np.ndarray:
-        """Sorted indices of the vertices that are held in some directions alone."""
+    def partly_fixed(self) -> np.ndarray:
+        """Sorted indices of the vertices that are fixed in some directions only."""
         return self.vertices[~self.wholly]
 
     @property
-    def guides(self) -> np.ndarray:
-        """Projectors onto the directions in which these are held, shape (k, 3, 3)."""
+    def sliding_supports(self) -> np.ndarray:
+        """Projectors onto the directions in which these are fixed, shape (k, 3, 3)."""
         return self.held[~self.wholly]
 
     def free(self, x: np.ndarray) -> np.ndarray:
         """Vectors of all vertices, shape (num_vertices, 3), without what is held of them; a copy."""
         out = np.array(x)
         out[self.fixed] = 0
-        if len(self.guided):
-            out[self.guided] -= np.einsum("kij,kj->ki", self.guides, out[self.guided])
+        if len(self.partly_fixed):
+            out[self.partly_fixed] -= np.einsum("kij,kj->ki", self.sliding_supports, out[self.partly_fixed])
         return out
 
     def freedom(self, num_vertices: int) -> np.ndarray:
@@ -93,23 +93,23 @@ class Supports:
             return np.tile(np.linalg.pinv(directions, rcond=1e-6) @ directions, (len(vertices), 1, 1))
         return self.held[np.searchsorted(self.vertices, vertices)]
 
-    def parts_of(self, motion: Motion | Pose | Mapping | None) -> tuple[list[tuple[Clamp, Pose]], bool]:
+    def parts_of(self, motion: Motion | Pose | Mapping | None) -> tuple[list[tuple[PosedSupport, Pose]], bool]:
         """What of a motion is a pose, and whether there is anything else."""
         parts = motion.values() if isinstance(motion, Mapping) else [motion]
-        return self._clamps(motion), motion is not None and not all(isinstance(own, Pose) for own in parts)
+        return self._posed_supports(motion), motion is not None and not all(isinstance(own, Pose) for own in parts)
 
-    def _clamps(self, motion) -> list[tuple[Clamp, Pose]]:
+    def _posed_supports(self, motion) -> list[tuple[PosedSupport, Pose]]:
         if isinstance(motion, Pose):
             every = np.arange(len(self.vertices))
             one = np.tile(np.eye(3), (len(every), 1, 1))
-            return [(Clamp("prescribed_pose", "prescribed_about", self.vertices, every, one), motion)]
+            return [(PosedSupport("prescribed_pose", "prescribed_about", self.vertices, every, one), motion)]
         out = []
         for name, own in motion.items() if isinstance(motion, Mapping) else ():
             if isinstance(own, Pose) and name in self.by_name:
                 places, rows = self._rows[name]
                 projectors = self._inverse[places][:, :, rows] @ self.by_name[name][1]
                 names = f"prescribed_pose.{name}", f"prescribed_about.{name}"
-                out.append((Clamp(*names, self.vertices[places], places, projectors), own))
+                out.append((PosedSupport(*names, self.vertices[places], places, projectors), own))
         return out
 
     def rows(self, motion: Motion | Pose | Mapping[str, Motion | Pose], times: ArrayLike) -> np.ndarray:
@@ -193,7 +193,7 @@ def _normal(mesh: TetrahedralMesh, name: str) -> np.ndarray:
 
 def rigid_motions_left(places: np.ndarray, held: np.ndarray) -> str:
     """The rigid motions that supports at places [m], shape (k, 3), with projectors onto what is held leave, in words; ""
-    if none. Motions are t + w x (x - middle): those that no held direction feels.
+    if none. Motions are t + w x (x - middle): those that no fixed direction resists.
     """
     middle = places.mean(0) if len(places) else np.zeros(3)
     arms = places - middle

@@ -45,7 +45,7 @@ class Term(ABC):
             raise ValueError(f"{kind}: {rule}: its inputs' names begin with it")
         for described in inputs:
             if described.value is not None:
-                described.check_given(kind)
+                described.check_value(kind)
         self.described, self.name = inputs, name
 
     @property

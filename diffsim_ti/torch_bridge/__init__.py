@@ -1,1 +1,1 @@
-"""What the PyTorch face is made of; users import `diff_simulator` and `diff_physics`."""
+"""What the PyTorch interface is made of; users import `diff_simulator` and `diff_physics`."""

@@ -1,4 +1,5 @@
-"""What the modules of the PyTorch face share: torch itself, or what to install; and a clear no to second derivatives."""
+"""What the modules of the PyTorch interface share: torch itself, or what to install; and a clear no to second
+derivatives."""
 
 from functools import wraps
 

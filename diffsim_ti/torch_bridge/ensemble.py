@@ -105,7 +105,7 @@ class Ensemble:
     ) -> "torch.Tensor":
         """Sum of function(member), scalar tensors, as a tensor whose `backward()` adds its gradients to the parameters.
 
-        parameters: a module, or tensors from which the function computes anew at each call.
+        parameters: a module, or tensors from which the function computes again at each call.
         """
         from diffsim_ti.torch_bridge.ensemble_node import total_of
 

@@ -26,8 +26,8 @@ class TorchFrames(_States):
     """Saved states as tensors of shape (frames, num_vertices, 3): positions [m] (far from the origin in float64), velocities
     [m/s], displacements [m].
 
-    `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them. `alive`: whether
-    the run came to its end (`Rollout(..., raise_errors=False)`).
+    `outputs` has what the Rollout was asked to compute besides, by name; `frames["name"]` gives any of them. `alive`:
+    whether the run came to its end (`Rollout(..., raise_errors=False)`).
     """
 
     outputs: dict[str, torch.Tensor]
@@ -97,7 +97,7 @@ def _as_tensors(gradients: dict, names, tensors, needed) -> list:
 
 @uncompiled
 def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFrames | TorchBatchFrames:
-    """Functional face: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
+    """Functional interface: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
 
     Names are those of `rollout.inputs`, whose numbers per tetrahedron {named set: tensor} may give; also
     "initial_displacements" instead of "initial_positions" (which keeps its digits in float32), and "shape", which moves
@@ -110,7 +110,7 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
     further outputs, gradients with implicit solvers, prescribed motion, rest_positions, and everything on Vulkan, whose
     memory torch cannot see.
     Raises ValueError for unknown names, wrong shapes, types that are not floating point, and tensors that require a
-    gradient by density or rest_positions which the Rollout was told not to compute.
+    gradient by density or rest_positions which the Rollout was asked not to compute.
 
     A `Batch` in place of the Rollout gives tensors of all its scenes (batch_node.py). `torch.compile` breaks its graph here.
     """
@@ -120,7 +120,7 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
         return batch_frames(rollout, tensors)
     if "initial_positions" in tensors and "initial_displacements" in tensors:
         raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
-    for name, value in rollout.scene.given_tensors().items():
+    for name, value in rollout.scene.input_tensors().items():
         tensors.setdefault(name, value.expand(rollout.values[name].shape))
     tensors = as_tensors(rollout.scene, rollout.values, tensors)
     for name, tensor in tensors.items():

@@ -53,7 +53,7 @@ def is_direct(rollout, names) -> bool:
     shape are measured from. The host then stands between, with the same numbers.
     """
     scene = rollout.scene
-    copies = shares_memory() and rollout.solver.explicit and not len(scene.supports.guided)
+    copies = shares_memory() and rollout.solver.explicit and not len(scene.supports.partly_fixed)
     return copies and scene.motion is None and "rest_positions" not in names
 
 

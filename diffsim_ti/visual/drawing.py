@@ -38,8 +38,8 @@ def painter(backend: str, size: tuple[int, int]) -> "SoftwarePainter | VulkanPai
 
 
 def held_along(mesh: TetrahedralMesh, vertices: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Of vertices and the projectors onto the directions in which each is held: (those held in all, one vertex and unit
-    vector for each direction in which another is held); the vectors point out of the body. None if all are held wholly."""
+    """Of vertices and the projectors onto the directions in which each is fixed: (those held in all, one vertex and unit
+    vector for each direction in which another is held); the vectors point out of the body. None if all are fixed wholly."""
     rank = np.rint(np.trace(held, axis1=1, axis2=2)).astype(int)
     if len(held) == 0 or rank.min() == 3:
         return None
@@ -62,7 +62,8 @@ class Drawing:
     size: width and height in pixels. camera: default one that frames `box` [m], shape (2, 3) (default: the rest shape),
         from `azimuth` and `elevation` [degrees].
     ground: height of a floor [m], or None. obstacles: (points, triangles) of what stands around, see `obstacle_surfaces`.
-    fixed: vertices to mark; held: projectors onto the directions in which each is held, shape (len(fixed), 3, 3), None: all.
+    fixed: vertices to mark; held: projectors onto the directions in which each is fixed, shape (len(fixed), 3, 3),
+    None: all.
         wireframe: draw the triangles' edges. colouring: how values are coloured.
     backend: "auto", "vulkan" or "software"; `describe()` says which it became.
     """

@@ -9,8 +9,8 @@ from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
 from diffsim_ti.outputs import Output, Stress
+from diffsim_ti.outputs.applied_loads import AppliedLoads
 from diffsim_ti.outputs.deformation import Deformation
-from diffsim_ti.outputs.given_loads import GivenLoads
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
@@ -25,8 +25,8 @@ from diffsim_ti.visual.scene_marks import marks_of
 class Setting:
     """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand.
 
-    held: of fixed vertices the projectors onto the directions in which each is held, shape (len(fixed), 3, 3), where some
-    are held in some directions alone; else None.
+    held: of fixed vertices the projectors onto the directions in which each is fixed, shape (len(fixed), 3, 3), where some
+    are fixed in some directions only; else None.
     """
 
     mesh: TetrahedralMesh
@@ -38,7 +38,7 @@ class Setting:
     @classmethod
     def of(cls, scene: Scene) -> "Setting":
         """A scene's."""
-        held = scene.supports.held if len(scene.supports.guided) else None
+        held = scene.supports.held if len(scene.supports.partly_fixed) else None
         return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene), held)
 
 
@@ -149,7 +149,7 @@ def _of_items(values: Iterable[tuple], scene: Scene) -> tuple[dict[str, np.ndarr
 def _loads(scene: Scene, positions: np.ndarray, step: int, values: dict) -> dict[str, np.ndarray]:
     """{"loads": forces of loads on each vertex}, of the step that ends there; nothing in a scene without, or where they are
     not known (a chamber's volume is held)."""
-    loads = GivenLoads(scene, weight=False)
+    loads = AppliedLoads(scene, weight=False)
     if scene.holds_volumes or not loads.any:
         return {}
     return {"loads": loads.forces(scene.inputs.derive(values), positions.astype(np.float64), step)}

@@ -1,4 +1,4 @@
-"""Where a viewer's frames come from: a saved series, or a run that goes on while one looks."""
+"""Where a viewer's frames come from: a saved series, or a run that goes on meanwhile."""
 
 import time
 from abc import ABC, abstractmethod
@@ -154,7 +154,7 @@ class LiveFrames(FrameSource):
             self._grip.target, self.run.driven = None, self._driven
             self._pull()
             self._grip = None
-            self.run.balance_anew()
+            self.run.restart_balance()
 
     def _pull(self) -> None:
         if self._grip is not None:

@@ -106,7 +106,7 @@ def turned(both, profile, colour, camera: Camera, size, near: float, through: bo
 
 
 def key_lines(
-    drawn: Sequence[Mark], scale: Mapping[str, float], colours: Mapping[str, np.ndarray], held: bool, guided: bool
+    drawn: Sequence[Mark], scale: Mapping[str, float], colours: Mapping[str, np.ndarray], held: bool, partly_fixed: bool
 ) -> list[tuple[str, np.ndarray]]:
     """(text, colour) of each line of a picture's key."""
     signs = {Lines: "━", Points: "●"}
@@ -116,5 +116,5 @@ def key_lines(
         if isinstance(mark, Arrows):
             words = f"{words}, longest {scale[mark.label]:.3g}"
         out[mark.label] = f"{sign} {words}", colours[mark.label]
-    held_rows = [("● held in all directions", MARK)] * held + [("▲ held along the cone", MARK)] * guided
-    return [*held_rows, *out.values()] if out or guided else []
+    held_rows = [("● held in all directions", MARK)] * held + [("▲ held along the cone", MARK)] * partly_fixed
+    return [*held_rows, *out.values()] if out or partly_fixed else []

@@ -144,7 +144,7 @@ class ForwardRun:
         if self._balance:
             self._balance.begin()
 
-    def balance_anew(self) -> None:
+    def restart_balance(self) -> None:
         """Measure the rise and drift of energy from the present state on, which something outside has changed."""
         self._begin_balance()
         self._energy = self._lowest = self._begun = self.simulator.compute_energy()
@@ -165,7 +165,7 @@ class ForwardRun:
                 self.simulator.step()
             if self.drift is not None:
                 self.drift += self._balance.take()
-            self._look()
+            self._check()
         self.energies.append(self._energy)
         self.seen.seconds += time.perf_counter() - begin
 
@@ -235,13 +235,13 @@ class ForwardRun:
             return True
         return False
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         """Note the extremes of the present state."""
         sim, seen = self.simulator, self.seen
         J = sim.tetrahedron_fields().J
         self._squeezed = J.min() < STEPS.squeezed
         seen.J, seen.inverted = min(seen.J, float(J.min())), max(seen.inverted, int((J <= 0).sum()))
-        self._look_at_gaps()
+        self._check_gaps()
         seen.substeps[-1] += sim.solver.substeps
         seen.shortest = min(seen.shortest, sim.solver.substep)
         seen.longest = max(seen.longest, sim.solver.substep)
@@ -249,7 +249,7 @@ class ForwardRun:
         self._lowest, self._fastest = min(self._lowest, self._energy), max(self._fastest, self._energy.parts["kinetic"])
         self.largest_energy = max(self.largest_energy, self._moving(self._energy))
 
-    def _look_at_gaps(self) -> None:
+    def _check_gaps(self) -> None:
         sim, seen, offsets = self.simulator, self.seen, self.scene.places(self.simulator.time)
         positions, crossed = sim.positions[self.scene.mesh.surface_vertices], 0
         for term in self.obstacles:

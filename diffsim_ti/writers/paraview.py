@@ -85,7 +85,7 @@ class ParaViewWriter(Writer):
         self.count += 1
 
     def _held(self, dtype) -> dict[str, np.ndarray]:
-        """Where some vertices are held in some directions alone: the projectors onto these, row by row."""
+        """Where some vertices are fixed in some directions only: the projectors onto these, row by row."""
         if self.setting.held is None:
             return {}
         rows = np.zeros((self.setting.mesh.num_vertices, 9), dtype)

@@ -24,7 +24,7 @@ class View:
     backend: "software", "vulkan" or "auto"; title: words before the time. arrows: names of fields that are vectors of
     vertices, such as forces, to draw as arrows.
     fit: what camera and colours of a picture of the end are chosen by: the whole "run", or the "end" alone.
-    say: told once what draws.
+    say: called once with what draws.
     Raises ValueError for what is out of range.
     """
 
@@ -72,7 +72,7 @@ class Writer(ABC):
 
     @abstractmethod
     def open(self, setting: Setting) -> None:
-        """Begin, or begin anew. The folder may have to be made."""
+        """Begin, or begin again. The folder may have to be made."""
 
     @abstractmethod
     def write(self, frame: Frame) -> None:

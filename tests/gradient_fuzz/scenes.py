@@ -146,7 +146,7 @@ def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configu
         own = load(name, more, mesh, steps, duration, mass.sum())
         terms.insert(int(more.integers(0, len(terms) + 1)), own)
     more = np.random.default_rng([22, seed])
-    for name in kind.ties:
+    for name in kind.lines:
         terms.append(tie(name, more, mesh, steps, duration, mass, beat))
 
     terms += newer.muscles(kind, seed, mesh, steps, duration, E)

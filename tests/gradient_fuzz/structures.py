@@ -62,8 +62,8 @@ class Structure:
     contact: str  # of explicit solvers
     contact_damping: float
     loads: tuple[str, ...]  # on surfaces and volumes, each with how it is given
-    ties: tuple[str, ...]  # springs, cables, foundations
-    rollers: bool  # some of what is fixed is held in some directions alone
+    lines: tuple[str, ...]  # springs, cables, foundations
+    rollers: bool  # some of what is fixed is fixed in some directions alone
     chamber: str  # what the cavity of a hollow body holds, and how that is given; "" of others
     order: int  # of the functions between nodes
 
@@ -84,7 +84,7 @@ class Structure:
         words = [name for name in flags if getattr(self, name)]
         how = f"{self.contact} {self.contact_damping:g}" if self.explicit else "potential"
         words += ["ten nodes"] * (self.order == 2)
-        forces = [self.forces, *self.loads, *self.ties, *[self.chamber] * bool(self.chamber)]
+        forces = [self.forces, *self.loads, *self.lines, *[self.chamber] * bool(self.chamber)]
         return (
             f"structure {self.number}: {self.law.__name__}, {self.solver.__name__}, {self.precision}, {self.volume}"
             f"{', parallel' if self.parallel else ''}; obstacles: {', '.join(kinds) or 'none'}, {how}; "

@@ -1,1 +1,1 @@
-"""Chambers: gases and held volumes in cavities."""
+"""Chambers: gases and incompressible fluids in cavities."""

@@ -22,7 +22,7 @@ from diffsim_ti.terms.gas_law import gas_law
 
 A = ti.template()
 CHAMBERS = dict.fromkeys(("triangles", "chamber", "begins", "anchor", "first_row"), "ints") | dict(
-    point="vectors", volume="scalars", felt="scalars", weight="scalars", push="scalars"
+    point="vectors", volume="scalars", by_pressure="scalars", weight="scalars", push="scalars"
 )
 SCENE = dict(rest="vectors", follower="vectors2")
 TABLE = dict(ints="ints", floats="scalars")
@@ -117,19 +117,19 @@ class ChamberKernels(StepNumbers):
 
     @ti.func
     def sums(self, q, what: A, scene: A, at: A, more: A, chambers: A, plan: A):
-        """Part q: of the volume and, to `felt`, of its change or of the adjoint of the pressure."""
-        c, volume, felt = q // self.parts, ti.cast(0, self.fp), ti.cast(0, self.fp)
+        """Part q: of the volume and, to `by_pressure`, of its change or of the adjoint of the pressure."""
+        c, volume, by_pressure = q // self.parts, ti.cast(0, self.fp), ti.cast(0, self.fp)
         begin, end = chambers.begins[c] + q % self.parts, chambers.begins[c + 1]
         for k in range((end - begin + self.parts - 1) // self.parts):
             t = begin + k * self.parts
             y = self.places(t, at, scene, chambers, plan)
             volume += chambers.weight[t] * y[0].dot(cross(y[1], y[2]))
             if ti.static(what == "jvp"):
-                felt += chambers.weight[t] * self.dots(self.changes(t, more, chambers), self.swept(y))
+                by_pressure += chambers.weight[t] * self.dots(self.changes(t, more, chambers), self.swept(y))
             if ti.static(what == "vjp"):
-                felt += chambers.push[t] * self.dots(self.pulls(t, more, chambers), self.normals(y))
+                by_pressure += chambers.push[t] * self.dots(self.pulls(t, more, chambers), self.normals(y))
         chambers.volume[q] = self.sixth() * volume
-        chambers.felt[q] = self.sixth() * felt
+        chambers.by_pressure[q] = self.sixth() * by_pressure
 
     @ti.func
     def whole(self, c, parts: A):
@@ -180,7 +180,13 @@ class ChamberKernels(StepNumbers):
             now, c = pass_at(table, plan.pass_ - plan.window), chambers.chamber[t]
             p, by_p0, by_outside, by_V0, by_n, slope = self.law_at(c, now, scene, chambers)
             dp0, d_outside, dV0, dn = self.numbers(c, now, tangent.follower, chambers)
-            dp = by_p0 * dp0 + by_outside * d_outside + by_V0 * dV0 + by_n * dn + slope * self.whole(c, chambers.felt)
+            dp = (
+                by_p0 * dp0
+                + by_outside * d_outside
+                + by_V0 * dV0
+                + by_n * dn
+                + slope * self.whole(c, chambers.by_pressure)
+            )
             y, factor = self.places(t, at, scene, chambers, plan), self.sixth() * chambers.push[t]
             normals, changes = self.normals(y), self.normals_jvp(y, self.changes(t, tangent, chambers))
             for a in ti.static(range(3)):
@@ -193,9 +199,12 @@ class ChamberKernels(StepNumbers):
         for t in range(plan.num_triangles):
             now, c = pass_at(table, plan.pass_ - plan.window), chambers.chamber[t]
             p, by_p0, by_outside, by_V0, by_n, slope = self.law_at(c, now, scene, chambers)
-            felt = self.whole(c, chambers.felt)  # the adjoint of p
+            by_pressure = self.whole(c, chambers.by_pressure)  # the adjoint of p
             y = self.places(t, at, scene, chambers, plan)
-            by_V, by_n_a = self.sixth() * chambers.weight[t] * (felt * slope), self.sixth() * chambers.push[t] * p
+            by_V, by_n_a = (
+                self.sixth() * chambers.weight[t] * (by_pressure * slope),
+                self.sixth() * chambers.push[t] * p,
+            )
             swept, turned = self.swept(y), self.normals_vjp(y, self.pulls(t, adjoint, chambers))
             for a in ti.static(range(3)):
                 by = by_V * swept[a] + by_n_a * turned[a]
@@ -203,11 +212,11 @@ class ChamberKernels(StepNumbers):
                 if ti.static(self.shape):
                     adjoint.chamber_rest[3 * t + a] = adjoint.chamber_rest[3 * t + a] + by
             if t == chambers.begins[c]:
-                self.add_mean(4 * c, felt * by_p0, now, adjoint.chamber_felt)
+                self.add_mean(4 * c, by_pressure * by_p0, now, adjoint.chamber_adjoint)
                 for d, by in ti.static(((1, by_outside), (2, by_V0), (3, by_n))):
                     one = self.vector(0)
-                    one[0] = felt * by
-                    adjoint.chamber_felt[0, 4 * c + d] = adjoint.chamber_felt[0, 4 * c + d] + one
+                    one[0] = by_pressure * by
+                    adjoint.chamber_adjoint[0, 4 * c + d] = adjoint.chamber_adjoint[0, 4 * c + d] + one
 
     # ---- kernels -----------------------------------------------------------------------------------------------------
 
@@ -229,5 +238,5 @@ class ChamberKernels(StepNumbers):
     @cached_property
     def vjp(self) -> Kernel:
         """Products of the transposed derivative with adjoint.w, to corners; adds the adjoints of numbers and of places."""
-        own = dict(w="vectors2", corner="vectors", chamber_felt="vectors2", chamber_rest="vectors")
+        own = dict(w="vectors2", corner="vectors", chamber_adjoint="vectors2", chamber_rest="vectors")
         return self._kernel("chamber_vjp", self.all_vjp, adjoint=own)

@@ -45,7 +45,7 @@ class Chambers(Stage):
             anchor=ints([e.triangles[0, 0] if e.point is None else -1 for e in closed]),
             point=runtime.upload(np.array([zero if e.point is None else e.point - a.origin for e in closed]), a.vector),
             volume=runtime.array(a.fp, self.count * self.parts),
-            felt=runtime.array(a.fp, self.count * self.parts),
+            by_pressure=runtime.array(a.fp, self.count * self.parts),
             weight=runtime.upload(np.concatenate(weights), a.fp),
             push=runtime.upload(np.concatenate(push).astype(float), a.fp),
         )

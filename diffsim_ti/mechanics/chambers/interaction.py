@@ -41,12 +41,12 @@ class Gases(Pressing):
 
     def adjoints(self, values, shape):
         return dict(
-            chamber_felt=(len(values.follower), 4 * len(self.terms)), chamber_rest=(self.triangles.size * shape,)
+            chamber_adjoint=(len(values.follower), 4 * len(self.terms)), chamber_rest=(self.triangles.size * shape,)
         )
 
     def collect(self, found, out, shape):
         rows = np.concatenate([np.arange(r.start, r.stop) for r in self.rows])
-        out.follower[..., rows, :] += found["chamber_felt"]
+        out.follower[..., rows, :] += found["chamber_adjoint"]
         if shape:
             add_at(out.rest, self.vertices, found["chamber_rest"])
 
@@ -63,7 +63,8 @@ class Gases(Pressing):
 
 
 class FilledChambers(Pressing):
-    """Implicit steps find their pressures as multipliers (multipliers.py); explicit steps have a stage (held_volumes.py)."""
+    """Implicit steps find their pressures as multipliers (multipliers.py); explicit steps have a stage
+    (volume_constraints.py)."""
 
     name, kinds, works, apart, in_kernels = "filled", (FilledChamber,), WORKS, True, False
 

@@ -45,7 +45,7 @@ class Gas:
         return self.share * (absolute * V * per_V - outside * change)
 
 
-class Held:
+class PrescribedVolume:
     """What holds V at a target, of numbers (target, V_0): p = multiplier - gamma (V - volume), a penalty about `volume` that
     makes what is stable under the constraint stable without it (multipliers.py).
 
@@ -83,6 +83,6 @@ class Held:
         return change * (self.pressure(V) - 0.5 * self.gamma * change) if V + change > 0 else -np.inf
 
 
-def law_of(chamber) -> Gas | Held:
+def law_of(chamber) -> Gas | PrescribedVolume:
     """The law of a term (terms/chambers.py)."""
-    return Held() if isinstance(chamber, FilledChamber) else Gas()
+    return PrescribedVolume() if isinstance(chamber, FilledChamber) else Gas()

@@ -1,4 +1,4 @@
-"""Volumes that are held: the part of Newton's method and of its derivatives that finds multipliers.
+"""Volume constraints: the part of Newton's method and of its derivatives that finds multipliers.
 
 A step holds V(u) = target by a multiplier p for each chamber. The bordered system
 
@@ -19,7 +19,7 @@ class HeldPressure(ChamberPressure):
     """What chambers push with that hold their volume."""
 
 
-class HeldVolumes:
+class VolumeConstraints:
     """Of the chambers of a HeldPressure.
 
     free: what vertices may do, sets that do not deform all; eps: rounding of displacements.

@@ -1,4 +1,4 @@
-"""Pressures of held volumes in the frames of a run: their changes, and adjoints that a loss gives."""
+"""Pressures of constrained volumes in the frames of a run: their changes, and adjoints that a loss gives."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ class ChamberRecord:
         return int(self.solver.schedule.shown(j + 1, save_every))
 
     def adjoint(self, j: int, save_every: int) -> np.ndarray:
-        """By the pressures of held volumes after pass j."""
+        """By the pressures of constrained volumes after pass j."""
         frame = self._frame(j, save_every)
         return np.zeros(len(self.held)) if self.adjoints is None or frame < 0 else self.adjoints[frame, self.held]
 

@@ -73,8 +73,8 @@ def assemble(potential, mass: Mass, free: Free, more=()):
         data[diagonal] += mass[:, :, None] * np.eye(3)
     data[diagonal[~is_free]] = np.eye(3) * (np.abs(data).max() or 1.0)
     if isinstance(free, FreeDirections):
-        at = diagonal[free.guided]
-        data[at] = P[free.guided] @ data[at] @ P[free.guided] + free.guides * np.abs(data).max()
+        at = diagonal[free.partly_fixed]
+        data[at] = P[free.partly_fixed] @ data[at] @ P[free.partly_fixed] + free.sliding_supports * np.abs(data).max()
     start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
     return bsr_matrix((data, columns, start), shape=(3 * n, 3 * n)), diagonal
 

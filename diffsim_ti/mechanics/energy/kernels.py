@@ -11,10 +11,10 @@ from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import Bundle, Kernel, assign, kernels_of, let, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed, with_held, with_pass
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed, with_frozen, with_pass
 
 A = ti.template()
-PASS = dict(walls="vectors", lag="vectors2", pressed="vectors2")  # what contact sees of a pass (obstacles.py)
+PASS = dict(poses="vectors", lag="vectors2", pressed="vectors2")  # what contact sees of a pass (obstacles.py)
 NUMBERS = dict(num_items="int", num_tetrahedra="int", num_vertices="int", per_gamma="float")
 
 
@@ -50,12 +50,12 @@ class PotentialKernels:
         return Kernel(name, body, self.law.precision, own, NUMBERS)
 
     @ti.func
-    def felt(self, i, scene: A):
-        """Whether vertex i feels obstacles."""
-        felt = False
+    def meets_obstacles(self, i, scene: A):
+        """Whether vertex i can touch obstacles."""
+        meets_obstacles = False
         if ti.static(len(self.features.groups) > 0):
-            felt = scene.surface[i] > 0
-        return felt
+            meets_obstacles = scene.surface[i] > 0
+        return meets_obstacles
 
     # ---- energy ------------------------------------------------------------------------------------------------------
 
@@ -81,7 +81,7 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             value = ti.cast(0, self.fp)
-            if self.felt(i, scene):
+            if self.meets_obstacles(i, scene):
                 value = self.obstacles.total_energy(i, at.u[0, i], scene, pass_, plan, True)
             out.contact[i] = value
 
@@ -96,7 +96,7 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             value = ti.cast(0, self.fp)
-            if self.felt(i, scene):
+            if self.meets_obstacles(i, scene):
                 value = self.obstacles.total_energy(i, at.u[0, i], scene, pass_, plan, False)
             out.contact[i] = value
 
@@ -119,7 +119,7 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             pushed, total = self.obstacles.vector(0), self.obstacles.vector(0)
-            if self.felt(i, scene):
+            if self.meets_obstacles(i, scene):
                 pushed = self.obstacles.total_force(i, at.u[0, i], scene, pass_, plan)
             norm = self.length(pushed)
             for c in range(scene.start[i], scene.start[i + 1]):
@@ -144,7 +144,7 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             f = self.element.gather(i, scene, scene.corner)
-            if self.felt(i, scene):
+            if self.meets_obstacles(i, scene):
                 f += self.obstacles.total_product(i, at.u[0, i], at.w[0, i], scene, pass_, plan, friction)
             out.y[0, i] = f
 
@@ -200,7 +200,7 @@ class PotentialKernels:
     def contact_column(self, i, d, at: A, scene: A, pass_: A, plan: A):
         """Column d of df/du of obstacles at vertex i."""
         f = self.obstacles.vector(0)
-        if self.felt(i, scene):
+        if self.meets_obstacles(i, scene):
             unit = self.obstacles.vector(0)
             for m in ti.static(range(3)):
                 unit[m] = ti.select(d == m, ti.cast(1, self.fp), ti.cast(0, self.fp))
@@ -274,7 +274,7 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             f = self.element.gather(i, scene, scene.corner)
-            if self.felt(i, scene):
+            if self.meets_obstacles(i, scene):
                 f = self.obstacles.add_jvp(i, f, at.u[0, i], at.w[0, i], scene, pass_, tangent, plan)
             out.y[0, i] = f
 
@@ -282,7 +282,7 @@ class PotentialKernels:
     def jvp(self) -> Kernel:
         """Change y of the forces for changes w of the displacement and of everything else that they depend on."""
         own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
-        own["tangent"] = with_held(TANGENT | PASS, self.law)
+        own["tangent"] = with_frozen(TANGENT | PASS, self.law)
         return self._kernel("jvp", self.all_jvp, **own)
 
     @ti.func
@@ -293,15 +293,15 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             f = self.element.gather(i, scene, scene.corner)
-            if self.felt(i, scene):
+            if self.meets_obstacles(i, scene):
                 f = self.obstacles.add_vjp(i, f, at.u[0, i], at.w[0, i], scene, pass_, adjoint, plan)
             out.y[0, i] = f
 
     @cached_property
     def vjp(self) -> Kernel:
         """y = df/du w (it is symmetric) and adjoints of the pass; adds the adjoints of all else that forces depend on."""
-        adjoint = ADJOINT | dict(lag="vectors2", walls="vectors2", pressed="vectors2")
-        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=with_held(adjoint, self.law))
+        adjoint = ADJOINT | dict(lag="vectors2", poses="vectors2", pressed="vectors2")
+        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=with_frozen(adjoint, self.law))
         return self._kernel("vjp", self.all_vjp, **own)
 
 

@@ -29,8 +29,8 @@ class Potential:
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))  # displacement, direction, result
         self.has_friction = bool(a.features().rough)
         self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the walls
-        self.walls = runtime.array(a.vector, a.walls.size)
-        self.faces = FaceContact(self, parallel) if FaceContact.is_felt(arrays) else None
+        self.poses = runtime.array(a.vector, a.poses.size)
+        self.faces = FaceContact(self, parallel) if FaceContact.is_active(arrays) else None
         self.presses = any(g.force.friction and a.features().reaches(g) for g in a.features().groups)
         self.pressed = runtime.array(a.vector, num_obstacles if self.presses else 1, n if self.presses else 1)
         self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
@@ -39,19 +39,21 @@ class Potential:
         self._launches, self._coupling = {}, None  # made when first needed
         self._points = None
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
-        self.held = arrays.held_numbers()  # what the law measures rates from in a pass
-        self.rate = runtime.array(a.fp, 1) if a.law.viscous else None  # [1/s], of changes in a pass; zero in statics
+        self.held = arrays.frozen_numbers()  # what the law measures rates from in a pass
+        self.rate = (
+            runtime.array(a.fp, 1) if a.law.viscous else None
+        )  # [1/s], of changes in a pass; zero in static solves
         self.hosts = NONE  # host forces that have an energy: set by whom a time is known
         self.rigid: RigidSets | None = None  # sets that do not deform: set by whom passes are known
 
     @property
-    def rubbing(self):
+    def surface_friction(self):
         """Friction of surfaces on each other (mechanics/surfaces/lagged_friction.py); None without."""
         return self.pairs.friction if self.pairs else None
 
     def _on_host(self) -> list:
         """What acts on vertices from the host: host forces with an energy, and friction of surfaces."""
-        return [part for part in (self.hosts, self.rubbing) if part]
+        return [part for part in (self.hosts, self.surface_friction) if part]
 
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""
@@ -67,17 +69,17 @@ class Potential:
         sizes = dict(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices)
         return sizes | dict(per_gamma=self.per_gamma)
 
-    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, walls: np.ndarray) -> None:
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, poses: np.ndarray) -> None:
         """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (obstacles.py)."""
         self.per_gamma = per_gamma
         if self.has_friction:
             runtime.fill(self.lag, np.stack([u, x]))
-        if len(walls):
-            runtime.fill(self.walls, walls)
+        if len(poses):
+            runtime.fill(self.poses, poses)
         if self.pairs:
             self.pairs.begin(u)
-        if self.rubbing:
-            self.rubbing.begin(u, x, per_gamma)
+        if self.surface_friction:
+            self.surface_friction.begin(u, x, per_gamma)
 
     def place(self, u: np.ndarray) -> np.ndarray:
         """Go to displacement u [m]; returns it as the device holds it."""
@@ -121,21 +123,24 @@ class Potential:
     @contextmanager
     def without_friction(self):
         """What has a potential in the state alone, for friction has one in a pass."""
-        a, rubbing = self.arrays, getattr(self.rubbing, "inner", self.rubbing)  # that of curved faces acts on corners
+        a, surface_friction = (
+            self.arrays,
+            getattr(self.surface_friction, "inner", self.surface_friction),
+        )  # that of curved faces acts on corners
         rough = [first + force.index.friction for force, first, _ in a.obstacles if force.friction]
-        if not (rough or rubbing):
+        if not (rough or surface_friction):
             yield
             return
-        kept, pressing = runtime.fetch(a.parameters), rubbing.L if rubbing else None
+        kept, pressing = runtime.fetch(a.parameters), surface_friction.L if surface_friction else None
         smooth = kept.copy()
         smooth[rough] = 0
-        if rubbing:
-            rubbing.L = np.zeros_like(pressing)
+        if surface_friction:
+            surface_friction.L = np.zeros_like(pressing)
         runtime.fill(a.parameters, smooth)
         yield
         runtime.fill(a.parameters, kept)
-        if rubbing:
-            rubbing.L = pressing
+        if surface_friction:
+            surface_friction.L = pressing
 
     def energy(self) -> tuple[float, float, np.ndarray]:
         """(energy [J], the sum of its absolute parts, J at each point)."""
@@ -241,7 +246,8 @@ class Potential:
         return self.coupling.rows(runtime.fetch(a.corner)[: a.first_contact_corner].astype(np.float64))
 
     def tangents(self) -> np.ndarray:
-        """d2psi/dF2 [Pa] at each point, its patch's pressure held, where `blocks` was last called, shape (points, 9, 9)."""
+        """d2psi/dF2 [Pa] at each point, its patch's pressure frozen, where `blocks` was last called, shape (points, 9,
+        9)."""
         a = self.arrays
         return a.from_blocks(runtime.fetch(self._block_arrays.tangent), 81 * a.points).reshape(-1, 9, 9)
 

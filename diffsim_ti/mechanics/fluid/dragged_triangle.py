@@ -24,11 +24,11 @@ class DraggedTriangle(ItemForce):
     shape: bool
     name, reads_rates, reads_rest = "dragged", True, True
     arrays = dict(dragged="ints", dragged_numbers="ints")  # corners of each, where its numbers stand in the parameters
-    adjoints = dict(dragged_felt="vectors", dragged_rest="vectors")
+    adjoints = dict(fluid_adjoint="vectors", dragged_rest="vectors")
 
     @traced
     def sizes(self, plan) -> dict:
-        return dict(dragged_felt=2 * plan.num_dragged, dragged_rest=3 * plan.num_dragged)
+        return dict(fluid_adjoint=2 * plan.num_dragged, dragged_rest=3 * plan.num_dragged)
 
     @ti.func
     def number(self, x: ti.template()):
@@ -99,7 +99,7 @@ class DraggedTriangle(ItemForce):
     @ti.func
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
         """Products of the transposed derivatives with adjoint.w, to corners; adds the adjoints of numbers to
-        adjoint.dragged_felt and, if `shape`, those of places to adjoint.dragged_rest."""
+        adjoint.fluid_adjoint and, if `shape`, those of places to adjoint.dragged_rest."""
         rho, c, k = self.numbers(t, scene.parameters, scene)
         e, f, v, size, N, L, along, B = self.known(t, scene, state, s)
         w = adjoint.w[0, scene.dragged[3 * t]]
@@ -119,5 +119,5 @@ class DraggedTriangle(ItemForce):
         by_k, by_c = along * over * across, L * straight
         by_rho = -size * w.dot(B) * self.number(1.0 / 12.0)
         felt = self.vector(by_rho, by_k, by_c - by_k, self.number(0))
-        adjoint.dragged_felt[2 * t] = adjoint.dragged_felt[2 * t] + felt
-        adjoint.dragged_felt[2 * t + 1] = adjoint.dragged_felt[2 * t + 1] - by_v
+        adjoint.fluid_adjoint[2 * t] = adjoint.fluid_adjoint[2 * t] + felt
+        adjoint.fluid_adjoint[2 * t + 1] = adjoint.fluid_adjoint[2 * t + 1] - by_v

@@ -44,11 +44,11 @@ class FluidDrag(Interaction):
         return Fluid(self.triangles, self.first_number, self.mesh.num_vertices)
 
     def adjoints(self, values, shape):
-        return dict(dragged_felt=(2 * self.count,), dragged_rest=(3 * self.count * shape,))
+        return dict(fluid_adjoint=(2 * self.count,), dragged_rest=(3 * self.count * shape,))
 
     def collect(self, found, out, shape):
         numbers = self.first_number[:, None] + np.arange(6)
-        felt = found["dragged_felt"]
+        felt = found["fluid_adjoint"]
         np.add.at(out.parameters, (..., numbers.ravel()), felt.reshape(*felt.shape[:-2], -1))
         if shape:
             add_at(out.rest, self.vertices, found["dragged_rest"])

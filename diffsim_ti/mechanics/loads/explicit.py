@@ -1,4 +1,4 @@
-"""Forces that are given on vertices, in explicit passes: constant, for each step, or linear within steps."""
+"""Prescribed forces on vertices, in explicit passes: constant, for each step, or linear within steps."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class GivenForces:
+class AppliedForces:
     """Functions of one vertex i."""
 
     features: Features

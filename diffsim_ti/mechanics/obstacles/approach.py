@@ -24,15 +24,15 @@ class Approach:
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
 
     def __call__(self, u, held, starts: list, problem: tuple) -> np.ndarray:
-        """Displacements with held vertices where they get, in front of the obstacles where forces are taken in the pass.
+        """Displacements with fixed vertices where they get, in front of the obstacles where forces are taken in the pass.
 
-        u: where the pass begins; held: the same with held vertices where they get; starts: where the body may be led;
+        u: where the pass begins; held: the same with fixed vertices where they get; starts: where the body may be led;
         problem: mass, inertial, loads of `Newton.solve`.
         Raises Blocked where no room is left.
         """
         ws = self.ws
-        way, before, after = ws.ways.way, ws.ways.before, ws.ways.at_stage
-        step, drift = held - u, ws.arrays.walls.drift(before, after)
+        way, before, after = ws.collisions.detection, ws.collisions.before, ws.collisions.at_stage
+        step, drift = held - u, ws.arrays.poses.drift(before, after)
         if not (step.any() or drift.any()):
             return held
         ws.check_pairs(u, step)
@@ -41,44 +41,44 @@ class Approach:
         try:
             for start in starts:
                 if way.share(u, start - u, before, drift) == 1 and self._is_sound(u, start):
-                    ws.ways.put(before)
+                    ws.collisions.put(before)
                     ws.potential.place(held)
                     if ws.newton.rise(held, ws.potential.energy(), start, problem) <= 0:
                         return start
             return self._in_parts(u, step, before, drift, problem)
         finally:
-            ws.ways.put(after)
+            ws.collisions.put(after)
 
     def _in_parts(self, place, step, before, drift, problem):
         ws, done, stuck = self.ws, 0.0, 0
-        moved = ws.arrays.walls.moved
+        moved = ws.arrays.poses.moved
         for _ in range(self.most_parts):
-            left, walls = 1 - done, moved(before, drift, done)
-            share = ws.ways.way.share(place, left * step, walls, left * drift, kept=self.kept)
-            met = ws.ways.way.met
+            left, poses = 1 - done, moved(before, drift, done)
+            share = ws.collisions.detection.share(place, left * step, poses, left * drift, kept=self.kept)
+            met = ws.collisions.detection.met
             place, done = place + share * left * step, done + share * left
             if share == 1:
                 return place
             stuck = stuck + 1 if share * left < self.least else 0
             if stuck > self.patience:
                 break
-            walls = moved(before, drift, done)
-            carried = self._carried(place, (1 - done) * step, walls, (1 - done) * drift, met.obstacle)
+            poses = moved(before, drift, done)
+            carried = self._carried(place, (1 - done) * step, poses, (1 - done) * drift, met.obstacle)
             if carried is not None:
                 return carried
-            ws.ways.put(walls)
+            ws.collisions.put(poses)
             place = ws.newton.solve(place, *problem, rounds=self.rounds)
-        ws.ways.put(walls)
+        ws.collisions.put(poses)
         own = list(met.vertices)
-        carried = ws.ways.carried(met.obstacle, place[own], walls, drift, own)
+        carried = ws.collisions.carried(met.obstacle, place[own], poses, drift, own)
         speed = np.linalg.norm(carried - step[own], axis=1).max() / ws.substep
         raise Blocked.pinched(ws, place, met, 1 - done, float(speed))
 
-    def _carried(self, place, step, walls, drift, obstacle: int):
+    def _carried(self, place, step, poses, drift, obstacle: int):
         """All that moves freely goes along with an obstacle; None where that way is not free."""
-        along = step + self.ws.ways.carried(obstacle, place, walls, drift) * self.ws.linear
+        along = step + self.ws.collisions.carried(obstacle, place, poses, drift) * self.ws.linear
         along = self.ws.rigid.nearest(place + along) - place if self.ws.rigid else along
-        if not (along - step).any() or self.ws.ways.way.share(place, along, walls, drift) < 1:
+        if not (along - step).any() or self.ws.collisions.detection.share(place, along, poses, drift) < 1:
             return None
         return place + along if self._is_sound(place, place + along) else None
 

@@ -20,8 +20,8 @@ class Blocked(NotConverged):
     @classmethod
     def pinched(cls, ws, u, met, left: float, speed: float) -> "Blocked":
         """An obstacle or a support has the share `left` of its motion to go, and finds no room."""
-        term, h = ws.ways.way.terms[met.obstacle], ws.substep
-        gap, width = ws.ways.gap_of(met, u), float(term.values["barrier_width"])
+        term, h = ws.collisions.detection.terms[met.obstacle], ws.substep
+        gap, width = ws.collisions.gap_of(met, u), float(term.values["barrier_width"])
         short = min(0.5 * h, width / max(speed, 1e-300))
         message = (
             f"{met} is {gap:.3g} m before {term!r}, they come together at {speed:.4g} m/s, and {left:.0%} of the "
@@ -32,10 +32,10 @@ class Blocked(NotConverged):
     @classmethod
     def at_an_obstacle(cls, ws, error: NotConverged, u: np.ndarray, met, speed: float) -> "NotConverged":
         """What NotConverged was about, if it happened before an obstacle; else the error itself."""
-        if met is None or met.obstacle >= len(ws.ways.way.terms):
+        if met is None or met.obstacle >= len(ws.collisions.detection.terms):
             return error
-        term, gap = ws.ways.way.terms[met.obstacle], ws.ways.gap_of(met, u)
-        width, stiffness = ws.ways.width_of(met.obstacle), ws.arrays.stiffness_of(met.obstacle, met.vertices)
+        term, gap = ws.collisions.detection.terms[met.obstacle], ws.collisions.gap_of(met, u)
+        width, stiffness = ws.collisions.width_of(met.obstacle), ws.arrays.stiffness_of(met.obstacle, met.vertices)
         if gap > cls.near * width:
             return error
         R = ws.newton.residual_at(u)[list(met.vertices)]

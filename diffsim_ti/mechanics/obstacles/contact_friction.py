@@ -1,9 +1,9 @@
 """Friction of the contact stage: that of each obstacle, one after the other, with the pushes that the stage has noted.
 
 Friction with one obstacle may lead a vertex towards another one, which the stage has not asked. With e the way that friction
-adds and y_o > 0 the distances to which the stage leads, the vertex takes the share c(x) of all friction (held_back.py).
-A vertex that is held in some directions takes of each friction what lies in the others, and along the obstacle there: what
-would lead it to or from the obstacle is left out, as if it were across the normal.
+adds and y_o > 0 the distances to which the stage leads, the vertex takes the share c(x) of all friction
+(limited_displacement.py). A vertex that is fixed in some directions takes of each friction what lies in the others, and
+along the obstacle there: what would lead it to or from the obstacle is left out, as if it were across the normal.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from diffsim_ti.mechanics.obstacles.contact_impulses import (
     note_friction_jvp,
     seed_of_friction,
 )
-from diffsim_ti.mechanics.obstacles.held_back import HeldBack
-from diffsim_ti.mechanics.obstacles.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
+from diffsim_ti.mechanics.obstacles.limited_displacement import LimitedDisplacement
+from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
 from diffsim_ti.terms.obstacles import stage
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -29,8 +29,8 @@ class ContactFriction(ObstacleStages):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
 
     @cached_property
-    def held_back(self) -> HeldBack:
-        return HeldBack(self.features, self.precision)
+    def limited_displacement(self) -> LimitedDisplacement:
+        return LimitedDisplacement(self.features, self.precision)
 
     @ti.func
     def led_normal(self, i, n, scene: A):
@@ -44,8 +44,8 @@ class ContactFriction(ObstacleStages):
     def along(self, i, n, e, scene: A):
         """A friction e without what leads vertex i to or from the obstacle, (e . m) m / m . m."""
         out = e
-        if ti.static(self.features.guided):
-            if scene.guide_slot[i] >= 0:
+        if ti.static(self.features.partly_fixed):
+            if scene.sliding_slot[i] >= 0:
                 m, inverse = self.led_normal(i, n, scene)
                 out = e + -inverse * e.dot(m) * m
         return out
@@ -54,8 +54,8 @@ class ContactFriction(ObstacleStages):
     def along_jvp(self, i, n, dn, e, de, scene: A):
         """Its change."""
         out = de
-        if ti.static(self.features.guided):
-            if scene.guide_slot[i] >= 0:
+        if ti.static(self.features.partly_fixed):
+            if scene.sliding_slot[i] >= 0:
                 m, inverse = self.led_normal(i, n, scene)
                 dm, size = self.may(i, dn, scene), e.dot(m)
                 lost = de.dot(m) + e.dot(dm) - 2 * inverse * size * m.dot(dm)
@@ -66,8 +66,8 @@ class ContactFriction(ObstacleStages):
     def along_vjp(self, i, n, e, e_adj, scene: A):
         """(adjoint of e, of n) for that of what is left of e."""
         by_e, by_n = e_adj, self.vector(0)
-        if ti.static(self.features.guided):
-            if scene.guide_slot[i] >= 0:
+        if ti.static(self.features.partly_fixed):
+            if scene.sliding_slot[i] >= 0:
                 m, inverse = self.led_normal(i, n, scene)
                 size, seen = e.dot(m), e_adj.dot(m)
                 by_e = e_adj + -inverse * seen * m
@@ -78,11 +78,11 @@ class ContactFriction(ObstacleStages):
     @ti.func
     def slide(self, o, i, v, ratio, scene: A, state: A):
         """Velocity after the friction of an obstacle, whose push is noted."""
-        pushed, felt, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + FELT, i], v
+        pushed, felt, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + NUMBERS, i], v
         if pushed.x > 0 and felt.z > 0:
-            plane, wall = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + WALL, i]
-            after = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
-            if ti.static(self.features.guided):
+            plane, v_obstacle = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + WALL, i]
+            after = stage.slide(self.fp, plane, pushed.x, v, v_obstacle, ratio, felt.z, felt.w)
+            if ti.static(self.features.partly_fixed):
                 after = v + self.along(i, self.normal(plane), after - v, scene)
         return after
 
@@ -90,7 +90,7 @@ class ContactFriction(ObstacleStages):
     def led(self, i, v, after, scene: A):
         """Velocity of vertex i where friction alone would make v that after it."""
         out = after
-        if ti.static(self.features.guided):
+        if ti.static(self.features.partly_fixed):
             out = v + self.may(i, after - v, scene)
         return out
 
@@ -127,11 +127,11 @@ class ContactFriction(ObstacleStages):
         return most, number
 
     @ti.func
-    def rubbed(self, i, v, z, ratio, now: A, scene: A, state: A):
+    def after_friction(self, i, v, z, ratio, now: A, scene: A, state: A):
         """Velocity after friction."""
         after = self.slide_all(i, v, ratio, scene, state)
         x, _ = self.crowding(i, v, after, z, now, state)
-        c, slope = self.held_back.share_and_slope(x)
+        c, slope = self.limited_displacement.share_and_slope(x)
         if slope < 0:
             after = v + c * (after - v)
         return after
@@ -142,19 +142,32 @@ class ContactFriction(ObstacleStages):
     def slide_jvp_of(self, g: A, k, i, u, du, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
         """Velocity after the friction of one obstacle, and its change."""
         row, first = ROWS * (g.number + k), g.first + k * g.size
-        pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
+        pushed, felt = state.stage[row + PUSH, i], state.stage[row + NUMBERS, i]
         if pushed.x > 0:
-            plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+            plane, v_obstacle = state.stage[row + PLANE, i], state.stage[row + WALL, i]
             X = self.seen_now(g, k, scene.rest[i], now, scene)
-            dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+            dv_obstacle = self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
             change = state.stage[row + SEED, i]
             dmu = tangent.parameters[first + g.force.index.friction]
             deps = tangent.parameters[first + g.force.index.friction_speed]
             dafter = stage.slide_jvp(
-                self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
+                self.fp,
+                plane,
+                pushed.x,
+                v,
+                v_obstacle,
+                ratio,
+                felt.z,
+                felt.w,
+                change,
+                dv,
+                dv_obstacle,
+                dratio,
+                dmu,
+                deps,
             )
-            after = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
-            if ti.static(self.features.guided):
+            after = stage.slide(self.fp, plane, pushed.x, v, v_obstacle, ratio, felt.z, felt.w)
+            if ti.static(self.features.partly_fixed):
                 n, dn, e = self.normal(plane), self.normal(change), after - v
                 dafter = dv + self.along_jvp(i, n, dn, e, dafter - dv, scene)
                 after = v + self.along(i, n, e, scene)
@@ -171,11 +184,11 @@ class ContactFriction(ObstacleStages):
         return v, dv
 
     @ti.func
-    def rubbed_jvp(self, i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now: A, scene: A, state: A, tangent: A):
+    def after_friction_jvp(self, i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now: A, scene: A, state: A, tangent: A):
         """Velocity after friction, and its change."""
         after, change = self.slide_all_jvp(i, u, du, v, dv, ratio, dratio, now, scene, state, tangent)
         x, number = self.crowding(i, v, after, z, now, state)
-        c, slope = self.held_back.share_and_slope(x)
+        c, slope = self.limited_displacement.share_and_slope(x)
         dc, start, dstart = ti.cast(0, self.fp), v, dv
         if slope < 0:
             way, dway, dx = after - v, change - dv, ti.cast(0, self.fp)
@@ -183,7 +196,7 @@ class ContactFriction(ObstacleStages):
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    dx = self.held_back.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
+                    dx = self.limited_displacement.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
             dc = slope * dx
             after, change = v + c * way, dv + c * dway + dc * way
         if ti.static(self.features.recorded):
@@ -194,7 +207,8 @@ class ContactFriction(ObstacleStages):
 
     @ti.func
     def slide_all_vjp(self, i, v, v_adj, ratio, share, now: A, scene: A, state: A, adjoint: A):
-        """(adjoint of the velocity v before friction, of h / m); notes those of all else, of the wall in its place.
+        """(adjoint of the velocity v before friction, of h / m); notes those of all else, of the obstacle's velocity in
+        its place.
 
         share: what of it the vertex takes, for impulses that are asked for.
         """
@@ -202,61 +216,61 @@ class ContactFriction(ObstacleStages):
         for back in range(ti.static(self.features.num_staged)):
             before = ti.static(self.features.num_staged) - 1 - back
             row = ROWS * (ti.static(self.features.first_staged) + before)
-            pushed, felt, by_wall = state.stage[row + PUSH, i], state.stage[row + FELT, i], self.vector(0)
+            pushed, felt, by_v_obstacle = state.stage[row + PUSH, i], state.stage[row + NUMBERS, i], self.vector(0)
             if pushed.x > 0 and felt.z > 0:
                 start, held_adj = self.slide_by(before, i, v, ratio, scene, state), self.vector(0)
-                if ti.static(self.features.guided):
-                    held_adj = self.guides.held(i, v_adj, scene)
+                if ti.static(self.features.partly_fixed):
+                    held_adj = self.sliding_supports.held(i, v_adj, scene)
                     v_adj = v_adj + -1 * held_adj
-                plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+                plane, v_obstacle = state.stage[row + PLANE, i], state.stage[row + WALL, i]
                 if ti.static(self.features.recorded):
                     v_adj += share * seed_of_friction(self, before, i, now, scene, adjoint)
                 by_n = self.vector(0)
-                if ti.static(self.features.guided):
-                    raw = stage.slide(self.fp, plane, pushed.x, start, wall, ratio, felt.z, felt.w)
+                if ti.static(self.features.partly_fixed):
+                    raw = stage.slide(self.fp, plane, pushed.x, start, v_obstacle, ratio, felt.z, felt.w)
                     by_e, by_n = self.along_vjp(i, self.normal(plane), raw - start, v_adj, scene)
                     held_adj += v_adj - by_e
                     v_adj = by_e
-                by_plane, by_v, of_wall, more, by_mu, by_eps = stage.slide_vjp(
-                    self.fp, plane, pushed.x, start, wall, ratio, felt.z, felt.w, v_adj
+                by_plane, by_v, of_v_obstacle, more, by_mu, by_eps = stage.slide_vjp(
+                    self.fp, plane, pushed.x, start, v_obstacle, ratio, felt.z, felt.w, v_adj
                 )
-                v_adj, by_wall = by_v + held_adj if ti.static(self.features.guided) else by_v, of_wall
+                v_adj, by_v_obstacle = by_v + held_adj if ti.static(self.features.partly_fixed) else by_v, of_v_obstacle
                 if ti.static(self.features.recorded):
                     v_adj += -share * seed_of_friction(self, before, i, now, scene, adjoint)
                     friction_by_mass(self, before, i, start, share, ratio, now, scene, state, adjoint)
                 by_ratio += more
                 state.stage[row + SEED, i] = state.stage[row + SEED, i] + by_plane
-                if ti.static(self.features.guided):
+                if ti.static(self.features.partly_fixed):
                     state.stage[row + SEED, i] = state.stage[row + SEED, i] + by_n
                 pushed.z, pushed.w = by_mu, by_eps
                 state.stage[row + PUSH, i] = pushed
-            state.stage[row + WALL, i] = by_wall
+            state.stage[row + WALL, i] = by_v_obstacle
         return v_adj, by_ratio
 
     @ti.func
-    def rubbed_vjp(self, i, u, v, v_adj, z, ratio, now: A, scene: A, state: A, adjoint: A):
+    def after_friction_vjp(self, i, u, v, v_adj, z, ratio, now: A, scene: A, state: A, adjoint: A):
         """(adjoints of v before friction, of h / m, of the move z, of alpha, of u); notes or adds those of all else."""
         after, by_z, by_u = self.slide_all(i, v, ratio, scene, state), self.vector(0), self.vector(0)
         x, number = self.crowding(i, v, after, z, now, state)
-        c, slope = self.held_back.share_and_slope(x)
-        way_adj, own, by_alpha = v_adj, self.vector(0), ti.cast(0, self.fp)
+        c, slope = self.limited_displacement.share_and_slope(x)
+        displacement_adj, own, by_alpha = v_adj, self.vector(0), ti.cast(0, self.fp)
         if slope < 0:
             way = after - v
             by_x = slope * v_adj.dot(way)
             if ti.static(self.features.recorded):
                 by_x += slope * friction_by_share(self, i, v, ratio, now, scene, state, adjoint)
-            way_adj = c * v_adj
+            displacement_adj = c * v_adj
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    of_e, of_z, of_u = self.held_back.adjoint_of_x(
+                    of_e, of_z, of_u = self.limited_displacement.adjoint_of_x(
                         g, k, i, i, u, z, now.alpha * way, x, by_x, now, scene, adjoint, adjoint
                     )
-                    way_adj += now.alpha * of_e
+                    displacement_adj += now.alpha * of_e
                     by_alpha += of_e.dot(way)
                     by_z += of_z
                     by_u += of_u
             self.add_to_rest(i, by_u, adjoint)
-            own = v_adj - way_adj
-        by_v, by_ratio = self.slide_all_vjp(i, v, way_adj, ratio, c, now, scene, state, adjoint)
+            own = v_adj - displacement_adj
+        by_v, by_ratio = self.slide_all_vjp(i, v, displacement_adj, ratio, c, now, scene, state, adjoint)
         return by_v + own, by_ratio, by_z, by_alpha, by_u

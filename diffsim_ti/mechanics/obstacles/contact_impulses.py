@@ -2,7 +2,7 @@
 
 In a pass obstacle o gives vertex i h P_o n_o by its push and c m (v_o - v_(o-1)) by its friction, v_o being the velocity
 after the frictions of obstacles 1 .. o, and c the share of them that the vertex takes (contact_friction.py): what the stage
-adds to the vertex's momentum, to round-off, or, in directions in which it is held, to what holds it. They are added to rows
+adds to the vertex's momentum, to round-off, or, in directions in which it is fixed, to what holds it. They are added to rows
 now.into + 2 o and now.into + 2 o + 1 of `impulse`; now.into is negative in passes that no frame counts.
 """
 
@@ -18,7 +18,7 @@ def note_impulses(self: A, i, v_plus, z, ratio, now: A, scene: A, state: A):
     """Add what the noted pushes, and the frictions on v+, are."""
     if now.into >= 0:
         x, _ = self.crowding(i, v_plus, self.slide_all(i, v_plus, ratio, scene, state), z, now, state)
-        share, _ = self.held_back.share_and_slope(x)
+        share, _ = self.limited_displacement.share_and_slope(x)
         v = v_plus
         for c in range(ti.static(self.features.num_staged)):
             o = ti.static(self.features.first_staged) + c

@@ -1,6 +1,7 @@
 """What obstacles do in each frame of an implicit run, per vertex, with tangent and adjoint; on the host, in float64.
 
-Forces are those where passes take them, averaged over the passes since the frame before; of statics those of the last pass.
+Forces are those where passes take them, averaged over the passes since the frame before; of static solves those of the
+last pass.
 """
 
 from types import SimpleNamespace
@@ -38,7 +39,7 @@ class Shares:
     def run_face(self, name: str, which: int, **records) -> np.ndarray:
         """A kernel of one obstacle at points within faces; its result on vertices."""
         if ("face", name) not in self._launches:
-            place = SimpleNamespace(walls=self.p.walls), self.p.faces
+            place = SimpleNamespace(poses=self.p.poses), self.p.faces
             own = dict(scene=self.a, pass_=place, at=self.p, out=self) | records
             self._launches["face", name] = getattr(self.of_faces, name).bind(**own)
         self._launches["face", name](**self._sizes(which=which))
@@ -61,7 +62,7 @@ class ContactRecord:
 
     def __init__(self, workspace):
         frames, a, self.schedule = workspace.frames.frames_u.shape[0], workspace.arrays, workspace.solver.schedule
-        self.num_obstacles, rows = len(a.obstacles), len(a.obstacles) + bool(workspace.potential.rubbing)
+        self.num_obstacles, rows = len(a.obstacles), len(a.obstacles) + bool(workspace.potential.surface_friction)
         self.forces = np.zeros((frames, rows, 2, a.num_vertices, 3))
 
     def _weight(self, j: int, save_every: int, static: bool) -> tuple[int, float]:
@@ -101,16 +102,16 @@ class SharesAdjoint(Shares):
         p, a = self.p, self.a
         self.seed = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
         self.lag = runtime.array(a.vector, *p.lag.shape)
-        self.walls = runtime.array(a.vector, a.walls.size, a.num_vertices)
+        self.poses = runtime.array(a.vector, a.poses.size, a.num_vertices)
         self.pressed = runtime.array(a.vector, *p.pressed.shape)
-        own = SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed, face_areas=face_areas)
+        own = SimpleNamespace(lag=self.lag, poses=self.poses, pressed=self.pressed, face_areas=face_areas)
         self.numbers = (own, numbers)
 
     def pull_back(self, seed: np.ndarray) -> tuple[np.ndarray, ...]:
-        """(adjoint of u*, of the two rows of lag, of `pressed`, of the rows of walls) in float64; adds those of the scene's
-        numbers."""
+        """(adjoint of u*, of the two rows of lag, of `pressed`, of the rows of obstacle poses) in float64; adds those
+        of the scene's numbers."""
         runtime.fill(self.seed, seed.reshape(-1, *seed.shape[2:]))
-        for target in (self.lag, self.walls, self.pressed):
+        for target in (self.lag, self.poses, self.pressed):
             runtime.fill(target, 0)
         self.run("vjp", adjoint=self.numbers)
         by_u = runtime.fetch_row(self.y, 0)
@@ -118,7 +119,7 @@ class SharesAdjoint(Shares):
             for k in self.reaching:
                 runtime.fill(self.p.w, seed[k, :1])
                 by_u = by_u + self.run_face("vjp", k, adjoint=self.numbers)
-        by_lag, by_pressed, by_walls = (
-            runtime.fetch(x).astype(np.float64) for x in (self.lag, self.pressed, self.walls)
+        by_lag, by_pressed, by_poses = (
+            runtime.fetch(x).astype(np.float64) for x in (self.lag, self.pressed, self.poses)
         )
-        return by_u, by_lag, by_pressed, by_walls.sum(1)
+        return by_u, by_lag, by_pressed, by_poses.sum(1)

@@ -9,9 +9,10 @@ y_k = d_k + n_k . (z - h wall_k); z = alpha v+ + alpha (1 + c) / 2 delta is solv
 the minimum of a convex function, so there is one. vs is v+ after the friction of each obstacle with normal force P_k.
 
 c is the solver's `contact_damping`: 1 is backward Euler of the barriers alone, 0 their discrete gradients, which keep the
-energy. The kinetic and the barriers' energy together never grow but by walls that move: where obstacles are flat they fall
-by c m |delta|^2 / 2 or more. The distance to a curved obstacle is that to its tangent plane, the safe side if it is convex.
-A vertex that is held in some directions goes the way `lead` there, and is pushed and rubbed only in the others.
+energy. The kinetic and the barriers' energy together never grow but by obstacles that move: where obstacles are flat
+they fall by c m |delta|^2 / 2 or more. The distance to a curved obstacle is that to its tangent plane, the safe side if
+it is convex. A vertex that is fixed in some directions goes the way `lead` there, and is subject to contact and
+friction only in the others.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.contact_friction import ContactFriction
 from diffsim_ti.mechanics.obstacles.contact_impulses import note_impulses, note_pushes_jvp, seed_impulses
-from diffsim_ti.mechanics.obstacles.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
+from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
 from diffsim_ti.mechanics.obstacles.outside_work import add_work, work_of_lead, work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
 
@@ -33,7 +34,7 @@ MOST_ROUNDS = 60
 class ContactStage(ObstacleStages):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it.
 
-    Obstacles of all kinds are gone through in one loop, over what `look` notes of them.
+    Obstacles of all kinds are gone through in one loop, over what `look` records of them.
     """
 
     @cached_property
@@ -54,32 +55,32 @@ class ContactStage(ObstacleStages):
 
     @ti.func
     def look(self, i, u, move, now: A, scene: A, state: A):
-        """Is an obstacle felt, now or after `move`? If so, note what all of them are."""
+        """Does an obstacle act, now or after `move`? If so, note what all of them are."""
         near = False
         for turn in range(2):
             if turn == 0 or near:
                 for g in ti.static(self.features.staged):
                     for k in range(g.count):
                         first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
-                        wall = self.wall(g, k, X, u, now, scene)
-                        plane = g.force.outlook(scene.parameters, first, X, u)
+                        v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
+                        plane = g.force.contact_plane(scene.parameters, first, X, u)
                         width = g.force.width(scene.parameters, first)
                         if turn == 0:
-                            y = plane.w + self.normal(plane).dot(move - now.h * wall)
+                            y = plane.w + self.normal(plane).dot(move - now.h * v_obstacle)
                             near = near or ti.min(plane.w, y) < width
                         else:
                             row = ROWS * (g.number + k)
                             state.stage[row + PLANE, i] = plane
                             felt = stage.numbers(g.force, scene.parameters, first)
                             felt.x = self.on_area(g, i, felt.x, scene)
-                            state.stage[row + FELT, i] = felt
-                            state.stage[row + WALL, i] = wall
+                            state.stage[row + NUMBERS, i] = felt
+                            state.stage[row + WALL, i] = v_obstacle
         return near
 
     @ti.func
     def push(self, o, i, z, now: A, state: A, plan: A):
         """Note the push of an obstacle for the move z; returns (n, P, -dP/dy, the smaller one of d and y)."""
-        plane, felt = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + FELT, i]
+        plane, felt = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + NUMBERS, i]
         n, width = self.normal(plane), felt.y
         y = plane.w + n.dot(z - now.h * state.stage[ROWS * o + WALL, i])
         p, by_t = secant.push_by_end(plane.w / width, y / width, plan.contact_damping, self.fp)
@@ -129,25 +130,29 @@ class ContactStage(ObstacleStages):
         return now.alpha > 0 and scene.surface[i] > 0 and ratio > 0
 
     @ti.func
-    def way(self, i, v_plus, lead, now: A, scene: A):
-        """The way without obstacles; lead: that in directions in which the vertex is held."""
-        return self.may(i, now.alpha * v_plus, scene) + lead if ti.static(self.features.guided) else now.alpha * v_plus
+    def free_displacement(self, i, v_plus, lead, now: A, scene: A):
+        """The displacement without obstacles; lead: that in directions in which the vertex is held."""
+        return (
+            self.may(i, now.alpha * v_plus, scene) + lead
+            if ti.static(self.features.partly_fixed)
+            else now.alpha * v_plus
+        )
 
     @ti.func
     def advance(self, i, u, v_plus, lead, now: A, scene: A, state: A, plan: A):
         """(u', v') for the velocity v+ after the kick; what is held of them is left to the caller."""
         v, delta, ratio = v_plus, self.vector(0), now.h * scene.inverse_mass[i]
-        free = self.way(i, v_plus, lead, now, scene)
+        free = self.free_displacement(i, v_plus, lead, now, scene)
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * self.blend(plan) * ratio
                 z, total, _, _ = self.solve(i, lead, free, a, now, scene, state, plan)
-                delta, v = ratio * total, self.friction.rubbed(i, v_plus, z, ratio, now, scene, state)
+                delta, v = ratio * total, self.friction.after_friction(i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.recorded):
                     note_impulses(self.friction, i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.moving > 0):
                     add_work(self, i, work_of_stage(self.friction, i, v_plus, now, scene, state), state, plan)
-                if ti.static(self.features.guided and self.features.motion):
+                if ti.static(self.features.partly_fixed and self.features.motion):
                     add_work(self, i, work_of_lead(self, i, lead, state), state, plan)
         pressed = self.blend(plan) * delta
         return u + now.alpha * (v + pressed), now.decay * v + delta - (1 - now.decay) * pressed
@@ -161,7 +166,7 @@ class ContactStage(ObstacleStages):
         """Changes of u' and v'; moved: u' - u, where the move is looked for."""
         v, dv, delta, ddelta = v_plus, dv_plus, self.vector(0), self.vector(0)
         inverse = scene.inverse_mass[i]
-        ratio, blend, free = now.h * inverse, self.blend(plan), self.way(i, v_plus, lead, now, scene)
+        ratio, blend, free = now.h * inverse, self.blend(plan), self.free_displacement(i, v_plus, lead, now, scene)
         dalpha = now.alpha_by_rate * plan.rate_dot
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
@@ -172,12 +177,12 @@ class ContactStage(ObstacleStages):
                 b += blend * (dalpha * ratio + now.alpha * dratio) * total
                 dz = stage.solve_linear(self.features.num_staged, a, xyz, mixed, b + a * dtotal)
                 dtotal += self.add_change(i, dz, scene, state)
-                if ti.static(self.features.guided):
+                if ti.static(self.features.partly_fixed):
                     dz += dlead
                 delta, ddelta = ratio * total, dratio * total + ratio * dtotal
                 if ti.static(self.features.recorded):
                     note_pushes_jvp(self, i, now, state, tangent)
-                v, dv = self.friction.rubbed_jvp(
+                v, dv = self.friction.after_friction_jvp(
                     i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now, scene, state, tangent
                 )
         w, dw = v + blend * delta, dv + blend * ddelta
@@ -195,9 +200,9 @@ class ContactStage(ObstacleStages):
                 row, first = ROWS * (g.number + k), g.first + k * g.size
                 X = self.seen_now(g, k, scene.rest[i], now, scene)
                 moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
-                dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
-                own, dmove = z - now.h * state.stage[row + WALL, i], -now.h * dwall
-                if ti.static(self.features.guided):
+                dv_obstacle = self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                own, dmove = z - now.h * state.stage[row + WALL, i], -now.h * dv_obstacle
+                if ti.static(self.features.partly_fixed):
                     dmove += dlead
                 change = stage.push_jvp(
                     g.force, scene.parameters, first, X, u, own, plan.contact_damping, tangent.parameters, moved, dmove
@@ -232,7 +237,8 @@ class ContactStage(ObstacleStages):
 
         moved: u' - u, where the move is looked for. p and q have nothing in directions in which vertex i is held.
         """
-        free, w, u_adj, lead_adj = self.way(i, v_plus, lead, now, scene), v_plus, self.vector(0), self.vector(0)
+        free, w = self.free_displacement(i, v_plus, lead, now, scene), v_plus
+        u_adj, lead_adj = self.vector(0), self.vector(0)
         inverse, blend = scene.inverse_mass[i], self.blend(plan)
         ratio, w_adj = now.h * inverse, now.alpha * p - (1 - now.decay) * q
         v_adj, by_alpha = now.alpha * p + now.decay * q, p.dot(v_plus)
@@ -240,7 +246,7 @@ class ContactStage(ObstacleStages):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * blend * ratio
                 z, total, xyz, mixed = self.solve(i, moved, free, a, now, scene, state, plan)
-                w = self.friction.rubbed(i, v_plus, z, ratio, now, scene, state) + blend * ratio * total
+                w = self.friction.after_friction(i, v_plus, z, ratio, now, scene, state) + blend * ratio * total
                 delta_adj = q + blend * w_adj
                 by_alpha, by_ratio = p.dot(w), delta_adj.dot(total)
                 self.seed_all(i, ratio * delta_adj, state)
@@ -248,7 +254,7 @@ class ContactStage(ObstacleStages):
                     seed_impulses(self, i, now, state, adjoint)
                 by_z = self.vector(0)
                 if ti.static(len(self.features.staged_rough) > 0):
-                    v_adj, more, of_z, of_alpha, of_u = self.friction.rubbed_vjp(
+                    v_adj, more, of_z, of_alpha, of_u = self.friction.after_friction_vjp(
                         i, u, v_plus, v_adj, z, ratio, now, scene, state, adjoint
                     )
                     by_ratio += more
@@ -262,8 +268,8 @@ class ContactStage(ObstacleStages):
                 by_ratio += blend * now.alpha * z_adj.dot(total)
                 by_u, by_lead = self.push_all_vjp(i, u, z, a * z_adj, now, scene, state, adjoint, plan)
                 u_adj += by_u
-                if ti.static(self.features.guided):
-                    lead_adj = self.guides.held(i, by_lead + by_z, scene)
+                if ti.static(self.features.partly_fixed):
+                    lead_adj = self.sliding_supports.held(i, by_lead + by_z, scene)
                 if ti.static(self.features.density):
                     row = ti.static(self.features.sums().first("mass"))
                     adjoint.sums[row, i] = adjoint.sums[row, i] - ratio * inverse * by_ratio
@@ -303,7 +309,7 @@ class ContactStage(ObstacleStages):
                 row, first = ROWS * (g.number + k), g.first + k * g.size
                 pushed, seed = state.stage[row + PUSH, i], state.stage[row + SEED, i]
                 X = self.seen_now(g, k, scene.rest[i], now, scene)
-                own = z - now.h * self.wall(g, k, X, u, now, scene)
+                own = z - now.h * self.v_obstacle(g, k, X, u, now, scene)
                 by_n = self.normal(seed) + pushed.x * total_adj
                 by_push = seed.w + self.normal(state.stage[row + PLANE, i]).dot(total_adj)
                 if ti.static(g.force.per_area):
@@ -314,14 +320,14 @@ class ContactStage(ObstacleStages):
                 )
                 for m in ti.static(range(g.force.index.width + 1)):
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
-                by_wall = -now.h * by_own
+                by_v_obstacle = -now.h * by_own
                 move_adj += by_own
                 if ti.static(g.force.friction):
                     at_mu, at_eps = first + g.force.index.friction, first + g.force.index.friction_speed
                     adjoint.sums[at_mu, i] = adjoint.sums[at_mu, i] + pushed.z
                     adjoint.sums[at_eps, i] = adjoint.sums[at_eps, i] + pushed.w
-                    by_wall += state.stage[row + WALL, i]
-                by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
+                    by_v_obstacle += state.stage[row + WALL, i]
+                by_u = self.spread(g, k, i, X, u, by_place, by_v_obstacle, now, scene, adjoint, adjoint)
                 u_adj += by_u
                 self.add_to_rest(i, by_u, adjoint)
         return u_adj, move_adj

@@ -27,8 +27,8 @@ class CurvedPoints(ObstacleFunctions):
     @ti.func
     def around_curved(self, what: A, g: A, k, i, scene: A, pass_: A, at: A, more: A):
         out, first, n = self.vector(0), g.first + k * g.size, g.number + k
-        wall, width, q = pass_.walls[3 * n], g.force.width(scene.parameters, first), self.turn_of(g, k, pass_)
-        X0, u0 = self.made(g, first, q, scene.rest[i] - wall, at.u[0, i], scene)
+        v_obstacle, width, q = pass_.poses[3 * n], g.force.width(scene.parameters, first), self.turn_of(g, k, pass_)
+        X0, u0 = self.made(g, first, q, scene.rest[i] - v_obstacle, at.u[0, i], scene)
         own = g.force.clearance(scene.parameters, first, X0, u0)[3]
         for c in range(pass_.face_start[i], pass_.face_start[i + 1]):
             row, most, six = c * ti.static(self.num_obstacles) + n, ti.cast(0, self.fp), ti.Vector([0] * 6)
@@ -36,7 +36,7 @@ class CurvedPoints(ObstacleFunctions):
             X, u, w = self.rows(0), self.rows(0), self.rows(0)
             for a in ti.static(range(6)):
                 six[a] = pass_.face_next[8 * c + a]
-                x, y = self.made(g, first, q, scene.rest[six[a]] - wall, at.u[0, six[a]], scene)
+                x, y = self.made(g, first, q, scene.rest[six[a]] - v_obstacle, at.u[0, six[a]], scene)
                 z = self.change_of(what, g, k, six[a], at, pass_, scene, more)
                 if ti.static(what == "column"):
                     z = self.moved_alone(more, a == spot)
@@ -83,7 +83,7 @@ class CurvedPoints(ObstacleFunctions):
         elif ti.static(g.force.convex):  # which is never nearer than the tangent plane at the middle says
             W = self.node_weights(ti.Vector([one, one, one]), inner)
             Xm, um, out = self.mix(W, X), self.mix(W, u), ti.cast(0, self.fp)
-            middle = g.force.outlook(scene.parameters, first, Xm, um)
+            middle = g.force.contact_plane(scene.parameters, first, Xm, um)
             for a in ti.static(range(3)):
                 along = ti.cast(0, self.fp)
                 for m in ti.static(range(3)):
@@ -129,7 +129,7 @@ class CurvedPoints(ObstacleFunctions):
                             if ti.static(a < 3):
                                 of_corner = ti.select(spot == a, s[a], of_corner)
                         Xs, us = self.mix(W, X), self.mix(W, u)
-                        now = g.force.outlook(scene.parameters, first, Xs, us)
+                        now = g.force.contact_plane(scene.parameters, first, Xs, us)
                         ahead, _ = self.passed(g, now[3], width + reach, step, parts)
                         onwards = y + 1 + ahead
                         sigma = (now[3] - reach) / width
@@ -161,7 +161,7 @@ class CurvedPoints(ObstacleFunctions):
                                 push = self.besides(g, Fs, Ft)
                                 f, by_now = scale * (push * along + Ft * across), scale * push * own * wi
                                 by_now[3] = self.besides(g, by_s, by_t) / width
-                                g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
+                                g.force.contact_plane_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
                                 for a in ti.static(range(3)):
                                     of_a = ti.select(spot == a, scale * Ft * s[a], ti.cast(0, self.fp))
                                     for m in ti.static(range(3)):

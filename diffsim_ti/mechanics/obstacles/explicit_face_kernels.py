@@ -1,16 +1,18 @@
-"""Contact of points within faces as a stage of explicit passes: what they feel on the way that a pass has found.
+"""Contact of points within faces as a stage of explicit passes: their forces along the displacement that a pass has found.
 
 A pass leads a surface vertex of mass m from u0 to u1. Barriers of points are stiffer than it can follow, and narrower than
 it is long, so that the way is gone again in n equal parts of length d = h / n, with their forces f (face_forces.py):
 
     u  = u0 + (k + 1/2) / n (u1 - u0) + e + d v / 2        where forces of part k are taken
-    v' = v + d f(u) / m,    e' = e + d (v + v') / 2,       from v = e = 0; at the end e (face_walls.py) and v are added
+    v' = v + d f(u) / m,    e' = e + d (v + v') / 2,       from v = e = 0; at the end e (limited_face_contact.py) and v
+    are added
 
-It is leapfrog in the moving frame of the pass, and keeps the energy as that does. n is a power of two (felt_faces.py): in a
-part no face goes farther than a share of the width, and d^2 D / m is at most LOAD at each vertex. D, which comes with f, is
-no less than the stiffness of the points around it. The step of the body need not know of this stiffness. Where more parts
-would be needed than there may be, a part takes of f what it can follow, f / max(1, d^2 D / m), and a warning says so.
-Tuckerman, Berne, Martyna 1992, Reversible multiple time scale molecular dynamics, doi:10.1063/1.463137.
+It is leapfrog in the moving frame of the pass, and keeps the energy as that does. n is a power of two
+(face_contact_points.py): in a part no face goes farther than a share of the width, and d^2 D / m is at most LOAD at
+each vertex. D, which comes with f, is no less than the stiffness of the points around it. The step of the body need not
+know of this stiffness. Where more parts would be needed than there may be, a part takes of f what it can follow, f /
+max(1, d^2 D / m), and a warning says so. Tuckerman, Berne, Martyna 1992, Reversible multiple time scale molecular
+dynamics, doi:10.1063/1.463137.
 """
 
 from dataclasses import dataclass
@@ -19,8 +21,8 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.face_lattice import FLAT
-from diffsim_ti.mechanics.obstacles.face_walls import FaceWalls
-from diffsim_ti.mechanics.supports.guides import GUIDED
+from diffsim_ti.mechanics.obstacles.limited_face_contact import LimitedFaceContact
+from diffsim_ti.mechanics.supports.sliding_supports import SLIDING_SUPPORTS
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, needed
@@ -40,14 +42,14 @@ NUMBERS |= dict(n="int", k="int", h="float")
 
 
 @dataclass(frozen=True)
-class FaceKernels(FaceWalls):
+class FaceKernels(LimitedFaceContact):
     """Of all faces; u[slot] of a state is where the pass ends, faces.begin[0] where it begins."""
 
     parallel: bool
 
     def _kernel(self, name: str, body, more=(), **arrays) -> Kernel:
         own = dict(
-            scene=needed(SCENE, self.features) | (GUIDED if self.features.guided else {}),
+            scene=needed(SCENE, self.features) | (SLIDING_SUPPORTS if self.features.partly_fixed else {}),
             faces=FACES | (PUSHED if self.rough else {}),
             state=dict(u="vectors2", v="vectors2"),
             table=dict(ints="ints", floats="scalars"),
@@ -86,7 +88,7 @@ class FaceKernels(FaceWalls):
             out = self.arch(X + u, self.inner(f))
         elif ti.static(g.force.convex):
             Xm, um = self.middle_of(f, X), self.middle_of(f, u)
-            middle, out = g.force.outlook(scene.parameters, first, Xm, um), self.arch(X + u, self.inner(f))
+            middle, out = g.force.contact_plane(scene.parameters, first, Xm, um), self.arch(X + u, self.inner(f))
             for a in range(3):
                 Xa, ua = self.row_of(X, a), self.row_of(u, a)
                 edge = (Xa - Xm) + (ua - um)
@@ -170,7 +172,7 @@ class FaceKernels(FaceWalls):
                 if ti.static(g.force.turns):
                     for a in ti.static(range(self.nodes)):
                         x, i = self.row_of(u, a), faces.corners[self.nodes * f + a]
-                        speed = self.wall(g, k, self.seen(g, scene.rest[i], place), x, now, scene)
+                        speed = self.v_obstacle(g, k, self.seen(g, scene.rest[i], place), x, now, scene)
                         faces.done[f] = faces.done[f] + length * self.dot3(self.row_of(rows, a), speed)
                 elif ti.static(g.path >= 0):
                     speed = self.speed(g, k, now, scene.path)
@@ -208,7 +210,7 @@ class FaceKernels(FaceWalls):
 
     @cached_property
     def forces(self) -> Kernel:
-        """What faces feel at u[slot], between passes."""
+        """Contact forces of faces at u[slot], between passes."""
         return self._kernel("forces", self.all_forces)
 
     # ---- the parts of a pass -----------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ class FaceContact:
     """What points within faces add to a potential, at its displacement."""
 
     @staticmethod
-    def is_felt(arrays) -> bool:
+    def is_active(arrays) -> bool:
         """Whether the scene has obstacles that could reach into a face between its corners."""
         return any(arrays.features().reaches(group) for group in arrays.features().groups)
 
@@ -39,7 +39,7 @@ class FaceContact:
 
     def bind(self, kernel, **records):
         """A kernel of faces.py at the potential's displacement, with more arrays than its own; returns y, a copy."""
-        own = dict(scene=self.a, pass_=(SimpleNamespace(walls=self.p.walls), self), out=self._out)
+        own = dict(scene=self.a, pass_=(SimpleNamespace(poses=self.p.poses), self), out=self._out)
         launch = kernel.bind(**own | dict(at=SimpleNamespace(u=self.p.u, w=self.p.w)) | records)
 
         def run() -> np.ndarray:
@@ -58,10 +58,10 @@ class FaceContact:
         self._run("energy")
         return runtime.fetch(self._out.contact).astype(np.float64)
 
-    def energies_at(self, u, walls) -> np.ndarray:
-        """The same of displacements u[0], obstacles being at `walls` (obstacles.py), arrays on the device."""
-        at, place = SimpleNamespace(u=u, w=self.p.w), (SimpleNamespace(walls=walls), self)
-        key = "energy", id(u), id(walls)  # which the launch keeps
+    def energies_at(self, u, poses) -> np.ndarray:
+        """The same of displacements u[0], obstacles being at `poses` (obstacles.py), arrays on the device."""
+        at, place = SimpleNamespace(u=u, w=self.p.w), (SimpleNamespace(poses=poses), self)
+        key = "energy", id(u), id(poses)  # which the launch keeps
         if key not in self._launches:
             self._launches[key] = self.bind(self.kernels.energy, at=at, pass_=place)
         self._launches[key]()

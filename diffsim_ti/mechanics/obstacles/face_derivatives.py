@@ -15,7 +15,7 @@ A = ti.template()
 # of surface vertices: changes, or adjoints, of e and v; what a part is given; those of u0
 OWN = dict.fromkeys(("shift_dot", "speed_dot", "seed", "begin_dot"), "vectors")
 RUBBED = dict(impulse_dot="vectors")  # changes, or adjoints, of what rough obstacles push the nodes of each face with
-OF_FACES = dict(sums="scalars2", felt="vectors2", path="vectors2", rest_adj="vectors", by_areas="scalars")
+OF_FACES = dict(sums="scalars2", path_adjoint="vectors2", path="vectors2", rest_adj="vectors", by_areas="scalars")
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class FaceDerivatives(FaceKernels):
             for g in ti.static(self.groups):
                 for o in range(g.count):
                     felt = w
-                    if ti.static(g.force.friction):  # the impulses are felt by friction, too
+                    if ti.static(g.force.friction):  # friction depends on the impulses, too
                         for a in ti.static(range(self.nodes)):
                             by = self.part_length(now, plan) * own.impulse_dot[self.pushed_row(f, g.number + o, a)]
                             for m in ti.static(range(3)):

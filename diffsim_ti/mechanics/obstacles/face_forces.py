@@ -58,7 +58,7 @@ class FaceForces(FaceRows):
         middle, size = g.force.clearance(scene.parameters, first, Xm, um), self.size_of_rows(f, around)
         least = middle[3] - size - reach
         if least < width:
-            least = ti.cast(1e30, self.fp)  # unless points are told apart, corners speak for them
+            least = ti.cast(1e30, self.fp)  # unless points are told apart, corners stand for them
             corners, turns = self.rows(0), self.rows(0)  # (normal, distance) there, and its change
             bent = ti.cast(1e30, self.fp)
             for a in range(3):
@@ -103,7 +103,7 @@ class FaceForces(FaceRows):
                     s = ti.Vector([1 - s1 - s2, s1, s2])
                     N = self.node_weights(s, self.inner(f))
                     Xs, us = self.mix(N, X), self.mix(N, u)
-                    now = g.force.outlook(scene.parameters, first, Xs, us)
+                    now = g.force.contact_plane(scene.parameters, first, Xs, us)
                     ahead, far = self.passed(g, now[3], width + reach, step, parts)
                     least = ti.min(least, ti.min(far, now[3]) - reach)
                     onwards = y + 1 + ahead
@@ -262,7 +262,7 @@ class FaceForces(FaceRows):
         by_t = scale * (self.besides(g, Fst, Ftt) * along + Ftt * across)
         of_force, by_now = scale * (push * along + Ft * across), scale * push * mixed
         by_now[3] = self.besides(g, by_s, by_t) / width
-        g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, out.sums, f)
+        g.force.contact_plane_vjp(scene.parameters, first, Xs, us, by_now, out.sums, f)
         for a in ti.static(range(3)):
             for m in ti.static(range(3)):
                 by[a, m] = scale * Ft * s[a] * w[a, m]

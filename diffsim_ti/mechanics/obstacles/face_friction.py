@@ -6,8 +6,9 @@ velocity at sum w_a x_a, x the places where the pass began. Friction gives the n
 
     r = -L f(s / eps) t / |t|,  L = mu |P|,    s + c f(s / eps) = |t|,  c = sum_a |w_a| S_a / m_a,  S_i = sum |w_a| L
 
-the last sum over all that rubs on vertex i; f(y) = 2 y - y^2 for y < 1, 1 beyond. It is the stage of surfaces that rub on
-each other, and takes energy as that does, as the obstacles see it, whatever the step (surfaces/friction_kernels.py).
+the last sum over all that slides on vertex i; f(y) = 2 y - y^2 for y < 1, 1 beyond. It is the stage of surfaces that
+slide on each other, and takes energy as that does, as the obstacles see it, whatever the step
+(surfaces/friction_kernels.py).
 """
 
 from dataclasses import dataclass
@@ -16,19 +17,19 @@ from types import SimpleNamespace
 import numpy as np
 
 from diffsim_ti.common import rotations
-from diffsim_ti.state.walls import Moment
+from diffsim_ti.state.obstacle_poses import Moment
 from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
 
 TINY = 1e-300
 
 
 @dataclass
-class Rubbing:
-    """What rubs in a pass, rows for each face and obstacle; `gained` is what vertices gain of it [m/s]."""
+class FaceFrictionPass:
+    """Friction in a pass, rows for each face and obstacle; `gained` is what vertices gain of it [m/s]."""
 
     now: SimpleNamespace  # numbers of the pass
     moment: Moment
-    walls: np.ndarray
+    poses: np.ndarray
     face: np.ndarray
     obstacle: np.ndarray
     corners: np.ndarray  # places among the surface's vertices, (k, nodes)
@@ -39,7 +40,7 @@ class Rubbing:
 
     @property
     def ratio(self) -> float:
-        """The way by a change of velocity after a pass."""
+        """The displacement by a change of velocity after a pass."""
         return self.now.alpha / self.now.decay
 
 
@@ -65,16 +66,16 @@ class FaceFriction:
     def __bool__(self) -> bool:
         return bool(self.obstacles)
 
-    def begin(self, impulses, v, x, corners, j: int, num_passes: int) -> Rubbing | None:
-        """What rubs after pass j, None if nothing does; impulses [N s]: (faces, obstacles, nodes, 3)."""
+    def begin(self, impulses, v, x, corners, j: int, num_passes: int) -> FaceFrictionPass | None:
+        """Friction after pass j, None if there is none; impulses [N s]: (faces, obstacles, nodes, 3)."""
         now, schedule = self.ws.numbers_of(j, num_passes), self.ws.solver.schedule
         own = impulses[:, self.number]
         face, which = np.nonzero(np.linalg.norm(own.sum(2), axis=-1) > TINY)
         if not len(face) or not now.alpha > 0 or not np.all(np.isfinite(own)):
             return None
         moment = Moment(schedule, j, schedule.begin(j), schedule.begin(j))
-        walls = self.a.walls.value(self.a.rows["path"], moment)
-        return Rubbing(now, moment, walls, face, which, corners[face], own[face, which], v, x)
+        poses = self.a.poses.value(self.a.rows["path"], moment)
+        return FaceFrictionPass(now, moment, poses, face, which, corners[face], own[face, which], v, x)
 
     # ---- parts of the formula ----------------------------------------------------------------------------------------
 
@@ -86,56 +87,56 @@ class FaceFriction:
         """What vertices may do of vectors."""
         return np.einsum("nij,nj->ni", self.free, x)
 
-    def _gather(self, rub: Rubbing, at_nodes: np.ndarray) -> np.ndarray:
+    def _gather(self, rub: FaceFrictionPass, at_nodes: np.ndarray) -> np.ndarray:
         """Sums for the surface's vertices."""
         out = np.zeros((len(self.surface), *at_nodes.shape[2:]))
         np.add.at(out, rub.corners, at_nodes)
         return out
 
-    def _turning(self, rub: Rubbing, y: np.ndarray):
+    def _turning(self, rub: FaceFrictionPass, y: np.ndarray):
         """Of each obstacle (its place here, its own rows, first row of its pose or None, arms r, J, R r), R the turn in the
         pass and J its Jacobian by the angular velocity, per length of the pass."""
         for k, o in enumerate(self.number):
             own = np.flatnonzero(rub.obstacle == k)
-            if o not in self.a.walls.place_of:
+            if o not in self.a.poses.place_of:
                 yield k, own, None, None, None, None
                 continue
-            pose, h = 3 * self.a.walls.place_of[o], rub.now.h
-            turn = h * rub.walls[pose + 2]
-            r = y[own] - self.a.origin - rub.walls[3 * o] - self.a.values.parameters[self._about(k)]
+            pose, h = 3 * self.a.poses.place_of[o], rub.now.h
+            turn = h * rub.poses[pose + 2]
+            r = y[own] - self.a.origin - rub.poses[3 * o] - self.a.values.parameters[self._about(k)]
             yield k, own, pose, r, rotations.left_jacobian(turn), rotations.turned(rotations.quaternion(turn), r)
 
-    def _wall(self, rub: Rubbing, y: np.ndarray) -> np.ndarray:
+    def _obstacle_velocity(self, rub: FaceFrictionPass, y: np.ndarray) -> np.ndarray:
         """Velocity of the obstacles at points y, on the chord of the pass (turned.py)."""
-        out = rub.walls[3 * self.number[rub.obstacle] + 2]
+        out = rub.poses[3 * self.number[rub.obstacle] + 2]
         for _, own, pose, r, _, turned in self._turning(rub, y):
             if pose is not None:
                 out[own] += (turned - r) / rub.now.h
         return out
 
-    def _wall_jvp(self, rub: Rubbing, y, dy, dwalls, parameters_dot) -> np.ndarray:
-        out = dwalls[3 * self.number[rub.obstacle] + 2]
+    def _obstacle_velocity_jvp(self, rub: FaceFrictionPass, y, dy, dposes, parameters_dot) -> np.ndarray:
+        out = dposes[3 * self.number[rub.obstacle] + 2]
         for k, own, pose, _, J, turned in self._turning(rub, y):
             if pose is not None:
-                dr = dy[own] - dwalls[3 * self.number[k]] - parameters_dot[self._about(k)]
-                turn = rotations.quaternion(rub.now.h * rub.walls[pose + 2])
-                out[own] += (rotations.turned(turn, dr) - dr) / rub.now.h + np.cross(J @ dwalls[pose + 2], turned)
+                dr = dy[own] - dposes[3 * self.number[k]] - parameters_dot[self._about(k)]
+                turn = rotations.quaternion(rub.now.h * rub.poses[pose + 2])
+                out[own] += (rotations.turned(turn, dr) - dr) / rub.now.h + np.cross(J @ dposes[pose + 2], turned)
         return out
 
-    def _wall_vjp(self, rub: Rubbing, y, by, walls_adj, parameters_adj) -> np.ndarray:
-        """Adjoint of y for that of the velocities; adds those of the walls and of points that they turn about."""
+    def _obstacle_velocity_vjp(self, rub: FaceFrictionPass, y, by, poses_adj, parameters_adj) -> np.ndarray:
+        """Adjoint of y for that of the velocities; adds those of the obstacle poses and of points that they turn about."""
         out = np.zeros_like(y)
         for k, own, pose, _, J, turned in self._turning(rub, y):
-            walls_adj[3 * self.number[k] + 2] += by[own].sum(0)
+            poses_adj[3 * self.number[k] + 2] += by[own].sum(0)
             if pose is not None:
-                back = rotations.quaternion(-rub.now.h * rub.walls[pose + 2])
+                back = rotations.quaternion(-rub.now.h * rub.poses[pose + 2])
                 out[own] = (rotations.turned(back, by[own]) - by[own]) / rub.now.h
-                walls_adj[pose + 2] += J.T @ np.cross(turned, by[own]).sum(0)
-                walls_adj[3 * self.number[k]] -= out[own].sum(0)
+                poses_adj[pose + 2] += J.T @ np.cross(turned, by[own]).sum(0)
+                poses_adj[3 * self.number[k]] -= out[own].sum(0)
                 parameters_adj[self._about(k)] -= out[own].sum(0)
         return out
 
-    def _known(self, rub: Rubbing) -> SimpleNamespace:
+    def _known(self, rub: FaceFrictionPass) -> SimpleNamespace:
         """All that the formula names."""
         p, I = self.a.values.parameters, rub.impulses
         mu, eps = p[self.at_mu][rub.obstacle], p[self.at_eps][rub.obstacle]
@@ -145,8 +146,8 @@ class FaceFriction:
         w = np.einsum("kad,kd->ka", I, n) / size[:, None]
         v, x = rub.v[rub.corners], rub.x[rub.corners]
         at = np.einsum("ka,kad->kd", w, x)
-        wall = self._wall(rub, at)
-        relative = np.einsum("ka,kad->kd", w, v) - wall
+        v_obstacle = self._obstacle_velocity(rub, at)
+        relative = np.einsum("ka,kad->kd", w, v) - v_obstacle
         t = relative - n * _dot(n, relative)
         speed, L, inverse = np.linalg.norm(t, axis=1), mu * size, self.inverse
         S = self._gather(rub, (np.abs(w) * L[:, None])[..., None])
@@ -155,32 +156,34 @@ class FaceFriction:
         kappa, f, y, B = slip(speed, c, eps, TINY, ARRAYS)
         r = -(L * kappa)[:, None] * t
         of_push = dict(mu=mu, size=size, n=n, w=w, L=L, at=at)
-        of_motion = dict(v=v, x=x, wall=wall, relative=relative, t=t, speed=speed)
+        of_motion = dict(v=v, x=x, v_obstacle=v_obstacle, relative=relative, t=t, speed=speed)
         of_law = dict(S=S, inverse=inverse, lightness=lightness, kappa=kappa, f=f, y=y, B=B, r=r)
         return SimpleNamespace(**of_push, **of_motion, **of_law)
 
-    def slide(self, rub: Rubbing) -> float:
+    def slide(self, rub: FaceFrictionPass) -> float:
         """Find what vertices gain; returns the work of moving obstacles on the body [J]."""
         k = self._known(rub)
         rub.gained = k.inverse * self.freed(self._gather(rub, k.w[:, :, None] * k.r[:, None]))
-        return float((k.r * k.wall).sum())
+        return float((k.r * k.v_obstacle).sum())
 
-    def impulses(self, rub: Rubbing) -> np.ndarray:
+    def impulses(self, rub: FaceFrictionPass) -> np.ndarray:
         """Of each rough obstacle on each surface vertex [N s], shape (obstacles, surface, 3)."""
         k = self._known(rub)
         return self._of_obstacles(rub, k.w[:, :, None] * k.r[:, None])
 
-    def _of_obstacles(self, rub: Rubbing, at_nodes: np.ndarray) -> np.ndarray:
+    def _of_obstacles(self, rub: FaceFrictionPass, at_nodes: np.ndarray) -> np.ndarray:
         out = np.zeros((len(self.number), len(self.surface), 3))
         np.add.at(out, (rub.obstacle[:, None], rub.corners), at_nodes)
         return out
 
     # ---- derivatives -------------------------------------------------------------------------------------------------
 
-    def jvp(self, rub: Rubbing, dI, dv, dx, inverse_dot, parameters_dot, dwalls) -> tuple[np.ndarray, np.ndarray]:
+    def jvp(
+        self, rub: FaceFrictionPass, dI, dv, dx, inverse_dot, parameters_dot, dposes
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(change of what vertices gain, of the impulses of each obstacle) for changes of everything.
 
-        dI: (faces, obstacles, nodes, 3); dv, dx, inverse_dot: of the surface's vertices; dwalls: rows as walls are.
+        dI: (faces, obstacles, nodes, 3); dv, dx, inverse_dot: of the surface's vertices; dwalls: rows as poses are.
         """
         k = self._known(rub)
         dI = dI[:, self.number][rub.face, rub.obstacle]
@@ -191,8 +194,8 @@ class FaceFriction:
         along = np.einsum("kad,kd->ka", dI, k.n) + np.einsum("kad,kd->ka", rub.impulses, dn)
         dw = (along - k.w * d_size[:, None]) / k.size[:, None]
         dy = np.einsum("ka,kad->kd", dw, k.x) + np.einsum("ka,kad->kd", k.w, dx[rub.corners])
-        d_wall = self._wall_jvp(rub, k.at, dy, dwalls, parameters_dot)
-        d_relative = np.einsum("ka,kad->kd", dw, k.v) + np.einsum("ka,kad->kd", k.w, dv[rub.corners]) - d_wall
+        dv_obstacle = self._obstacle_velocity_jvp(rub, k.at, dy, dposes, parameters_dot)
+        d_relative = np.einsum("ka,kad->kd", dw, k.v) + np.einsum("ka,kad->kd", k.w, dv[rub.corners]) - dv_obstacle
         dt = d_relative - k.n * _dot(k.n, d_relative) - dn * _dot(k.n, k.relative) - k.n * _dot(dn, k.relative)
         dL, sign = d_mu * k.size + k.mu * d_size, np.sign(k.w)
         dS = self._gather(rub, (sign * dw * k.L[:, None] + np.abs(k.w) * dL[:, None])[..., None])
@@ -209,7 +212,7 @@ class FaceFriction:
         change = k.inverse * self.freed(self._gather(rub, at_nodes)) + inverse_dot * self.freed(pushed)
         return change, self._of_obstacles(rub, at_nodes)
 
-    def vjp(self, rub: Rubbing, gained_adj: np.ndarray, impulses_adj: np.ndarray | None) -> SimpleNamespace:
+    def vjp(self, rub: FaceFrictionPass, gained_adj: np.ndarray, impulses_adj: np.ndarray | None) -> SimpleNamespace:
         """Adjoints, by name, for that of what vertices gain and of the impulses of each obstacle: impulses (faces rows as
         `rub` has them), v, x and inverse of the surface's vertices, parameters, walls."""
         k, N = self._known(rub), np.abs
@@ -239,8 +242,8 @@ class FaceFriction:
         n_adj = -t_adj * _dot(k.n, k.relative) - k.relative * _dot(k.n, t_adj)
         w_adj += np.einsum("kad,kd->ka", k.v, relative_adj)
         v_adj = self._gather(rub, k.w[:, :, None] * relative_adj[:, None])
-        walls_adj, parameters = np.zeros_like(rub.walls), np.zeros_like(self.a.values.parameters)
-        y_adj = self._wall_vjp(rub, k.at, -relative_adj, walls_adj, parameters)
+        poses_adj, parameters = np.zeros_like(rub.poses), np.zeros_like(self.a.values.parameters)
+        y_adj = self._obstacle_velocity_vjp(rub, k.at, -relative_adj, poses_adj, parameters)
         w_adj += np.einsum("kad,kd->ka", k.x, y_adj)
         x_adj = self._gather(rub, k.w[:, :, None] * y_adj[:, None])
         # w = I . n / |P|
@@ -257,7 +260,7 @@ class FaceFriction:
             x=x_adj,
             inverse=by_inverse,
             parameters=parameters,
-            walls=walls_adj,
+            poses=poses_adj,
         )
 
 

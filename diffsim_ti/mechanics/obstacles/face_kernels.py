@@ -12,7 +12,7 @@ from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed
 
 A = ti.template()
 PASS = dict(
-    walls="vectors", face_start="ints", face_next="ints", face_parts="ints", face_reach="scalars", face_weight="scalars"
+    poses="vectors", face_start="ints", face_next="ints", face_parts="ints", face_reach="scalars", face_weight="scalars"
 )
 
 
@@ -79,7 +79,7 @@ class FaceKernels(FacePoints):
     @cached_property
     def jvp(self) -> Kernel:
         """Change y of the forces for changes w of the displacement and of everything else that they depend on."""
-        own = dict(out=dict(y="vectors2"), tangent=TANGENT | dict(walls="vectors"))
+        own = dict(out=dict(y="vectors2"), tangent=TANGENT | dict(poses="vectors"))
         return self._kernel("face_jvp", self.all_jvp, **own)
 
     @ti.func
@@ -98,7 +98,7 @@ class FaceKernels(FacePoints):
     @cached_property
     def vjp(self) -> Kernel:
         """y = df/du w; adds the adjoints of all else that forces depend on."""
-        own = dict(out=dict(y="vectors2"), adjoint=ADJOINT | dict(walls="vectors2", face_areas="scalars"))
+        own = dict(out=dict(y="vectors2"), adjoint=ADJOINT | dict(poses="vectors2", face_areas="scalars"))
         return self._kernel("face_vjp", self.all_vjp, **own)
 
 

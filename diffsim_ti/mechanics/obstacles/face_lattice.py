@@ -1,13 +1,13 @@
-"""Where the points within a face lie that feel an obstacle, and how their part in it fades in (faces.py)."""
+"""Where the points within a face lie in contact with an obstacle, and how their part in it fades in (faces.py)."""
 
 import numpy as np
 import taichi as ti
 
 from diffsim_ti.mesh import geometry
-from diffsim_ti.mesh.curved_triangles import FELT, arches, nodes_of_triangles
+from diffsim_ti.mesh.curved_triangles import NOTABLE, arches, nodes_of_triangles
 from diffsim_ti.terms.obstacles import barrier
 
-FLAT, BENT, GROWTH = FELT, 0.12, 8
+FLAT, BENT, GROWTH = NOTABLE, 0.12, 8
 PER_WIDTH, MOST_PARTS = 4, 64  # lattice points along a width; along the side of a face, if half of PER_WIDTH are there
 FINEST = 1024  # lattice points along the side of a face, at most
 SMOOTH = 0.05  # of a width: how far a curved face is from the triangles of its lattice, before what is smooth
@@ -155,7 +155,7 @@ def lattices(arrays) -> tuple[np.ndarray, ...]:
     widths = np.array([float(t.values["barrier_width"]) for t in arrays.contacts])
     along = PER_WIDTH * longest[:, None] / widths
     parts = np.clip(np.ceil(along), 2, np.clip(np.ceil(along / 2), MOST_PARTS, FINEST)).astype(int)
-    smooth = np.array([arrays.curved and twin.hollow for twin, *_ in arrays.obstacles], bool)
+    smooth = np.array([arrays.curved and counterpart.hollow for counterpart, *_ in arrays.obstacles], bool)
     if smooth.any():
         fewest = np.ceil(np.sqrt(np.maximum(arches(mesh), arrays.bend)[:, None] / (SMOOTH * widths[smooth]))).astype(
             int

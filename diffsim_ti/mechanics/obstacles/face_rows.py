@@ -5,19 +5,19 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.face_lattice import BENT
-from diffsim_ti.mechanics.obstacles.held_back import HeldBack
+from diffsim_ti.mechanics.obstacles.limited_displacement import LimitedDisplacement
 from diffsim_ti.runtime import at, let, traced
-from diffsim_ti.state.walls import MORE
+from diffsim_ti.state.obstacle_poses import MORE
 from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class FaceRows(HeldBack):
+class FaceRows(LimitedDisplacement):
     """Taichi functions of one face f; g is a group of obstacles, k a place in it (state/features.py).
 
-    Where plan.between, obstacles are where one looks at the state between passes, not where pass `now` begins.
+    Where plan.between, obstacles are where the state is evaluated between passes, not where pass `now` begins.
     """
 
     @property
@@ -162,7 +162,7 @@ class FaceRows(HeldBack):
                     s1, s2 = x * per, y * per
                     s = ti.Vector([1 - s1 - s2, s1, s2])
                     N = self.node_weights(s, self.inner(f))
-                    now = g.force.outlook(scene.parameters, first, self.mix(N, X), self.mix(N, u))
+                    now = g.force.contact_plane(scene.parameters, first, self.mix(N, X), self.mix(N, u))
                     ahead, _ = self.passed(g, now[3], felt, step, parts)
                     onwards = y + 1 + ahead
                     d, before = now[3], now[3] - self.dot3(now, self.mix(N, move))
@@ -194,7 +194,7 @@ class FaceRows(HeldBack):
 
     @property
     def rough(self) -> bool:
-        """Whether points within faces rub on some obstacle."""
+        """Whether some obstacle has friction at points within faces."""
         return any(g.force.friction for g in self.groups)
 
     @traced

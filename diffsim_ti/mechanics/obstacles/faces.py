@@ -1,4 +1,4 @@
-"""What points within a face feel of an obstacle that its corners do not speak for.
+"""Contact of points within a face with an obstacle that its corners do not resolve.
 
     E = k c w^2 beta(s) phi(t),    s = (d - r) / w,    t = (sum_a s_a d_a - d) / w
 
@@ -6,7 +6,7 @@ d [m]: distance of the point, whose shares of the corners are s_a; d_a: those of
 stiffness, width and barrier (terms/obstacles/barrier.py); r: how far what lies between the points is from them; c: the
 square of their distance in widths, so that the points in a square of one width are together as stiff as a vertex. t is how
 much nearer the point is than its corners let expect: nothing before what is flat, hollow or far larger than the face, so
-that it costs nothing there; before a needle, an edge or a corner the point feels the obstacle as a vertex does. phi rises
+that it costs nothing there; before a needle, an edge or a corner the point is in contact as a vertex is. phi rises
 from 0 to 1 between t = FLAT and BENT and is C2.
 
 With a stiffness per area k, vertices and points are one integral over the surface. A vertex stands for a third of the
@@ -19,7 +19,7 @@ the corners included, and give each corner its third of it, so that nothing coun
 said of a point is taken back, and its own energy stands. What is much narrower than a face touches little of it, and has
 to stop as much of the body as vertices carry: phi grows on as 1 + 8 t^2, which refinement takes back. (Not so before a
 mesh, whose distances end with its grid.) The sum does not grow with the number of points, but for r,
-which is 0.16 w at most and lets a point feel what lies between it and the next.
+which is 0.16 w at most and lets a point touch what lies between it and the next.
 The points of a face lie on a lattice, a quarter of a width apart or closer, but for its largest number; corners are none of
 them.
 """
@@ -31,7 +31,7 @@ import taichi as ti
 from diffsim_ti.mechanics.obstacles.curved_faces import CurvedPoints
 from diffsim_ti.mechanics.obstacles.face_lattice import FLAT, point_curvatures, point_energy, point_slopes
 from diffsim_ti.runtime import at, let, traced
-from diffsim_ti.state.walls import MORE
+from diffsim_ti.state.obstacle_poses import MORE
 from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()
@@ -48,7 +48,7 @@ class FacePoints(CurvedPoints):
         if ti.static(what in ("product", "numbers")):
             w = at.w[0, i]
         if ti.static(what == "jvp"):
-            w = at.w[0, i] + more.rest[i] - more.walls[3 * n]
+            w = at.w[0, i] + more.rest[i] - more.poses[3 * n]
         return w
 
     @ti.func
@@ -73,8 +73,8 @@ class FacePoints(CurvedPoints):
     @ti.func
     def around_flat(self, what: A, g: A, k, i, scene: A, pass_: A, at: A, more: A):
         out, first, n = self.vector(0), g.first + k * g.size, g.number + k
-        wall, width, q = pass_.walls[3 * n], g.force.width(scene.parameters, first), self.turn_of(g, k, pass_)
-        X0, u0 = self.made(g, first, q, scene.rest[i] - wall, at.u[0, i], scene)
+        v_obstacle, width, q = pass_.poses[3 * n], g.force.width(scene.parameters, first), self.turn_of(g, k, pass_)
+        X0, u0 = self.made(g, first, q, scene.rest[i] - v_obstacle, at.u[0, i], scene)
         own = g.force.clearance(scene.parameters, first, X0, u0)[3]
         for c in range(pass_.face_start[i], pass_.face_start[i + 1]):
             row = c * ti.static(self.num_obstacles) + n
@@ -83,7 +83,7 @@ class FacePoints(CurvedPoints):
             for a in ti.static(range(3)):
                 if ti.static(a > 0):
                     i3[a] = pass_.face_next[2 * c + a - 1]
-                x, y = self.made(g, first, q, scene.rest[i3[a]] - wall, at.u[0, i3[a]], scene)
+                x, y = self.made(g, first, q, scene.rest[i3[a]] - v_obstacle, at.u[0, i3[a]], scene)
                 z = self.change_of(what, g, k, i3[a], at, pass_, scene, more)
                 if ti.static(what == "column"):
                     z = self.unit(more, a)
@@ -118,7 +118,7 @@ class FacePoints(CurvedPoints):
         if not g.force.turns:
             return None
         row = 3 * self.num_obstacles + MORE * (g.turning + k)
-        return turning.from_rodrigues(self.turned.short(at(pass_.walls, row)), self.fp)
+        return turning.from_rodrigues(self.turned.short(at(pass_.poses, row)), self.fp)
 
     @traced
     def made(self, g, first, q, X, u, scene):
@@ -145,14 +145,14 @@ class FacePoints(CurvedPoints):
     @ti.func
     def moved_with(self, g: A, k, i, dr, u, pass_: A, scene: A, more: A):
         n, row = 3 * (g.number + k), 3 * ti.static(self.num_obstacles) + MORE * (g.turning + k)
-        X = self.turned.joined(scene.rest[i] - pass_.walls[n], self.turn_of(g, k, pass_), 4)
-        dplace = self.turned.joined(more.walls[n], more.walls[row])
+        X = self.turned.joined(scene.rest[i] - pass_.poses[n], self.turn_of(g, k, pass_), 4)
+        dplace = self.turned.joined(more.poses[n], more.poses[row])
         return self.turned.moved(g, g.first + k * g.size, X, u, dr, dplace, scene, more)
 
     @ti.func
     def add_turn(self, g: A, k, i, f, scene: A, pass_: A, more: A):
         """The change of a force f of vertex i that turns with the obstacle."""
-        theta = self.turned.short(more.walls[3 * ti.static(self.num_obstacles) + MORE * (g.turning + k)])
+        theta = self.turned.short(more.poses[3 * ti.static(self.num_obstacles) + MORE * (g.turning + k)])
         return self.turned.long(theta.cross(self.turned.short(f)))
 
     @ti.func
@@ -162,12 +162,12 @@ class FacePoints(CurvedPoints):
         if ti.static(g.force.turns):
             f = self.around_one("force", g, k, i, scene, pass_, at, at)
             turn = self.turned.short(f).cross(self.turned.short(at.w[0, i]))
-            X = self.turned.joined(scene.rest[i] - pass_.walls[n], self.turn_of(g, k, pass_), 4)
+            X = self.turned.joined(scene.rest[i] - pass_.poses[n], self.turn_of(g, k, pass_), 4)
             by, none = self.turned.joined(by_u, turn), ti.Vector.zero(self.fp, 3)
             first = g.first + k * g.size
             _, _, by_theta = self.turned.spread(g, first, i, X, at.u[0, i], by, none, scene, adjoint.sums)
-            adjoint.walls[row, i] = adjoint.walls[row, i] + self.turned.long(by_theta)
-        adjoint.walls[n, i] = adjoint.walls[n, i] - by_u
+            adjoint.poses[row, i] = adjoint.poses[row, i] + self.turned.long(by_theta)
+        adjoint.poses[n, i] = adjoint.poses[n, i] - by_u
         self.add_to_rest(i, by_u, adjoint)
 
     @traced
@@ -210,7 +210,7 @@ class FacePoints(CurvedPoints):
             if a == 3:
                 x = self.mix(thirds, X)
                 y = self.mix(thirds, u)
-            seen = g.force.outlook(scene.parameters, first, x, y)
+            seen = g.force.contact_plane(scene.parameters, first, x, y)
             for m in ti.static(range(4)):
                 middle[m] = seen[m]
                 for b in ti.static(range(3)):
@@ -232,7 +232,7 @@ class FacePoints(CurvedPoints):
                     for m in ti.static(range(4)):
                         for b in ti.static(range(3)):
                             turns[b, m] = ti.select(a == b, t[m], turns[b, m])
-            out = self.points_that_feel(
+            out = self.contact_points(
                 what,
                 g,
                 first,
@@ -255,7 +255,7 @@ class FacePoints(CurvedPoints):
         return out
 
     @ti.func
-    def points_that_feel(
+    def contact_points(
         self,
         what: A,
         g: A,
@@ -287,7 +287,7 @@ class FacePoints(CurvedPoints):
                     s0 = 1 - s1 - s2
                     shares = ti.Vector([s0, s1, s2])
                     Xs, us = self.mix(shares, X), self.mix(shares, u)
-                    now = g.force.outlook(scene.parameters, first, Xs, us)
+                    now = g.force.contact_plane(scene.parameters, first, Xs, us)
                     ahead, _ = self.passed(g, now[3], width + reach, step, parts)
                     onwards = y + 1 + ahead
                     s = (now[3] - reach) / width
@@ -314,7 +314,7 @@ class FacePoints(CurvedPoints):
                             f = scale * (Fs * along + Ft * across)
                             by_now = scale * (Fs - Ft) * w0
                             by_now[3] = (by_s - by_t) / width
-                            g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
+                            g.force.contact_plane_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
                             for m in ti.static(range(3)):
                                 by[0, m] += scale * Ft * w0[m]
                             by[0, 3] += s0 * by_t / width

@@ -8,7 +8,7 @@ from diffsim_ti import runtime
 class ImpulseRecord:
     """Impulses [N s] of obstacles on vertices: those of the contact stage in `impulse` (contact_impulses.py), those of
     points within faces in `of_faces`, shape (frames, obstacles that reach there, num_vertices, 3), those of friction there
-    in `of_friction`, of obstacles that rub, on the surface's vertices.
+    in `of_friction`, of obstacles with friction, on the surface's vertices.
 
     Raises ValueError where obstacles act as forces, and while it runs where two of them push on the faces around one vertex.
     """
@@ -22,7 +22,7 @@ class ImpulseRecord:
             )
         reaching = [g.number + k for g in features.groups if features.reaches(g) for k in range(g.count)]
         self.reaching = reaching if workspace.faces else []
-        self.rubbing = list(workspace.faces.friction.number) if workspace.faces else []
+        self.with_friction = list(workspace.faces.friction.number) if workspace.faces else []
         self.surface = a.mesh.surface_vertices
         self.num_frames, self.num_obstacles = workspace.frames.frames_u.shape[0], len(a.obstacles)
         self.impulse = runtime.array(a.vector, 2 * self.num_frames * self.num_obstacles, a.num_vertices)
@@ -35,19 +35,19 @@ class ImpulseRecord:
     def clear(self) -> None:
         runtime.fill(self.impulse, 0)
         self.of_faces = np.zeros((self.num_frames, len(self.reaching), self.arrays.num_vertices, 3))
-        self.of_friction = np.zeros((self.num_frames, len(self.rubbing), len(self.surface), 3))
+        self.of_friction = np.zeros((self.num_frames, len(self.with_friction), len(self.surface), 3))
 
     def put(self, impulses: np.ndarray) -> None:
         """Set them; shape as `collect` gives."""
         runtime.fill(self.impulse, impulses.reshape(-1, *self._shape[3:]))
         self.of_faces = impulses[:, self.reaching, 0].copy()
-        self.of_friction = impulses[:, self.rubbing, 1][:, :, self.surface].copy()
+        self.of_friction = impulses[:, self.with_friction, 1][:, :, self.surface].copy()
 
     def collect(self) -> np.ndarray:
         """Shape (frames, obstacles, 2: by push and by friction, num_vertices, 3), float64; the first frame has none."""
         out = runtime.fetch(self.impulse).astype(np.float64).reshape(self._shape)
         out[:, self.reaching, 0] += self.of_faces
-        for k, o in enumerate(self.rubbing):
+        for k, o in enumerate(self.with_friction):
             out[:, o, 1, self.surface] += self.of_friction[:, k]
         return out
 
@@ -61,7 +61,7 @@ class ImpulseRecord:
         """Of the obstacles that reach there in what faces do to each vertex, shape (obstacles, num_vertices, 1): all of it
         is the one's that pushes.
 
-        pushes: as FeltFaces has it. Raises ValueError where two push on one vertex.
+        pushes: as FaceContactPoints has it. Raises ValueError where two push on one vertex.
         """
         own = pushes[self.reaching]
         if len(own) > 1 and np.any(own.sum(0) > 1):
@@ -81,7 +81,7 @@ class ImpulseRecord:
             self.of_faces[frame] += self._shares(pushes) * self.arrays.values.mass[:, None] * change
 
     def add_friction(self, numbers: dict, impulses: np.ndarray | None) -> None:
-        """Add what friction within faces did in a pass, or the change of it, of each obstacle that rubs."""
+        """Add what friction within faces did in a pass, or the change of it, of each obstacle with friction."""
         frame = self.frame_of(numbers)
         if frame is not None and impulses is not None:
             self.of_friction[frame] += impulses

@@ -208,9 +208,9 @@ class ObstacleFunctions:
         """Change of (normal, distance) at a point that moves by w, of "jvp" for that of the obstacle's numbers too."""
         t = self.vector(0)
         if ti.static(what == "jvp"):
-            t = g.force.outlook_jvp(scene.parameters, first, X, u, w, more.parameters)
+            t = g.force.contact_plane_jvp(scene.parameters, first, X, u, w, more.parameters)
         else:
-            t = g.force.outlook_jvp(scene.parameters, first, X, u, w)
+            t = g.force.contact_plane_jvp(scene.parameters, first, X, u, w)
         return t
 
     # What corners say is their distance, to which that of a point is compared: (normal, distance). Before hollow obstacles,
@@ -223,7 +223,7 @@ class ObstacleFunctions:
 
     @ti.func
     def corner(self, g: A, first, X, u, scene: A):
-        said = g.force.outlook(scene.parameters, first, X, u)
+        said = g.force.contact_plane(scene.parameters, first, X, u)
         if ti.static(g.force.hollow):
             width = g.force.width(scene.parameters, first)
             s = said[3] / width
@@ -236,7 +236,7 @@ class ObstacleFunctions:
         """Its change, as of `turn`."""
         t = self.turn(what, g, first, X, u, w, scene, more)
         if ti.static(g.force.hollow):
-            seen, width = g.force.outlook(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
+            seen, width = g.force.contact_plane(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
             s, dwidth = seen[3] / width, ti.cast(0, self.fp)
             if ti.static(what == "jvp"):
                 dwidth = more.parameters[first + g.force.index.width]
@@ -252,7 +252,10 @@ class ObstacleFunctions:
         for a in range(3):
             x, y, w = self.row_of(X, a), self.row_of(u, a), self.row_of(by, a)
             if ti.static(g.force.hollow):
-                seen, width = g.force.outlook(scene.parameters, first, x, y), g.force.width(scene.parameters, first)
+                seen, width = (
+                    g.force.contact_plane(scene.parameters, first, x, y),
+                    g.force.width(scene.parameters, first),
+                )
                 s, at_w = seen[3] / width, first + g.force.index.width
                 slope, of_value = barrier.slope(s, self.fp), w[3]
                 by_s = barrier.curvature(s, self.fp) * self.dot3(seen, w) / width
@@ -260,4 +263,4 @@ class ObstacleFunctions:
                 adjoint.sums[at_w, i] = adjoint.sums[at_w, i] + more
                 w = slope * w
                 w[3] = by_s + slope * of_value
-            g.force.outlook_vjp(scene.parameters, first, x, y, w, adjoint.sums, i)
+            g.force.contact_plane_vjp(scene.parameters, first, x, y, w, adjoint.sums, i)

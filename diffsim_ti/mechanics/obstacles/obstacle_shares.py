@@ -17,7 +17,7 @@ from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed
 
 A = ti.template()
-PASS = dict(walls="vectors", lag="vectors2", pressed="vectors2")
+PASS = dict(poses="vectors", lag="vectors2", pressed="vectors2")
 NUMBERS = dict(num_vertices="int", per_gamma="float")
 
 
@@ -41,9 +41,9 @@ class ObstacleShares(ObstaclePotential):
                     if scene.surface[i] > 0:
                         f = self.push(g, k, i, at.u[0, i], scene, pass_)
                         if ti.static(g.force.friction):
-                            if self.is_rubbed(g, k, i, scene, pass_):
+                            if self.has_friction_at(g, k, i, scene, pass_):
                                 drag = self.drag(g, k, i, at.u[0, i], scene, pass_, plan)
-                                drag = self.on_rubbed_area(g, i, drag, scene)
+                                drag = self.on_friction_area(g, i, drag, scene)
                     out.force[row, i] = f
                     out.force[row + 1, i] = drag
 
@@ -62,7 +62,7 @@ class ObstacleShares(ObstaclePotential):
                     if scene.surface[i] > 0:
                         f = self.push_jvp(g, k, i, u, du, scene, pass_, tangent)
                         if ti.static(g.force.friction):
-                            if self.is_rubbed(g, k, i, scene, pass_):
+                            if self.has_friction_at(g, k, i, scene, pass_):
                                 drag = self.drag_jvp(g, k, i, u, du, scene, pass_, tangent, plan)
                     out.force[row, i] = f
                     out.force[row + 1, i] = drag
@@ -84,7 +84,7 @@ class ObstacleShares(ObstaclePotential):
                     if scene.surface[i] > 0:
                         y += self.push_vjp(g, k, i, at.u[0, i], at.seed[row, i], scene, pass_, adjoint)
                         if ti.static(g.force.friction):
-                            if self.is_rubbed(g, k, i, scene, pass_):
+                            if self.has_friction_at(g, k, i, scene, pass_):
                                 y += self.drag_vjp(
                                     g, k, i, at.u[0, i], at.seed[row + 1, i], scene, pass_, adjoint, plan
                                 )
@@ -98,7 +98,7 @@ class ObstacleShares(ObstaclePotential):
             "obstacle_forces_vjp",
             self.all_vjp,
             **own,
-            adjoint=ADJOINT | dict(lag="vectors2", walls="vectors2", pressed="vectors2"),
+            adjoint=ADJOINT | dict(lag="vectors2", poses="vectors2", pressed="vectors2"),
         )
 
 
@@ -143,7 +143,7 @@ class FaceShares(FacePoints):
 
     @cached_property
     def jvp(self) -> Kernel:
-        return self._kernel("face_share_jvp", self.all_jvp, tangent=TANGENT | dict(walls="vectors"))
+        return self._kernel("face_share_jvp", self.all_jvp, tangent=TANGENT | dict(poses="vectors"))
 
     @ti.func
     def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
@@ -162,7 +162,7 @@ class FaceShares(FacePoints):
     @cached_property
     def vjp(self) -> Kernel:
         return self._kernel(
-            "face_share_vjp", self.all_vjp, adjoint=ADJOINT | dict(walls="vectors2", face_areas="scalars")
+            "face_share_vjp", self.all_vjp, adjoint=ADJOINT | dict(poses="vectors2", face_areas="scalars")
         )
 
 

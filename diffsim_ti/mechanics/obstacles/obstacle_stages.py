@@ -14,7 +14,7 @@ import taichi as ti
 
 from diffsim_ti.inputs.poses import COLUMNS
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
-from diffsim_ti.mechanics.supports.guides import Guides
+from diffsim_ti.mechanics.supports.sliding_supports import SlidingSupports
 from diffsim_ti.runtime import Bundle, at, let, traced
 from diffsim_ti.state.pass_table import pass_at
 from diffsim_ti.terms.obstacles import turning
@@ -22,7 +22,7 @@ from diffsim_ti.terms.obstacles import turning
 A = ti.template()  # an array or Bundle handed to a Taichi function
 # what a contact stage notes of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu,
 # friction speed); its velocity; (P, -dP/dy, adjoint of mu, of the friction speed); change or adjoint of (n, P)
-PLANE, FELT, WALL, PUSH, SEED = range(5)
+PLANE, NUMBERS, WALL, PUSH, SEED = range(5)
 ROWS = 5
 
 
@@ -31,15 +31,15 @@ class ObstacleStages(ObstacleFunctions):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
 
     @cached_property
-    def guides(self) -> Guides:
-        return Guides(self.precision, self.features.motion)
+    def sliding_supports(self) -> SlidingSupports:
+        return SlidingSupports(self.precision, self.features.motion)
 
     @ti.func
     def may(self, i, x, scene: A):
-        """What of x vertex i may do: all, unless it is held in some directions."""
+        """The admissible part of x for vertex i: all, unless it is fixed in some directions."""
         out = x
-        if ti.static(self.features.guided):
-            out = self.guides.free(i, x, scene)
+        if ti.static(self.features.partly_fixed):
+            out = self.sliding_supports.free(i, x, scene)
         return out
 
     # ---- where obstacles are -----------------------------------------------------------------------------------------
@@ -112,86 +112,86 @@ class ObstacleStages(ObstacleFunctions):
         return now.per_step * self.turned.short(path[now.row, self.column(g, k) + 2])
 
     @traced
-    def wall(self, g, k, X, u, now, scene):
+    def v_obstacle(self, g, k, X, u, now, scene):
         """Velocity of an obstacle at a vertex in the pass."""
         v = self.speed(g, k, now, scene.path)
         if not g.force.turns:
             return v
         r = self.turned.arm(g, g.first + k * g.size, X, u, scene)
-        return self.turned.wall(self.turned.short(v), self.spin(g, k, now, scene.path), now.h, r)
+        return self.turned.v_obstacle(self.turned.short(v), self.spin(g, k, now, scene.path), now.h, r)
 
     @traced
-    def wall_jvp(self, g, k, X, u, dr, now, scene, tangent):
+    def obstacle_velocity_jvp(self, g, k, X, u, dr, now, scene, tangent):
         """Its change, for dr of X + u."""
         dv = self.speed(g, k, now, tangent.path)
-        return self.turned_wall_jvp(g, k, X, u, dr, dv, now, scene, tangent) if g.force.turns else dv
+        return self.turned_velocity_jvp(g, k, X, u, dr, dv, now, scene, tangent) if g.force.turns else dv
 
     @ti.func
-    def turned_wall_jvp(self, g: A, k, X, u, dr, dv, now: A, scene: A, tangent: A):
+    def turned_velocity_jvp(self, g: A, k, X, u, dr, dv, now: A, scene: A, tangent: A):
         first = g.first + k * g.size
         arm, darm = self.turned.arm(g, first, X, u, scene), self.turned.short(dr)
         darm += -1 * self.turned.short(self.shift_at(g, k, now.begin, now, tangent.path))
         darm += -1 * self.turned.about(g, first, tangent.parameters)
         omega, domega = self.spin(g, k, now, scene.path), self.spin(g, k, now, tangent.path)
-        return self.turned.wall_jvp(self.turned.short(dv), omega, domega, now.h, arm, darm)
+        return self.turned.obstacle_velocity_jvp(self.turned.short(dv), omega, domega, now.h, arm, darm)
 
     @traced
-    def spread(self, g, k, i, X, u, by, by_wall, now, scene, adjoint, felt, column=None):
+    def spread(self, g, k, i, X, u, by, by_v_obstacle, now, scene, adjoint, felt, column=None):
         """Adjoint of u for those of the changed place and of the obstacle's velocity there; adds those of its path to column
-        `column` of felt.felt, and of the point that it turns about to column i of the sums."""
+        `column` of felt.path_adjoint, and of the point that it turns about to column i of the sums."""
         column = i if column is None else column
         if g.force.turns:
-            return self.spread_turned(g, k, i, column, X, u, by, by_wall, now, scene, adjoint, felt)
-        self.add_to_path(g, k, column, now, by, by_wall, felt)
+            return self.spread_turned(g, k, i, column, X, u, by, by_v_obstacle, now, scene, adjoint, felt)
+        self.add_to_path(g, k, column, now, by, by_v_obstacle, felt)
         return by
 
     @ti.func
-    def spread_turned(self, g: A, k, i, column, X, u, by, by_wall, now: A, scene: A, adjoint: A, felt: A):
-        first, b = g.first + k * g.size, self.turned.short(by_wall)
+    def spread_turned(self, g: A, k, i, column, X, u, by, by_v_obstacle, now: A, scene: A, adjoint: A, felt: A):
+        first, b = g.first + k * g.size, self.turned.short(by_v_obstacle)
         r, omega = self.turned.arm(g, first, X, u, scene), self.spin(g, k, now, scene.path)
-        by_omega, by_arm = self.turned.wall_vjp(omega, now.h, r, b)
+        by_omega, by_arm = self.turned.obstacle_velocity_vjp(omega, now.h, r, b)
         by_u, _, by_theta = self.turned.spread(g, first, i, X, u, by, by_arm, scene, adjoint.sums)
-        self.add_to_path(g, k, column, now, by_u, by_wall, felt)
+        self.add_to_path(g, k, column, now, by_u, by_v_obstacle, felt)
         self.add_to_turn(g, k, column, now, by_theta, by_omega, scene, felt)
         return by_u
 
     @ti.func
     def add_to_turn(self, g: A, k, i, now: A, by_theta, by_omega, scene: A, adjoint: A):
         """Adjoints of the rotation of the row and of that in the step."""
-        phi, c = self.turned.short(scene.path[now.row, self.column(g, k) + 2]), now.felt + 2 * self.column(g, k)
+        phi, c = self.turned.short(scene.path[now.row, self.column(g, k) + 2]), now.path_adjoint + 2 * self.column(g, k)
         back = -now.begin * phi
         by_row = turning.rotated(back, by_theta, self.fp)
         by_phi = now.begin * turning.jacobian(back, by_theta, self.fp) + now.per_step * by_omega
-        adjoint.felt[c + 2, i] = adjoint.felt[c + 2, i] + self.turned.long(by_row)
-        adjoint.felt[c + 4, i] = adjoint.felt[c + 4, i] + self.turned.long(by_phi)
+        adjoint.path_adjoint[c + 2, i] = adjoint.path_adjoint[c + 2, i] + self.turned.long(by_row)
+        adjoint.path_adjoint[c + 4, i] = adjoint.path_adjoint[c + 4, i] + self.turned.long(by_phi)
 
     @ti.func
-    def add_to_path(self, g: A, k, i, now: A, by_X, by_wall, adjoint: A):
-        """Adjoints of the rows of the path that vertex i felt; summed over the vertices where a step begins."""
+    def add_to_path(self, g: A, k, i, now: A, by_X, by_v_obstacle, adjoint: A):
+        """Adjoints of the rows of the path by vertex i; summed over the vertices where a step begins."""
         if ti.static(g.path >= 0):
-            c, rate = now.felt + 2 * self.column(g, k), now.per_step * by_wall
-            adjoint.felt[c, i] = adjoint.felt[c, i] - ((1 - now.begin) * by_X + rate)
-            adjoint.felt[c + 1, i] = adjoint.felt[c + 1, i] - (now.begin * by_X - rate)
+            c, rate = now.path_adjoint + 2 * self.column(g, k), now.per_step * by_v_obstacle
+            adjoint.path_adjoint[c, i] = adjoint.path_adjoint[c, i] - ((1 - now.begin) * by_X + rate)
+            adjoint.path_adjoint[c + 1, i] = adjoint.path_adjoint[c + 1, i] - (now.begin * by_X - rate)
 
     @traced
-    def way_of_wall(self, g, k, X, u, now, scene):
+    def displacement_of_obstacle(self, g, k, X, u, now, scene):
         """How far an obstacle goes in the pass at a vertex."""
         if g.force.turns:
-            return now.h * self.wall(g, k, X, u, now, scene)
+            return now.h * self.v_obstacle(g, k, X, u, now, scene)
         return self.place_at(g, k, now.end, now, scene.path) - self.place(g, k, now, scene.path)
 
     # ---- adjoints of paths -------------------------------------------------------------------------------------------
 
     @traced
     def noting(self, now, plan):
-        """A pass on the way back with `felt`: where vertices note what they feel of paths in its step."""
+        """A pass on the way back with `felt`: where vertices accumulate adjoints of paths in its step."""
         moving = self.features.moving
-        return Bundle(**vars(now), felt=let(2 * moving * (now.row % plan.steps)) if moving else 0)
+        return Bundle(**vars(now), path_adjoint=let(2 * moving * (now.row % plan.steps)) if moving else 0)
 
     @ti.func
     def fold_part(self, p, count, first, last, adjoint: A, table: A, plan: A):
-        """Sum what every num_parts-th of `count` vertices (or faces) felt of a path in the steps that passes last .. first
-        complete, in order."""
+        """Sum what every num_parts-th of `count` vertices (or faces) accumulated for a path in the steps that passes
+        last .. first complete, in order."""
         low, high = pass_at(table, first - plan.window), pass_at(table, last - plan.window)
         for back in range(high.row - low.row + low.opens):
             self.fold_row(p, count, high.row - back, high.next, adjoint, plan)
@@ -204,10 +204,10 @@ class ObstacleStages(ObstacleFunctions):
         to_row, to_next = self.vector(0), self.vector(0)
         for m in range((count - part + plan.num_parts - 1) // plan.num_parts):
             i = part + m * plan.num_parts
-            to_row += adjoint.felt[at, i]
-            to_next += adjoint.felt[at + 1, i]
-            adjoint.felt[at, i] = self.vector(0)
-            adjoint.felt[at + 1, i] = self.vector(0)
+            to_row += adjoint.path_adjoint[at, i]
+            to_next += adjoint.path_adjoint[at + 1, i]
+            adjoint.path_adjoint[at, i] = self.vector(0)
+            adjoint.path_adjoint[at + 1, i] = self.vector(0)
         adjoint.path[row, p] = adjoint.path[row, p] + to_row
         adjoint.path[after, p] = adjoint.path[after, p] + to_next
 
@@ -225,9 +225,9 @@ class ObstacleStages(ObstacleFunctions):
     def note_one(self, g: A, k, i, u, u_next, now: A, scene: A, state: A):
         first, at = g.first + k * g.size, 3 * (g.number + k)
         X = self.seen_now(g, k, scene.rest[i], now, scene)
-        move = u_next - u - self.way_of_wall(g, k, X, u, now, scene)
+        move = u_next - u - self.displacement_of_obstacle(g, k, X, u, now, scene)
         d, width = g.force.gap(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
-        far = d - width if ti.static(self.features.stages) else d  # a stage feels where a pass leads to
+        far = d - width if ti.static(self.features.stages) else d  # a stage acts where a pass leads to
         if d < width or move.dot(move) >= far * far:
             approach = g.force.approach(scene.parameters, first, X, u, move)
             reached = ti.min(d, d + approach)
@@ -283,13 +283,13 @@ class ObstacleStages(ObstacleFunctions):
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 X = self.seen_now(g, k, scene.rest[i], now, scene)
-                wall = self.wall(g, k, X, u, now, scene)
+                v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
                 if ti.static(g.path >= 0):
-                    work += now.h * self.force(g, k, i, X, u, v_plus, scene).dot(wall)
+                    work += now.h * self.force(g, k, i, X, u, v_plus, scene).dot(v_obstacle)
                 if ti.static(g.force.friction):
                     if scene.inverse_mass[i] > 0:
                         after = self.slide(g, k, i, u, v, now, scene)
-                        work += (after - v).dot(wall) / scene.inverse_mass[i]
+                        work += (after - v).dot(v_obstacle) / scene.inverse_mass[i]
                         v = after
         return work
 
@@ -301,9 +301,9 @@ class ObstacleStages(ObstacleFunctions):
         first, after = g.first + k * g.size, v
         X = self.seen_now(g, k, scene.rest[i], now, scene)
         if g.force.touches(scene.parameters, first, X, u):
-            wall = self.wall(g, k, X, u, now, scene)
+            v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
             h_over_m = self.on_area(g, i, now.h * scene.inverse_mass[i], scene)
-            after = g.force.slide(scene.parameters, first, X, u, v, wall, h_over_m)
+            after = g.force.slide(scene.parameters, first, X, u, v, v_obstacle, h_over_m)
         return after
 
     @ti.func
@@ -333,15 +333,26 @@ class ObstacleStages(ObstacleFunctions):
                 X = self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
                     moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
-                    wall = self.wall(g, k, X, u, now, scene)
-                    dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                    v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
+                    dv_obstacle = self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
                     lighter = -h_over_m * inverse * tangent.mass[i]
                     if ti.static(g.force.per_area):
                         lighter += now.h * inverse * tangent.surface[i]
                     dv = g.force.slide_jvp(
-                        scene.parameters, first, X, u, v, wall, h_over_m, tangent.parameters, moved, dv, dwall, lighter
+                        scene.parameters,
+                        first,
+                        X,
+                        u,
+                        v,
+                        v_obstacle,
+                        h_over_m,
+                        tangent.parameters,
+                        moved,
+                        dv,
+                        dv_obstacle,
+                        lighter,
                     )
-                    v = g.force.slide(scene.parameters, first, X, u, v, wall, h_over_m)
+                    v = g.force.slide(scene.parameters, first, X, u, v, v_obstacle, h_over_m)
         return dv
 
     @ti.func
@@ -356,10 +367,10 @@ class ObstacleStages(ObstacleFunctions):
                 X = self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
                     start = self.slide_before(g.number + k, i, u, v, now, scene)
-                    by_place, by_v, by_wall, by_ratio, by = g.force.slide_vjp(
-                        scene.parameters, first, X, u, start, self.wall(g, k, X, u, now, scene), h_over_m, v_adj
+                    by_place, by_v, by_v_obstacle, by_ratio, by = g.force.slide_vjp(
+                        scene.parameters, first, X, u, start, self.v_obstacle(g, k, X, u, now, scene), h_over_m, v_adj
                     )
-                    by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
+                    by_u = self.spread(g, k, i, X, u, by_place, by_v_obstacle, now, scene, adjoint, adjoint)
                     v_adj = by_v
                     u_adj += by_u
                     self.add_to_numbers(g, k, i, by, adjoint)

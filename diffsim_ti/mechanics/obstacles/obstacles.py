@@ -1,7 +1,7 @@
 """Potential energy of obstacles at a vertex: barrier and friction, with all derivatives.
 
-Obstacles are looked at where they are in the pass, which `pass_.walls` says (state/walls.py). `pass_.lag` holds two rows:
-the displacement of the body where the pass begins, from which friction takes its normal force, and x, so that
+Obstacles are taken where they are in the pass, which `pass_.poses` says (state/obstacle_poses.py). `pass_.lag` holds
+two rows: the displacement of the body where the pass begins, from which friction takes its normal force, and x, so that
 (u - x) per_gamma is the velocity. `pass_.pressed` holds a row for each obstacle (`reaches`).
 """
 
@@ -11,7 +11,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
 from diffsim_ti.runtime import assign, at, let, traced
-from diffsim_ti.state.walls import AT_BEGIN, AT_STAGE, MORE, RATE, TAU
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, MORE, RATE, TAU
 from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -35,19 +35,19 @@ class ObstaclePotential(ObstacleFunctions):
     def place_of(self, g, k, m, pass_):
         """Displacement of an obstacle, of one that turns with its unit quaternion, where forces are taken (m = AT_STAGE) or
         the pass begins (AT_BEGIN)."""
-        shift = at(pass_.walls, 3 * (g.number + k) + m)
+        shift = at(pass_.poses, 3 * (g.number + k) + m)
         if not g.force.turns:
             return shift
-        s = self.turned.short(at(pass_.walls, self.turning_row(g, k) + m))
+        s = self.turned.short(at(pass_.poses, self.turning_row(g, k) + m))
         return self.turned.joined(shift, turning.from_rodrigues(s, self.fp), 4)
 
     @traced
     def moved(self, g, k, m, X, u, dr, scene, tangent):
         """Change of the place of a vertex for dr of X + u, and for that of the obstacle."""
-        shift = at(tangent.walls, 3 * (g.number + k) + m)
+        shift = at(tangent.poses, 3 * (g.number + k) + m)
         if not g.force.turns:
             return dr - shift
-        dplace = self.turned.joined(shift, at(tangent.walls, self.turning_row(g, k) + m))
+        dplace = self.turned.joined(shift, at(tangent.poses, self.turning_row(g, k) + m))
         return self.turned.moved(g, g.first + k * g.size, X, u, dr, dplace, scene, tangent)
 
     @traced
@@ -59,7 +59,7 @@ class ObstaclePotential(ObstacleFunctions):
         first, by_arm = g.first + k * g.size, none if by_arm is None else by_arm
         by_u, by_t, by_theta = self.turned.spread(g, first, i, X, u, by, by_arm, scene, adjoint.sums)
         row = self.turning_row(g, k) + m
-        assign(at(adjoint.walls, row, i), at(adjoint.walls, row, i) + self.turned.long(by_theta))
+        assign(at(adjoint.poses, row, i), at(adjoint.poses, row, i) + self.turned.long(by_theta))
         return by_u, by_t
 
     # ---- friction ----------------------------------------------------------------------------------------------------
@@ -82,10 +82,10 @@ class ObstaclePotential(ObstacleFunctions):
     # The velocity of an obstacle that turns is that at the place where the pass begins, so that it is no function of u.
 
     @traced
-    def wall(self, g, k, i, scene, pass_):
+    def v_obstacle(self, g, k, i, scene, pass_):
         """Velocity of an obstacle at a vertex."""
-        v = at(pass_.walls, 3 * (g.number + k) + RATE)
-        return self.turned_wall(g, k, i, v, scene, pass_) if g.force.turns else v
+        v = at(pass_.poses, 3 * (g.number + k) + RATE)
+        return self.turned_velocity(g, k, i, v, scene, pass_) if g.force.turns else v
 
     @ti.func
     def arm(self, g: A, k, i, scene: A, pass_: A):
@@ -93,44 +93,44 @@ class ObstaclePotential(ObstacleFunctions):
         return self.turned.arm(g, g.first + k * g.size, X, pass_.lag[0, i], scene)
 
     @ti.func
-    def spin(self, g: A, k, walls: A):
+    def spin(self, g: A, k, poses: A):
         """Angular velocity."""
-        return self.turned.short(walls[self.turning_row(g, k) + RATE])
+        return self.turned.short(poses[self.turning_row(g, k) + RATE])
 
     @ti.func
-    def turned_wall(self, g: A, k, i, v, scene: A, pass_: A):
-        tau, r = pass_.walls[self.turning_row(g, k) + TAU][0], self.arm(g, k, i, scene, pass_)
-        return self.turned.wall(self.turned.short(v), self.spin(g, k, pass_.walls), tau, r)
+    def turned_velocity(self, g: A, k, i, v, scene: A, pass_: A):
+        tau, r = pass_.poses[self.turning_row(g, k) + TAU][0], self.arm(g, k, i, scene, pass_)
+        return self.turned.v_obstacle(self.turned.short(v), self.spin(g, k, pass_.poses), tau, r)
 
     @traced
-    def wall_jvp(self, g, k, i, scene, pass_, tangent):
+    def obstacle_velocity_jvp(self, g, k, i, scene, pass_, tangent):
         """Its change."""
-        dv = at(tangent.walls, 3 * (g.number + k) + RATE)
-        return self.turned_wall_jvp(g, k, i, dv, scene, pass_, tangent) if g.force.turns else dv
+        dv = at(tangent.poses, 3 * (g.number + k) + RATE)
+        return self.turned_velocity_jvp(g, k, i, dv, scene, pass_, tangent) if g.force.turns else dv
 
     @ti.func
-    def turned_wall_jvp(self, g: A, k, i, dv, scene: A, pass_: A, tangent: A):
+    def turned_velocity_jvp(self, g: A, k, i, dv, scene: A, pass_: A, tangent: A):
         n, dr = 3 * (g.number + k), tangent.lag[0, i] + tangent.rest[i]
-        darm = self.turned.short(dr - tangent.walls[n + AT_BEGIN])
+        darm = self.turned.short(dr - tangent.poses[n + AT_BEGIN])
         darm += -1 * self.turned.about(g, g.first + k * g.size, tangent.parameters)
-        tau, r = pass_.walls[self.turning_row(g, k) + TAU][0], self.arm(g, k, i, scene, pass_)
-        omega, domega = self.spin(g, k, pass_.walls), self.spin(g, k, tangent.walls)
-        return self.turned.wall_jvp(self.turned.short(dv), omega, domega, tau, r, darm)
+        tau, r = pass_.poses[self.turning_row(g, k) + TAU][0], self.arm(g, k, i, scene, pass_)
+        omega, domega = self.spin(g, k, pass_.poses), self.spin(g, k, tangent.poses)
+        return self.turned.obstacle_velocity_jvp(self.turned.short(dv), omega, domega, tau, r, darm)
 
     @ti.func
-    def turned_wall_vjp(self, g: A, k, i, by_place, by_wall, scene: A, pass_: A, adjoint: A):
+    def turned_velocity_vjp(self, g: A, k, i, by_place, by_v_obstacle, scene: A, pass_: A, adjoint: A):
         """(adjoints of the place where the pass begins, of the obstacle's displacement there), of the velocity's and of six
         numbers by_place; adds those of all else."""
         row, r = self.turning_row(g, k), self.arm(g, k, i, scene, pass_)
-        tau, omega = pass_.walls[row + TAU][0], self.spin(g, k, pass_.walls)
-        by_omega, by_arm = self.turned.wall_vjp(omega, tau, r, self.turned.short(by_wall))
-        adjoint.walls[row + RATE, i] = adjoint.walls[row + RATE, i] + self.turned.long(by_omega)
+        tau, omega = pass_.poses[row + TAU][0], self.spin(g, k, pass_.poses)
+        by_omega, by_arm = self.turned.obstacle_velocity_vjp(omega, tau, r, self.turned.short(by_v_obstacle))
+        adjoint.poses[row + RATE, i] = adjoint.poses[row + RATE, i] + self.turned.long(by_omega)
         X = self.rest_before(g, k, i, scene, pass_)
         by_u, by_t = self.spread(g, k, AT_BEGIN, i, X, pass_.lag[0, i], by_place, scene, adjoint, by_arm)
         return by_u, by_t
 
     @ti.func
-    def on_rubbed_area(self, g: A, i, x, scene: A):
+    def on_friction_area(self, g: A, i, x, scene: A):
         """Friction on the area of vertex i; `pressed` is of the whole already."""
         out = x
         if ti.static(not self.reaches(g)):
@@ -138,8 +138,8 @@ class ObstaclePotential(ObstacleFunctions):
         return out
 
     @ti.func
-    def is_rubbed(self, g: A, k, i, scene: A, pass_: A):
-        """Whether friction of an obstacle is felt."""
+    def has_friction_at(self, g: A, k, i, scene: A, pass_: A):
+        """Whether friction of an obstacle acts."""
         felt = False
         if ti.static(self.reaches(g)):
             felt = pass_.pressed[g.number + k, i].norm_sqr() > 0
@@ -149,8 +149,8 @@ class ObstaclePotential(ObstacleFunctions):
         return felt
 
     @traced
-    def felt_at(self, g, k, i, scene, pass_):
-        """What friction takes its normal force from, as `rub` has it: a place, or `pressed`."""
+    def lagged_at(self, g, k, i, scene, pass_):
+        """What friction takes its normal force from, as `friction_force` has it: a place, or `pressed`."""
         if self.reaches(g):
             return None, let(at(pass_.pressed, g.number + k, i))
         return self.rest_before(g, k, i, scene, pass_), let(at(pass_.lag, 0, i))
@@ -158,8 +158,12 @@ class ObstaclePotential(ObstacleFunctions):
     @ti.func
     def lost(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
         """Potential of friction by the velocity [W]."""
-        v, wall, first = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_), g.first + k * g.size
-        return g.force.dissipation(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall)
+        v, v_obstacle, first = (
+            self.velocity(i, u, pass_, plan),
+            self.v_obstacle(g, k, i, scene, pass_),
+            g.first + k * g.size,
+        )
+        return g.force.dissipation(scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle)
 
     @ti.func
     def push(self, g: A, k, i, u, scene: A, pass_: A):
@@ -167,15 +171,25 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
-        v, wall, first = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_), g.first + k * g.size
-        return g.force.rub(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall)
+        v, v_obstacle, first = (
+            self.velocity(i, u, pass_, plan),
+            self.v_obstacle(g, k, i, scene, pass_),
+            g.first + k * g.size,
+        )
+        return g.force.friction_force(scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle)
 
     @ti.func
     def drag_product(self, g: A, k, i, u, w, scene: A, pass_: A, plan: A):
         """Change of `drag` for a change w of the displacement."""
-        v, wall, first = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_), g.first + k * g.size
+        v, v_obstacle, first = (
+            self.velocity(i, u, pass_, plan),
+            self.v_obstacle(g, k, i, scene, pass_),
+            g.first + k * g.size,
+        )
         dv = plan.per_gamma * w
-        return g.force.rub_product(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, dv)
+        return g.force.friction_product(
+            scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle, dv
+        )
 
     # ---- barrier and friction; `rough`: whether friction counts -------------------------------------------------------
 
@@ -188,9 +202,9 @@ class ObstaclePotential(ObstacleFunctions):
                 X = self.rest_now(g, k, i, scene, pass_)
                 value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
                 if ti.static(rough and g.force.friction):
-                    if self.is_rubbed(g, k, i, scene, pass_):
+                    if self.has_friction_at(g, k, i, scene, pass_):
                         lost = self.lost(g, k, i, u, scene, pass_, plan)
-                        value += self.on_rubbed_area(g, i, lost, scene) / plan.per_gamma
+                        value += self.on_friction_area(g, i, lost, scene) / plan.per_gamma
         return value
 
     @ti.func
@@ -200,8 +214,8 @@ class ObstaclePotential(ObstacleFunctions):
             for k in range(g.count):
                 f += self.push(g, k, i, u, scene, pass_)
                 if ti.static(g.force.friction):
-                    if self.is_rubbed(g, k, i, scene, pass_):
-                        f += self.on_rubbed_area(g, i, self.drag(g, k, i, u, scene, pass_, plan), scene)
+                    if self.has_friction_at(g, k, i, scene, pass_):
+                        f += self.on_friction_area(g, i, self.drag(g, k, i, u, scene, pass_, plan), scene)
         return f
 
     @ti.func
@@ -214,8 +228,8 @@ class ObstaclePotential(ObstacleFunctions):
                 change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
                 f += self.on_area(g, i, change, scene)
                 if ti.static(rough and g.force.friction):
-                    if self.is_rubbed(g, k, i, scene, pass_):
-                        f += self.on_rubbed_area(g, i, self.drag_product(g, k, i, u, w, scene, pass_, plan), scene)
+                    if self.has_friction_at(g, k, i, scene, pass_):
+                        f += self.on_friction_area(g, i, self.drag_product(g, k, i, u, w, scene, pass_, plan), scene)
         return f
 
     # ---- derivatives by everything -----------------------------------------------------------------------------------
@@ -229,18 +243,29 @@ class ObstaclePotential(ObstacleFunctions):
     @ti.func
     def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
         first, dv = g.first + k * g.size, plan.per_gamma * (du - tangent.lag[1, i])
-        v, wall = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_)
-        moved, dwall = self.felt_jvp(g, k, i, scene, pass_, tangent), self.wall_jvp(g, k, i, scene, pass_, tangent)
-        f = g.force.rub_jvp(
-            scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, tangent.parameters, moved, dv, dwall
+        v, v_obstacle = self.velocity(i, u, pass_, plan), self.v_obstacle(g, k, i, scene, pass_)
+        moved, dv_obstacle = (
+            self.lagged_jvp(g, k, i, scene, pass_, tangent),
+            self.obstacle_velocity_jvp(g, k, i, scene, pass_, tangent),
         )
-        f = self.on_rubbed_area(g, i, f, scene)
+        f = g.force.friction_force_jvp(
+            scene.parameters,
+            first,
+            self.lagged_at(g, k, i, scene, pass_),
+            v,
+            v_obstacle,
+            tangent.parameters,
+            moved,
+            dv,
+            dv_obstacle,
+        )
+        f = self.on_friction_area(g, i, f, scene)
         if ti.static(g.force.per_area and not self.reaches(g)):
             f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
         return f
 
     @traced
-    def felt_jvp(self, g, k, i, scene, pass_, tangent):
+    def lagged_jvp(self, g, k, i, scene, pass_, tangent):
         """Change of what friction takes its normal force from."""
         if self.reaches(g):
             return at(tangent.pressed, g.number + k, i)
@@ -254,7 +279,7 @@ class ObstaclePotential(ObstacleFunctions):
             for k in range(g.count):
                 f += self.push_jvp(g, k, i, u, du, scene, pass_, tangent)
                 if ti.static(g.force.friction):
-                    if self.is_rubbed(g, k, i, scene, pass_):
+                    if self.has_friction_at(g, k, i, scene, pass_):
                         f += self.drag_jvp(g, k, i, u, du, scene, pass_, tangent, plan)
         return f
 
@@ -264,9 +289,9 @@ class ObstaclePotential(ObstacleFunctions):
         by_place, _ = self.force_vjp(g, k, i, X, u, zero, w, scene, adjoint)
         by_u, by_t = self.spread(g, k, AT_STAGE, i, X, u, by_place, scene, adjoint)
         self.add_to_rest(i, by_u, adjoint)
-        adjoint.walls[n + AT_STAGE, i] = by_t
-        adjoint.walls[n + AT_BEGIN, i] = zero
-        adjoint.walls[n + RATE, i] = zero
+        adjoint.poses[n + AT_STAGE, i] = by_t
+        adjoint.poses[n + AT_BEGIN, i] = zero
+        adjoint.poses[n + RATE, i] = zero
         return by_u
 
     @ti.func
@@ -274,30 +299,30 @@ class ObstaclePotential(ObstacleFunctions):
         n, first = 3 * (g.number + k), g.first + k * g.size
         if ti.static(g.force.per_area and self.features.shape and not self.reaches(g)):
             self.add_to_area(g, i, self.drag(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
-        w = self.on_rubbed_area(g, i, w, scene)
-        v, wall = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_)
-        by_felt, by_v, by_wall, by = g.force.rub_vjp(
-            scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, w
+        w = self.on_friction_area(g, i, w, scene)
+        v, v_obstacle = self.velocity(i, u, pass_, plan), self.v_obstacle(g, k, i, scene, pass_)
+        by_lagged, by_v, by_v_obstacle, by = g.force.friction_force_vjp(
+            scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle, w
         )
         self.add_to_numbers(g, k, i, by, adjoint)
         if ti.static(self.reaches(g)):
-            adjoint.pressed[g.number + k, i] = by_felt
+            adjoint.pressed[g.number + k, i] = by_lagged
         if ti.static(g.force.turns or not self.reaches(g)):
-            by_u, by_t = self.felt_vjp(g, k, i, by_felt, by_wall, scene, pass_, adjoint)
+            by_u, by_t = self.lagged_vjp(g, k, i, by_lagged, by_v_obstacle, scene, pass_, adjoint)
             self.add_to_rest(i, by_u, adjoint)
             adjoint.lag[0, i] = adjoint.lag[0, i] + by_u
-            adjoint.walls[n + AT_BEGIN, i] = by_t
-        adjoint.walls[n + RATE, i] = by_wall
+            adjoint.poses[n + AT_BEGIN, i] = by_t
+        adjoint.poses[n + RATE, i] = by_v_obstacle
         adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
         return plan.per_gamma * by_v
 
     @traced
-    def felt_vjp(self, g, k, i, by_felt, by_wall, scene, pass_, adjoint):
+    def lagged_vjp(self, g, k, i, by_lagged, by_v_obstacle, scene, pass_, adjoint):
         """Adjoints of the place where the pass begins and of the obstacle's displacement there."""
         if not g.force.turns:
-            return by_felt, self.vector(0) - by_felt
-        by_place = ti.Vector.zero(self.fp, 6) if self.reaches(g) else by_felt
-        return self.turned_wall_vjp(g, k, i, by_place, by_wall, scene, pass_, adjoint)
+            return by_lagged, self.vector(0) - by_lagged
+        by_place = ti.Vector.zero(self.fp, 6) if self.reaches(g) else by_lagged
+        return self.turned_velocity_vjp(g, k, i, by_place, by_v_obstacle, scene, pass_, adjoint)
 
     @ti.func
     def add_vjp(self, i, f, u, w, scene: A, pass_: A, adjoint: A, plan: A):
@@ -306,6 +331,6 @@ class ObstaclePotential(ObstacleFunctions):
             for k in range(g.count):
                 f += self.push_vjp(g, k, i, u, w, scene, pass_, adjoint)
                 if ti.static(g.force.friction):
-                    if self.is_rubbed(g, k, i, scene, pass_):
+                    if self.has_friction_at(g, k, i, scene, pass_):
                         f += self.drag_vjp(g, k, i, u, w, scene, pass_, adjoint, plan)
         return f

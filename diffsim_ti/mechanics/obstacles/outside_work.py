@@ -52,10 +52,10 @@ def work_of_own_forces(step: A, i, v, v_plus, f, v_next, now: A, scene: A, plan:
     if inverse > 0:
         if ti.static(step.features.gravity >= 0):
             own += step.gravity(scene.parameters) / inverse
-        if ti.static(step.features.guided):
-            done += own.dot(step.guides.held(i, led, scene))
-            own, v = step.guides.free(i, own, scene), step.guides.free(i, v, scene)
-            v_plus = step.guides.free(i, v_plus, scene)
+        if ti.static(step.features.partly_fixed):
+            done += own.dot(step.sliding_supports.held(i, led, scene))
+            own, v = step.sliding_supports.free(i, own, scene), step.sliding_supports.free(i, v, scene)
+            v_plus = step.sliding_supports.free(i, v_plus, scene)
         done += step.half() * (now.pre + now.post) * own.dot(v + v_plus)
     elif ti.static(step.features.motion):
         done += own.dot(led)
@@ -78,14 +78,17 @@ def work_of_pass(step: A, i, u, v, v_plus, f, u_next, v_next, now: A, scene: A, 
     if inverse > 0:
         if ti.static(step.features.gravity >= 0):
             own += step.gravity(scene.parameters) / inverse
-        if ti.static(step.features.guided):  # what holds it takes what the body does there
-            done += -own.dot(step.guides.held(i, pre * v + post * v_next, scene))
+        if ti.static(step.features.partly_fixed):  # what holds it takes what the body does there
+            done += -own.dot(step.sliding_supports.held(i, pre * v + post * v_next, scene))
             own, v, v_plus = (
-                step.guides.free(i, own, scene),
-                step.guides.free(i, v, scene),
-                step.guides.free(i, v_plus, scene),
+                step.sliding_supports.free(i, own, scene),
+                step.sliding_supports.free(i, v, scene),
+                step.sliding_supports.free(i, v_plus, scene),
             )
-            u_next, v_next = u + step.guides.free(i, u_next - u, scene), step.guides.free(i, v_next, scene)
+            u_next, v_next = (
+                u + step.sliding_supports.free(i, u_next - u, scene),
+                step.sliding_supports.free(i, v_next, scene),
+            )
         if ti.static(step.features.forces or step.features.loaded_corners):
             done += half * load.dot((pre + post) * (v + v_plus) + (pre * pre - post * post) * inverse * own)
         if ti.static(step.features.drag >= 0):
@@ -104,19 +107,19 @@ def work_of_pass(step: A, i, u, v, v_plus, f, u_next, v_next, now: A, scene: A, 
 
 @ti.func
 def work_of_stage(contact: A, i, v, now: A, scene: A, state: A):
-    """What each moving obstacle pushes and rubs vertex i with, times its own velocity [J]; v: before friction.
+    """What each moving obstacle acts on vertex i with, friction included, times its own velocity [J]; v: before friction.
 
     Pushes and planes are those that the stage has noted. As the obstacles see it, friction and the stage only take energy.
     """
     inverse, work = scene.inverse_mass[i], ti.cast(0, contact.fp)
     for c in range(ti.static(contact.features.num_staged)):
         row = ROWS * (ti.static(contact.features.first_staged) + c)
-        wall, after = state.stage[row + WALL, i], v
+        v_obstacle, after = state.stage[row + WALL, i], v
         if ti.static(len(contact.features.staged_rough) > 0):
             after = contact.slide(ti.static(contact.features.first_staged) + c, i, v, now.h * inverse, scene, state)
         pushed = now.h * state.stage[row + PUSH, i].x * contact.normal(state.stage[row + PLANE, i])
         after = contact.led(i, v, after, scene)
-        work += (pushed + (after - v) / inverse).dot(wall)
+        work += (pushed + (after - v) / inverse).dot(v_obstacle)
         v = after
     return work
 

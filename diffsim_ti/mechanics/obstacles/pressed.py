@@ -16,14 +16,14 @@ def _at_begin(workspace) -> SimpleNamespace:
     """What a potential says of a pass, as if it took its forces where it begins."""
     a, p = workspace.arrays, workspace.potential
     u, w = (runtime.array(a.vector, 1, a.num_vertices) for _ in range(2))
-    walls = runtime.array(a.vector, *p.walls.shape)
-    return SimpleNamespace(u=u, w=w, walls=walls, lag=p.lag, pressed=p.pressed, faces=p.faces, per_gamma=1.0)
+    poses = runtime.array(a.vector, *p.poses.shape)
+    return SimpleNamespace(u=u, w=w, poses=poses, lag=p.lag, pressed=p.pressed, faces=p.faces, per_gamma=1.0)
 
 
-def _begin_rows(walls: np.ndarray) -> np.ndarray:
+def _begin_rows(poses: np.ndarray) -> np.ndarray:
     """Of the three rows of each obstacle, those where the pass begins in the place of those where it takes forces."""
-    out = walls.copy()
-    out[::3] = walls[1::3]
+    out = poses.copy()
+    out[::3] = poses[1::3]
     return out
 
 
@@ -34,10 +34,10 @@ class Pressed:
         self.potential, self.here = workspace.potential, _at_begin(workspace)
         self.shares = Shares(workspace, at=self.here)
 
-    def begin(self, u: np.ndarray, walls: np.ndarray) -> None:
-        """For a pass from displacement u [m], obstacles being as `walls` says."""
+    def begin(self, u: np.ndarray, poses: np.ndarray) -> None:
+        """For a pass from displacement u [m], obstacles being as `poses` says."""
         runtime.fill(self.here.u, u[None])
-        runtime.fill(self.here.walls, _begin_rows(walls))
+        runtime.fill(self.here.poses, _begin_rows(poses))
         runtime.fill(self.potential.pressed, self.shares.forces()[:, 0])
 
 
@@ -47,16 +47,16 @@ class PressedTangent:
     def __init__(self, workspace, tangent):
         self.tangent, self.here = tangent, workspace.pressed.here
         self.shares = Shares(workspace, at=self.here)
-        walls, lag = runtime.array(workspace.arrays.vector, *self.here.walls.shape), tangent.lag
+        poses, lag = runtime.array(workspace.arrays.vector, *self.here.poses.shape), tangent.lag
         self.change = SimpleNamespace(
-            walls=walls, lag=lag, pressed=runtime.array(workspace.arrays.vector, *tangent.pressed.shape)
+            poses=poses, lag=lag, pressed=runtime.array(workspace.arrays.vector, *tangent.pressed.shape)
         )
 
-    def begin(self, du: np.ndarray, walls_dot: np.ndarray | None) -> None:
+    def begin(self, du: np.ndarray, poses_dot: np.ndarray | None) -> None:
         """For a change du of the displacement where the pass begins, and of the rows of obstacles."""
         runtime.fill(self.here.w, du[None])
-        if walls_dot is not None:
-            runtime.fill(self.change.walls, _begin_rows(walls_dot))
+        if poses_dot is not None:
+            runtime.fill(self.change.poses, _begin_rows(poses_dot))
         df = self.shares.forces("jvp", tangent=(self.change, self.tangent.numbers))
         runtime.fill(self.tangent.pressed, df[:, 0])
 
@@ -68,9 +68,10 @@ class PressedAdjoint:
         self.shares = SharesAdjoint(workspace, features, numbers, face_areas, at=workspace.pressed.here)
 
     def pull_back(self, pressed_adj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(adjoint of the displacement where the pass begins, of the rows of walls); adds those of the scene's numbers."""
+        """(adjoint of the displacement where the pass begins, of the rows of obstacle poses); adds those of the scene's
+        numbers."""
         seed = np.stack([pressed_adj, np.zeros_like(pressed_adj)], 1)
-        by_u, _, _, by_walls = self.shares.pull_back(seed)
-        out = np.zeros_like(by_walls)
-        out[1::3] = by_walls[::3]
+        by_u, _, _, by_poses = self.shares.pull_back(seed)
+        out = np.zeros_like(by_poses)
+        out[1::3] = by_poses[::3]
         return by_u, out

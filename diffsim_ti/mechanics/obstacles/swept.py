@@ -19,7 +19,7 @@ from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
 from diffsim_ti.runtime import Kernel, kernels_of, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, needed
-from diffsim_ti.state.walls import MORE
+from diffsim_ti.state.obstacle_poses import MORE
 from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()

@@ -5,7 +5,7 @@ at the arm r = X + u - c from the point c. Changes of t, of R by dR = [theta]x R
 
     - dt - theta x r + (R - 1) dc,    besides the turn theta of what is felt.
 
-The wall's velocity is that of the obstacle's point at the vertex, on the chord that it goes in a time tau,
+The obstacle's velocity is that of the obstacle's point at the vertex, on the chord that it goes in a time tau,
 
     v + (R(tau omega) - 1) r / tau = v + omega x J(tau omega) r,
 
@@ -79,18 +79,18 @@ class Turned:
         return self.joined(out, theta)
 
     @ti.func
-    def wall(self, v, omega, tau, r):
-        """The wall's velocity; v, omega and r have three components."""
+    def v_obstacle(self, v, omega, tau, r):
+        """The obstacle's velocity; v, omega and r have three components."""
         return self.long(v + omega.cross(turning.jacobian(tau * omega, r, self.fp)))
 
     @ti.func
-    def wall_jvp(self, dv, omega, domega, tau, r, dr):
+    def obstacle_velocity_jvp(self, dv, omega, domega, tau, r, dr):
         a = tau * omega
         out = dv + turning.jacobian(a, domega, self.fp).cross(turning.rotated(a, r, self.fp))
         return self.long(out + omega.cross(turning.jacobian(a, dr, self.fp)))
 
     @ti.func
-    def wall_vjp(self, omega, tau, r, by):
+    def obstacle_velocity_vjp(self, omega, tau, r, by):
         """(adjoint of omega, of r)"""
         back = -tau * omega
         by_omega = turning.jacobian(back, turning.rotated(tau * omega, r, self.fp).cross(by), self.fp)

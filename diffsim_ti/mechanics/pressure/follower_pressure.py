@@ -142,8 +142,8 @@ class FollowerPressure(HostForce):
 
 
 def pressures_at(rows: np.ndarray, instant: Instant) -> np.ndarray:
-    """Pressures and numbers of chambers at an instant, of rows in time. In a part of a pass of statics those of steps of
-    which each has its own go over from the last one's."""
+    """Pressures and numbers of chambers at an instant, of rows in time. In a part of a pass of static solves those of
+    steps of which each has its own go over from the last one's."""
     schedule, j = instant.schedule, instant.j
     if instant.laid == 1 or j == 0:
         return schedule.pressure(rows, j, instant.share)

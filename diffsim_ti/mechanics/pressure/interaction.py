@@ -59,9 +59,9 @@ class Pressures(Pressing):
         return FollowerPressure(self.faces, self.load_of, self.mesh.num_vertices)
 
     def adjoints(self, values, shape):
-        return dict(pressed_felt=(len(values.follower), self.count), pressed_rest=(self.faces.size * shape,))
+        return dict(pressure_adjoint=(len(values.follower), self.count), pressed_rest=(self.faces.size * shape,))
 
     def collect(self, found, out, shape):
-        add_at(out.follower, self.load_of, found["pressed_felt"])
+        add_at(out.follower, self.load_of, found["pressure_adjoint"])
         if shape:
             add_at(out.rest, self.vertices, found["pressed_rest"])

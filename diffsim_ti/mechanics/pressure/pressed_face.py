@@ -89,7 +89,7 @@ class PressedFace(PressedTriangle):
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
         p = self.factor(t, now, scene.follower, scene)
         felt = self.push_vjp(t, p, scene, state, s, adjoint, self.first(plan))
-        self.add_mean(t, ti.cast(-1.0 / 6.0, self.fp) * felt, now, adjoint.pressed_felt)
+        self.add_mean(t, ti.cast(-1.0 / 6.0, self.fp) * felt, now, adjoint.pressure_adjoint)
 
 
 def pressed_element(order: int, precision: str, per_step: bool, shape: bool) -> PressedTriangle:

@@ -23,11 +23,11 @@ class PressedTriangle(StepNumbers, ItemForce):
     nodes = 3
     name, reads_rest, asks_for_steps = "pressed", True, True
     arrays, derived = dict.fromkeys(("pressed", "pressed_load"), "ints"), dict(follower="vectors2")
-    adjoints = dict(pressed_felt="vectors2", pressed_rest="vectors")
+    adjoints = dict(pressure_adjoint="vectors2", pressed_rest="vectors")
 
     @traced
     def sizes(self, plan) -> dict:
-        return super().sizes(plan) | dict(pressed_felt=plan.num_pressed, pressed_rest=self.nodes * plan.num_pressed)
+        return super().sizes(plan) | dict(pressure_adjoint=plan.num_pressed, pressed_rest=self.nodes * plan.num_pressed)
 
     @ti.func
     def edges(self, t, x: A, rest: A, s, scene: A):
@@ -61,7 +61,7 @@ class PressedTriangle(StepNumbers, ItemForce):
     @ti.func
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
         """Products of the transposed derivative with adjoint.w, to corners; adds the adjoints of pressures to
-        adjoint.pressed_felt and, if `shape`, those of places to adjoint.pressed_rest."""
+        adjoint.pressure_adjoint and, if `shape`, those of places to adjoint.pressed_rest."""
         e, f = self.edges(t, state.u, scene.rest, s, scene)
         w = adjoint.w[0, scene.pressed[3 * t]]
         for a in ti.static((1, 2)):
@@ -73,4 +73,4 @@ class PressedTriangle(StepNumbers, ItemForce):
             adjoint.corner[self.first(plan) + 3 * t + a] = by
             if ti.static(self.shape):
                 adjoint.pressed_rest[3 * t + a] = adjoint.pressed_rest[3 * t + a] + by
-        self.add_mean(t, ti.cast(-1.0 / 6.0, self.fp) * w.dot(self.cross(e, f)), now, adjoint.pressed_felt)
+        self.add_mean(t, ti.cast(-1.0 / 6.0, self.fp) * w.dot(self.cross(e, f)), now, adjoint.pressure_adjoint)

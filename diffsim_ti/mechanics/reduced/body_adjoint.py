@@ -148,7 +148,7 @@ class BodyStage(Bodies):
     def add_reach(self, m, b, y, by_reach, scene: A, adjoint: A):
         """Add what the adjoint of w at vertex m of all bodies says of y, M and J."""
         z, mass = self.solve_arm(b, y, scene), scene.body_numbers[b * NUMBERS]
-        self.add_felt(m, 2 * by_reach * z, ti.cast(0, ti.f64), adjoint)
+        self.add_adjoint(m, 2 * by_reach * z, ti.cast(0, ti.f64), adjoint)
         self.add(adjoint.body_sums, b * SUMS, -by_reach / (mass * mass))
         for k in ti.static(range(6)):
             r = ti.static(PAIRS[k][0])
@@ -189,18 +189,18 @@ class BodyStage(Bodies):
                     q += y.y * wide
                     r += y.z * wide
                     by_y = self.along(by, self.wide(felt)) + self.along(w, wide)
-                    self.add_felt(m, by_y, ti.cast(0, ti.f64), adjoint)
+                    self.add_adjoint(m, by_y, ti.cast(0, ti.f64), adjoint)
                     self.add_reach(m, b, y, self.double(felt.w) * by_total, scene, adjoint)
         return o, p, q, r
 
     @traced
-    def rub_vjp(self, b, rub, u, v, by_after, source, s, now, scene, adjoint):
+    def apply_friction_vjp(self, b, slip, u, v, by_after, source, s, now, scene, adjoint):
         """(adjoint of u, of v) for that of the velocities after friction."""
         if not self.rough:
             return self.field(*[VECTOR(0, 0, 0, 0)] * 4), by_after
-        by = self.solved_vjp(b, rub.p, by_after, scene, adjoint)
-        by_total = let(self.total_of_pushes(b, source, s, rub.w, rub.total, by, now, scene))
-        sums = self.pushes_vjp(b, source, s, rub.w, rub.total, by_total, by, now, scene, adjoint)
+        by = self.solved_vjp(b, slip.p, by_after, scene, adjoint)
+        by_total = let(self.total_of_pushes(b, source, s, slip.w, slip.total, by, now, scene))
+        sums = self.pushes_vjp(b, source, s, slip.w, slip.total, by_total, by, now, scene, adjoint)
         by_u, by_v = self.spun_vjp(b, 1, u, v, self.field(*sums), scene, adjoint)
         return by_u, self.sum_of(by_after, by_v)
 
@@ -226,7 +226,7 @@ class BodyStage(Bodies):
             x += arm.x * by
             y += arm.y * by
             z += arm.z * by
-            self.add_felt(m, self.along(q, by), ti.cast(0, ti.f64), adjoint)
+            self.add_adjoint(m, self.along(q, by), ti.cast(0, ti.f64), adjoint)
         return o, x, y, z
 
     @ti.func
@@ -239,7 +239,7 @@ class BodyStage(Bodies):
                 v = self.at_arm(seen, y)
             of_u, of_v, of_f = self.at_arm(by_u, y), self.at_arm(by_v, y), self.at_arm(by_f, y)
             by_y = mass * (self.along(by_u, u) + self.along(by_v, v)) + self.along(by_f, f)
-            self.add_felt(m, by_y, u.dot(of_u) + v.dot(of_v), adjoint)
+            self.add_adjoint(m, by_y, u.dot(of_u) + v.dot(of_v), adjoint)
             adjoint.u[0, i] = adjoint.u[0, i] + self.narrow(mass * of_u)
             adjoint.v[0, i] = self.narrow(mass * of_v)
             adjoint.w[0, i] = self.narrow(of_f)
@@ -291,14 +291,14 @@ class BodyStage(Bodies):
         seen = self.shown(b, u, v, f, now.pre, scene)
         start, share = self.chosen(halts, seen, v), now.pre_adj + now.post
         kicked = self.kicked(start, share, f)
-        rub = self.rub(b, u, kicked, state.u, s, now, scene)
-        turn = self.turn(b, u, rub.after, now, scene)
-        displaced, moving = self.moved(b, u, rub.after, turn, now, scene)
+        slip = self.apply_friction(b, u, kicked, state.u, s, now, scene)
+        turn = self.turn(b, u, slip.after, now, scene)
+        displaced, moving = self.moved(b, u, slip.after, turn, now, scene)
         by_v = self.field_of(self.spread_vjp(b, 0, adjoint.v, moving, scene, adjoint))
         by_u = self.field_of(self.spread_u(b, displaced, now, scene, adjoint))
         self.start_u(b, now, scene, adjoint)
-        of_u, of_after = self.moved_vjp(b, u, rub.after, turn, by_u, by_v, now, scene, adjoint)
-        more_u, of_kicked = self.rub_vjp(b, rub, u, kicked, of_after, state.u, s, now, scene, adjoint)
+        of_u, of_after = self.moved_vjp(b, u, slip.after, turn, by_u, by_v, now, scene, adjoint)
+        more_u, of_kicked = self.apply_friction_vjp(b, slip, u, kicked, of_after, state.u, s, now, scene, adjoint)
         of_seen = self.field_of(self.spread_frame(b, seen, now, scene, adjoint))
         w = self.kicked(v, now.pre, f)
         shown_u, of_w = self.spun_vjp(b, self.unless(halts, now.pre), u, w, of_seen, scene, adjoint)

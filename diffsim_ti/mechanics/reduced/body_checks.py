@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from diffsim_ti.mechanics.obstacles.felt_faces import feels_faces
+from diffsim_ti.mechanics.obstacles.face_contact_points import has_face_contact
 from diffsim_ti.terms import SelfContact
 
 if TYPE_CHECKING:
@@ -23,15 +23,15 @@ def check_bodies(scene: "Scene", contact: str) -> None:
             f"{said} take obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
             'contact="force"'
         )
-    if feels_faces(scene):
+    if has_face_contact(scene):
         raise ValueError(
             f"{said} touch obstacles at their vertices only in explicit steps, and an obstacle could reach into a face "
             "here: take a finer mesh, a wider barrier, or an implicit solver"
         )
     if scene.holds_volumes:
         raise ValueError(f"{said} and FilledChamber do not go together in explicit steps: take an implicit solver")
-    rubbing = scene.term(SelfContact)
-    if rubbing and rubbing.has_friction:
+    self_contact = scene.term(SelfContact)
+    if self_contact and self_contact.has_friction:
         raise ValueError(
             f"{said} have no friction in SelfContact in explicit steps, which slows every vertex by itself: leave it "
             "out, or take an implicit solver"

@@ -37,9 +37,9 @@ class BodyFriction(ObstacleStages):
             for k in range(g.count):
                 first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
-                    wall = self.wall(g, k, X, u, now, scene)
+                    v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
                     time = self.time(g, i, now, scene)
-                    out += grip.impulse(g.force, scene.parameters, first, X, u, v, wall, time, total)
+                    out += grip.impulse(g.force, scene.parameters, first, X, u, v, v_obstacle, time, total)
         return out
 
     @ti.func
@@ -69,8 +69,8 @@ class BodyFriction(ObstacleStages):
                 first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
                     moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
-                    wall = self.wall(g, k, X, u, now, scene)
-                    dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                    v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
+                    dv_obstacle = self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
                     time, dtime = self.time(g, i, now, scene), self.dtime(g, i, now, tangent)
                     out += grip.impulse_jvp(
                         g.force,
@@ -79,13 +79,13 @@ class BodyFriction(ObstacleStages):
                         X,
                         u,
                         v,
-                        wall,
+                        v_obstacle,
                         time,
                         total,
                         tangent.parameters,
                         moved,
                         dv,
-                        dwall,
+                        dv_obstacle,
                         dtime,
                         dtotal,
                     )
@@ -99,9 +99,9 @@ class BodyFriction(ObstacleStages):
             for k in range(g.count):
                 first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
-                    wall = self.wall(g, k, X, u, now, scene)
+                    v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
                     time = self.time(g, i, now, scene)
-                    out += grip.total_vjp(g.force, scene.parameters, first, X, u, v, wall, time, total, w)
+                    out += grip.total_vjp(g.force, scene.parameters, first, X, u, v, v_obstacle, time, total, w)
         return out
 
     @ti.func
@@ -113,12 +113,12 @@ class BodyFriction(ObstacleStages):
             for k in range(g.count):
                 first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
-                    wall = self.wall(g, k, X, u, now, scene)
+                    v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
                     time = self.time(g, i, now, scene)
-                    by_place, by_v, by_wall, by_time, by, own = grip.vjp(
-                        g.force, scene.parameters, first, X, u, v, wall, time, total, w, load_adj
+                    by_place, by_v, by_v_obstacle, by_time, by, own = grip.vjp(
+                        g.force, scene.parameters, first, X, u, v, v_obstacle, time, total, w, load_adj
                     )
-                    by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
+                    by_u = self.spread(g, k, i, X, u, by_place, by_v_obstacle, now, scene, adjoint, adjoint)
                     u_adj += by_u
                     v_adj += by_v
                     felt += own

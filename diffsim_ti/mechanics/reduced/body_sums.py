@@ -12,7 +12,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.reduced.body_motion import VECTOR, columns
 from diffsim_ti.runtime import Bundle, at, let, traced
-from diffsim_ti.state.bodies import FELT, NUMBERS, PAIRS, SUMS
+from diffsim_ti.state.bodies import NUMBERS, PAIRS, SIZE, SUMS
 
 if TYPE_CHECKING:
     from diffsim_ti.solvers.explicit.kick_drift import KickDrift
@@ -188,9 +188,9 @@ class BodySums:
         array[k] = array[k] + x
 
     @ti.func
-    def add_felt(self, m, by_y, by_mass, adjoint: A):
+    def add_adjoint(self, m, by_y, by_mass, adjoint: A):
         """Of vertex m of all bodies."""
-        first = FELT * m
+        first = SIZE * m
         for d in ti.static(range(3)):
-            adjoint.body_felt[first + d] = adjoint.body_felt[first + d] + by_y[d]
-        adjoint.body_felt[first + 3] = adjoint.body_felt[first + 3] + by_mass
+            adjoint.body_adjoints[first + d] = adjoint.body_adjoints[first + d] + by_y[d]
+        adjoint.body_adjoints[first + 3] = adjoint.body_adjoints[first + 3] + by_mass

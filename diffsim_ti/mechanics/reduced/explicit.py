@@ -162,7 +162,7 @@ class Bodies(BodySums):
         return self.field(a.o + b.o, a.x + b.x, a.y + b.y, a.z + b.z)
 
     @traced
-    def rub(self, b, u, v, source, s, now, scene):
+    def apply_friction(self, b, u, v, source, s, now, scene):
         """Velocities after friction, with C, the velocities w that it sees, and what it adds, p."""
         if not self.rough:
             return Bundle(after=v)
@@ -184,8 +184,8 @@ class Bodies(BodySums):
                 i = scene.body_vertex[m]
                 state.frames_u[now.frame, i] = state.u[s, i]
                 state.frames_v[now.frame, i] = self.narrow(self.at_arm(seen, self.arm(m, b, scene)))
-        rub = self.rub(b, u, self.kicked(v, now.pre + now.post, f), state.u, s, now, scene)
-        displaced, moving = self.moved(b, u, rub.after, self.turn(b, u, rub.after, now, scene), now, scene)
+        slip = self.apply_friction(b, u, self.kicked(v, now.pre + now.post, f), state.u, s, now, scene)
+        displaced, moving = self.moved(b, u, slip.after, self.turn(b, u, slip.after, now, scene), now, scene)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             self.go(m, b, displaced, moving, s, t, now, scene, state, plan)
 
@@ -309,14 +309,14 @@ class Bodies(BodySums):
         return o, p, q, r
 
     @traced
-    def rub_jvp(self, b, rub, u, v, du, dv, source, s, now, scene, tangent):
+    def apply_friction_jvp(self, b, slip, u, v, du, dv, source, s, now, scene, tangent):
         """Change of the velocities after friction."""
         if not self.rough:
             return dv
         dtotal = let(self.total_jvp(b, source, s, now, scene, tangent))
         dw = self.spun_jvp(b, u, v, du, dv, scene, tangent)
-        sums = self.pushes_jvp(b, source, s, rub.w, dw, rub.total, dtotal, now, scene, tangent)
-        return self.sum_of(dv, self.solved_jvp(b, rub.p, sums, scene, tangent))
+        sums = self.pushes_jvp(b, source, s, slip.w, dw, slip.total, dtotal, now, scene, tangent)
+        return self.sum_of(dv, self.solved_jvp(b, slip.p, sums, scene, tangent))
 
     @ti.func
     def step_jvp(self, b, j, now: A, scene: A, state: A, tangent: A, plan: A):
@@ -334,12 +334,12 @@ class Bodies(BodySums):
                 tangent.frames_v[now.frame, i] = self.narrow(self.at_arm(dseen, y) + self.slope_at(seen, dy))
         share = now.pre + now.post
         kicked, dkicked = self.kicked(v, share, f), self.kicked(dv, share, pulled)
-        rub = self.rub(b, u, kicked, state.u, s, now, scene)
-        dafter = self.rub_jvp(b, rub, u, kicked, du, dkicked, state.u, s, now, scene, tangent)
-        turn = self.turn(b, u, rub.after, now, scene)
-        displaced, moving = self.moved(b, u, rub.after, turn, now, scene)
+        slip = self.apply_friction(b, u, kicked, state.u, s, now, scene)
+        dafter = self.apply_friction_jvp(b, slip, u, kicked, du, dkicked, state.u, s, now, scene, tangent)
+        turn = self.turn(b, u, slip.after, now, scene)
+        displaced, moving = self.moved(b, u, slip.after, turn, now, scene)
         dalpha, ddecay = now.alpha_by_rate * plan.rate_dot, now.decay_by_rate * plan.rate_dot
-        ddisplaced, dmoving = self.moved_jvp(b, u, rub.after, turn, du, dafter, dalpha, ddecay, now, scene, tangent)
+        ddisplaced, dmoving = self.moved_jvp(b, u, slip.after, turn, du, dafter, dalpha, ddecay, now, scene, tangent)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
             if now.alpha > 0:

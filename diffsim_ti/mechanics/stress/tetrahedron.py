@@ -190,16 +190,16 @@ class Tetrahedron(Growing):
         implicit pass."""
         p = self.grown(item, self.coefficients_of(item, scene.coefficients), scene)
         p = [*p, *self.state_of(item, at.z, s, q)] if self.has_state else p
-        return [*p, *self.held_of(item, at.held, q), self.rate_of(at)] if self.holds(at) else p
+        return [*p, *self.frozen_of(item, at.held, q), self.rate_of(at)] if self.holds(at) else p
 
     def holds(self, at) -> bool:
         """Whether what the law holds in a pass is there."""
-        return bool(self.law.held_names) and hasattr(at, "held")
+        return bool(self.law.frozen_names) and hasattr(at, "held")
 
     @traced
-    def held_of(self, item, held, q: int = 0) -> list:
+    def frozen_of(self, item, held, q: int = 0) -> list:
         """What is held in a pass at point q."""
-        n = len(self.law.held_names)
+        n = len(self.law.frozen_names)
         return self.items.row(held, 0, n * q, n, n * self.nodes.points, item)
 
     @traced
@@ -290,7 +290,7 @@ class Tetrahedron(Growing):
     def _numbers_jvp(self, item, change, dots, q) -> list:
         dp = self.grown(item, self.coefficients_of(item, dots.coefficients), dots)
         dp = [*dp, *self.state_of(item, change.z, 0, q)] if self.has_state else dp
-        return [*dp, *self.held_of(item, change.held, q), let(0 * dp[0])] if self.holds(change) else dp
+        return [*dp, *self.frozen_of(item, change.held, q), let(0 * dp[0])] if self.holds(change) else dp
 
     @traced
     def forces_vjp(self, item, scene, at, s, w, corner, adjoint, shape: bool, add: bool = False) -> None:

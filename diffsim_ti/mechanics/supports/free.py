@@ -1,4 +1,4 @@
-"""What vertices may do where some are held in some directions alone."""
+"""Admissible motions of vertices, of which some are fixed in some directions only."""
 
 import numpy as np
 
@@ -6,21 +6,21 @@ import numpy as np
 class FreeDirections:
     """Projectors of vertices: `x * free` takes from vectors, shape (num_vertices, 3), what is held of them.
 
-    mask: (num_vertices, 1), 0 where a vertex is held wholly, else 1; guided: the vertices that are held in some directions,
+    mask: (num_vertices, 1), 0 where a vertex is fixed wholly, else 1; guided: the fixed vertices in some directions,
     with projectors onto these, shape (k, 3, 3).
     """
 
     __array_ufunc__ = None  # so that NumPy leaves x * free to this class
 
-    def __init__(self, mask: np.ndarray, guided: np.ndarray, guides: np.ndarray):
-        self.mask, self.guided, self.guides = mask, guided, guides
+    def __init__(self, mask: np.ndarray, partly_fixed: np.ndarray, sliding_supports: np.ndarray):
+        self.mask, self.partly_fixed, self.sliding_supports = mask, partly_fixed, sliding_supports
 
     def __rmul__(self, x: np.ndarray) -> np.ndarray:
         out = x * self.mask
-        guided = out[self.guided, :, None]
+        partly_fixed = out[self.partly_fixed, :, None]
         for _ in range(2):  # where next to nothing is free, once leaves as much rounding of what is held
-            guided = guided - self.guides @ guided
-        out[self.guided] = guided[..., 0]
+            partly_fixed = partly_fixed - self.sliding_supports @ partly_fixed
+        out[self.partly_fixed] = partly_fixed[..., 0]
         return out
 
     __mul__ = __rmul__
@@ -33,18 +33,20 @@ class FreeDirections:
     def projectors(self) -> np.ndarray:
         """Of all vertices, shape (num_vertices, 3, 3)."""
         out = self.mask[:, :, None] * np.eye(3)
-        out[self.guided] -= self.guides
+        out[self.partly_fixed] -= self.sliding_supports
         return out
 
     def of(self, vertices: np.ndarray) -> "FreeDirections":
         """The same of some vertices, sorted, by their places."""
-        here = np.isin(self.guided, vertices)
-        return FreeDirections(self.mask[vertices], np.searchsorted(vertices, self.guided[here]), self.guides[here])
+        here = np.isin(self.partly_fixed, vertices)
+        return FreeDirections(
+            self.mask[vertices], np.searchsorted(vertices, self.partly_fixed[here]), self.sliding_supports[here]
+        )
 
     def around(self, blocks: np.ndarray) -> np.ndarray:
         """P B P for a block of each vertex, shape (num_vertices, 3, 3)."""
-        P, out = np.eye(3) - self.guides, np.array(blocks)
-        out[self.guided] = P @ blocks[self.guided] @ P
+        P, out = np.eye(3) - self.sliding_supports, np.array(blocks)
+        out[self.partly_fixed] = P @ blocks[self.partly_fixed] @ P
         return out
 
 
@@ -54,8 +56,8 @@ class FreeBodies(FreeDirections):
     rigid: of what sets that do not deform feel where they stand (rigid_sets.py); None: of all motions of their vertices.
     """
 
-    def __init__(self, mask: np.ndarray, guided: np.ndarray, guides: np.ndarray, reduced, rigid=None):
-        super().__init__(mask, guided, guides)
+    def __init__(self, mask: np.ndarray, partly_fixed: np.ndarray, sliding_supports: np.ndarray, reduced, rigid=None):
+        super().__init__(mask, partly_fixed, sliding_supports)
         self.reduced, self.rigid = reduced, rigid
 
     def __rmul__(self, x: np.ndarray) -> np.ndarray:
@@ -66,10 +68,10 @@ class FreeBodies(FreeDirections):
 
     @property
     def linear(self) -> "FreeBodies":
-        return FreeBodies(self.mask, self.guided, self.guides, self.reduced)
+        return FreeBodies(self.mask, self.partly_fixed, self.sliding_supports, self.reduced)
 
 
-Free = np.ndarray | FreeDirections  # numbers (num_vertices, 1) where no vertex is held in some directions alone
+Free = np.ndarray | FreeDirections  # numbers (num_vertices, 1) where no vertex is fixed in some directions only
 
 
 def mask_of(free: Free) -> np.ndarray:

@@ -93,9 +93,9 @@ class CurvedFriction:
         """|C| inverse |C|^T load, as kernels have it."""
         return self.size @ (inverse[:, 0] * (self.size.T @ load)) / self.lightness
 
-    def _where_it_rubs(self, of_points) -> np.ndarray:
+    def _where_friction_acts(self, of_points) -> np.ndarray:
         """Numbers of points, of which others are left over from earlier passes."""
-        return np.where(runtime.fetch(self.inner.own.rubs) > 0, runtime.fetch(of_points).astype(np.float64), 0.0)
+        return np.where(runtime.fetch(self.inner.own.in_friction) > 0, runtime.fetch(of_points).astype(np.float64), 0.0)
 
     def freed(self, x: np.ndarray) -> np.ndarray:
         """What nodes may do of vectors."""
@@ -121,9 +121,9 @@ class CurvedFriction:
         self._weigh()
         own = self.inner.own
         self.inner.measure(self.pairs.fine(u, slot), 0)
-        self.rubs = bool(runtime.fetch(own.any)[0])
-        if self.rubs:
-            self.load = self._where_it_rubs(own.load)
+        self.in_friction = bool(runtime.fetch(own.any)[0])
+        if self.in_friction:
+            self.load = self._where_friction_acts(own.load)
             runtime.fill(own.load, self._spread(self.load, self.inverse))
 
     def _state(self) -> dict:
@@ -132,7 +132,7 @@ class CurvedFriction:
     def slide(self, history, slot: int, plan, recording: bool) -> None:
         if recording:
             self.kept[slot] = None
-        if not (plan.alpha > 0 and self.rubs):
+        if not (plan.alpha > 0 and self.in_friction):
             return
         u, v = self.rows.get(history.u, slot), self.rows.get(history.v, slot)
         before = self._at_points(v)
@@ -163,11 +163,11 @@ class CurvedFriction:
 
     def begin_jvp(self, history, slot: int, u_dot, numbers) -> None:
         self._begin(history, slot)
-        if not self.rubs:
+        if not self.in_friction:
             return
         own, moved = self.inner.own, self.pairs.fine_numbers(numbers)
         self.inner.changes(self.pairs.fine(history.u, slot), 0, self.pairs.fine_change(u_dot), moved)
-        change = self._where_it_rubs(own.load_dot)
+        change = self._where_friction_acts(own.load_dot)
         self.inverse_dot = -(self.inverse**2) * runtime.fetch(numbers.mass).astype(np.float64)[self.rows.nodes, None]
         spread = self._spread(change, self.inverse) + self._spread(self.load, self.inverse_dot)
         runtime.fill(own.load_dot, spread)
@@ -216,7 +216,7 @@ class CurvedFriction:
         at = self._state() | inner.adjoints | dict(v_adj=self.dv)
         inner.run(inner.kernels.pairs_vjp, at, slot=0, keep=0, **of_pass)
         self.rows.put(adjoint.v, 0, q + self._of_points(self.dv))
-        by_load = self._where_it_rubs(own.load_adj)
+        by_load = self._where_friction_acts(own.load_adj)
         by_inverse = (self.size.T @ by_load) * (self.size.T @ self.load) / self.lightness
         self.by_mass[:, 0] -= self.inverse[:, 0] ** 2 * by_inverse
         runtime.fill(own.load_adj, self._spread(by_load, self.inverse))
@@ -234,7 +234,7 @@ class CurvedFriction:
 
 
 def friction_of(pairs):
-    """Of CurvedPairs whose pairs rub; else None."""
+    """Of CurvedPairs whose pairs have friction; else None."""
     if pairs.inner.friction is None:
         return None
     kind = CurvedLaggedFriction if isinstance(pairs.inner.friction, LaggedFriction) else CurvedFriction

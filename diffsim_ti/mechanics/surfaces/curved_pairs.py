@@ -89,7 +89,11 @@ class FinerArrays:
         self.scene, self.mesh, self.precision = arrays, surface, arrays.precision
         self.self_contact, self.num_vertices = arrays.self_contact, surface.num_vertices
         self.parameters_of_self_contact = arrays.parameters_of_self_contact
-        self.fp, self.vector, self.supports = arrays.fp, arrays.vector, SimpleNamespace(guided=())  # nodes are held
+        self.fp, self.vector, self.supports = (
+            arrays.fp,
+            arrays.vector,
+            SimpleNamespace(partly_fixed=()),
+        )  # nodes are held
         self.rest = runtime.array(arrays.vector, surface.num_vertices)
         self.corner = runtime.array(arrays.vector, len(surface.surface_vertices))
         self._rest_of = None
@@ -251,8 +255,8 @@ class CurvedPairs:
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         return self.inner.safe_share(self._spread(u), self._spread(step), most)
 
-    def way_is_free(self, u: np.ndarray, step: np.ndarray) -> bool:
-        return self.inner.way_is_free(self._spread(u), self._spread(step))
+    def is_collision_free(self, u: np.ndarray, step: np.ndarray) -> bool:
+        return self.inner.is_collision_free(self._spread(u), self._spread(step))
 
     def check_end(self, u: np.ndarray, u_next: np.ndarray) -> None:
         self.inner.check_end(self._spread(u), self._spread(u_next))

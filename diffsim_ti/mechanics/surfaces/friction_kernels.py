@@ -6,8 +6,9 @@ its corners the impulses w_i r,
     r = -h mu N f(s / eps) t / |t|,   s + c f(s / eps) = |t|,   c = h sum_i (|w_i| / m_i) S_i,   S_i = sum |w_i| mu N
 
 the last sum over all pairs of vertex i; f(y) = 2 y - y^2 for y < 1, 1 beyond (terms/obstacles/friction.py). c / (h mu N) is
-a bound W of the inverse mass that the pair meets while all others rub too: by Cauchy and Schwarz |sum_p r_p w_p|^2 / m is
-at most sum_p W_p |r_p|^2. With r_p = -(1 - s / |t|) t / W_p all frictions together change the kinetic energy by no more than
+a bound W of the inverse mass that the pair meets while all others have friction, too: by Cauchy and Schwarz |sum_p r_p
+w_p|^2 / m is at most sum_p W_p |r_p|^2. With r_p = -(1 - s / |t|) t / W_p all frictions together change the kinetic
+energy by no more than
 
     sum_p (r_p . t_p + W_p |r_p|^2 / 2) = -sum_p (|t|^2 - s^2) / 2 W_p <= 0
 
@@ -29,7 +30,9 @@ from diffsim_ti.terms.self_contact import SelfContact
 
 A = ti.template()
 SIGNS = ((1, -1, -1, -1), (1, 1, -1, -1))  # of the weights of the corners
-OWN = dict(weights="vectors", pressing="vectors", load="scalars", rubs="ints", label="ints", row_of="ints", any="ints")
+OWN = dict(
+    weights="vectors", pressing="vectors", load="scalars", in_friction="ints", label="ints", row_of="ints", any="ints"
+)
 STATE = dict(u="vectors2", v="vectors2", inverse_mass="scalars", kept_u="vectors2", kept_v="vectors2")
 PASS = dict(keep="int", h="float", ratio="float")
 DOT = dict(weights_dot="vectors", pressing_dot="vectors", load_dot="scalars")
@@ -47,7 +50,7 @@ class FrictionKernels(ListedPair):
     derivatives take the state in the slot as it is before the stage.
     """
 
-    guided: bool
+    partly_fixed: bool
     num_labels: int
 
     @cached_property
@@ -56,16 +59,16 @@ class FrictionKernels(ListedPair):
 
     @property
     def state(self) -> dict:
-        return STATE | (dict(guide_slot="ints", guides="vectors") if self.guided else {})
+        return STATE | (dict(sliding_slot="ints", sliding_supports="vectors") if self.partly_fixed else {})
 
     @ti.func
     def may(self, i, x, at: A):
-        """What vertex i may do of x: all but what is held of it (mechanics/supports/guides.py)."""
+        """The admissible part of x for vertex i: all but what is held of it (mechanics/supports/sliding_supports.py)."""
         out = x
-        if ti.static(self.guided):
-            if at.guide_slot[i] >= 0:
+        if ti.static(self.partly_fixed):
+            if at.sliding_slot[i] >= 0:
                 for d in ti.static(range(3)):
-                    out[d] = x[d] - at.guides[3 * at.guide_slot[i] + d].dot(x)
+                    out[d] = x[d] - at.sliding_supports[3 * at.sliding_slot[i] + d].dot(x)
         return out
 
     @ti.func
@@ -131,7 +134,7 @@ class FrictionKernels(ListedPair):
 
     @ti.func
     def sum_of_corners(self, s, scene: A):
-        """What the pairs of surface vertex s that rub have stored for it."""
+        """What the pairs of surface vertex s with friction have stored for it."""
         total = self.vec4(0)
         for k in range(scene.row[s], scene.row[s + 1]):
             if scene.pressing[scene.corner_of[k] >> 2][3] > 0:
@@ -144,7 +147,7 @@ class FrictionKernels(ListedPair):
     def measure_pair(self, kind: A, p, scene: A, at: A, plan: A):
         pressing = self.vec4(0)
         mu = self.mu(p, scene)
-        if self.is_felt(p, scene) and mu > 0:
+        if self.is_active(p, scene) and mu > 0:
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             w, n, N = self.pair.pressed(kind, p, y1, y2, y3, scene, plan)
             pressing = self.vec4(n[0], n[1], n[2], mu * N)
@@ -152,7 +155,7 @@ class FrictionKernels(ListedPair):
             if mu * N > 0:
                 scene.any[0] = 1
                 for k in ti.static(range(4)):
-                    scene.rubs[scene.place[scene.pairs[4 * p + k]]] = 1
+                    scene.in_friction[scene.place[scene.pairs[4 * p + k]]] = 1
         scene.pressing[p] = pressing
 
     @ti.func
@@ -166,7 +169,7 @@ class FrictionKernels(ListedPair):
                 self.measure_pair(EDGE_EDGE, p, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            if scene.rubs[s] > 0:
+            if scene.in_friction[s] > 0:
                 scene.load[s] = self.sum_sizes(s, scene.pressing, scene)
 
     @cached_property
@@ -208,8 +211,8 @@ class FrictionKernels(ListedPair):
             i = scene.surface[s]
             if plan.keep >= 0:
                 at.kept_u[plan.keep, s], at.kept_v[plan.keep, s] = at.u[plan.slot, i], at.v[plan.slot, i]
-            if scene.rubs[s] > 0:
-                scene.rubs[s] = 0
+            if scene.in_friction[s] > 0:
+                scene.in_friction[s] = 0
                 gained = at.inverse_mass[i] * self.may(i, self.sum_of_corners(s, scene), at)
                 at.v[plan.slot, i] = at.v[plan.slot, i] + gained
                 at.u[plan.slot, i] = at.u[plan.slot, i] + plan.ratio * gained
@@ -266,7 +269,7 @@ class FrictionKernels(ListedPair):
         self.each_pressing(self.measure_pair_jvp, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            if scene.rubs[s] > 0:
+            if scene.in_friction[s] > 0:
                 total = self.sum_sizes(s, scene.pressing_dot, scene)
                 for k in range(scene.row[s], scene.row[s + 1]):
                     p, corner = scene.corner_of[k] >> 2, scene.corner_of[k] & 3
@@ -313,7 +316,7 @@ class FrictionKernels(ListedPair):
         self.each_pressing(self.slide_pair_jvp, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            if scene.rubs[s] > 0:
+            if scene.in_friction[s] > 0:
                 i = scene.surface[s]
                 inverse, gained = at.inverse_mass[i], at.kept_v[plan.keep, s] - at.v[plan.slot, i]
                 change = inverse * self.may(i, self.sum_of_corners(s, scene), at) + -inverse * at.mass_dot[i] * gained
@@ -435,7 +438,7 @@ class FrictionKernels(ListedPair):
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             at.by_place[s] = self.vec4(0)
-            if scene.rubs[s] > 0:
+            if scene.in_friction[s] > 0:
                 self.collect_vertex(s, scene, at, plan)
 
     @cached_property
@@ -450,7 +453,7 @@ class FrictionKernels(ListedPair):
         self.each_pressing(self.slide_pair_vjp, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            if scene.rubs[s] > 0:
+            if scene.in_friction[s] > 0:
                 self.end_vertex(s, scene, at, plan)
 
     @cached_property
@@ -465,7 +468,7 @@ class FrictionKernels(ListedPair):
     def slide_all_vjp(self, scene: A, at: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            if scene.rubs[s] > 0:
+            if scene.in_friction[s] > 0:
                 self.pull(s, scene, at, plan)
         self.all_pairs_vjp(scene, at, plan)
         self.measure_all_vjp(scene, at, plan)

@@ -40,7 +40,7 @@ class HessianKernels(ListedPair):
     @ti.func
     def product(self, kind: A, p, scene: A, at: A, plan: A):
         h1, h2, h3 = self.vec3(0), self.vec3(0), self.vec3(0)
-        if self.is_felt(p, scene):
+        if self.is_active(p, scene):
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
             w, n, k = self.stiffness_along(kind, p, y1, y2, y3, scene, plan)
@@ -60,7 +60,7 @@ class HessianKernels(ListedPair):
     def root(self, kind: A, p, scene: A, at: A, plan: A):
         """Of each corner, the vector c with c c^T its diagonal block of the convex part."""
         c = (self.vec4(0), self.vec4(0), self.vec4(0), self.vec4(0))
-        if self.is_felt(p, scene):
+        if self.is_active(p, scene):
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             w, n, k = self.stiffness_along(kind, p, y1, y2, y3, scene, plan)
             for a in ti.static(range(4)):

@@ -52,8 +52,8 @@ class ImplicitPairs(SurfacePairs):
         self.run(self.hessian.blocks, dict(u=u, out=out), slot=0)
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
-        """A share of the step, at most `most`, up to which no two primitives meet on the way; close to the largest such
-        share only where they are about to meet. Marches along the step, with a new list at each halt."""
+        """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
+        largest such share only where they are about to meet. Marches along the step, with a new list at each halt."""
         travel = self._travel(step[self.mesh.surface_vertices])
         if not travel.any():
             return most
@@ -78,8 +78,8 @@ class ImplicitPairs(SurfacePairs):
         self.run(self.hessian.shares, dict(w=self.step, out=out), slot=0, most=SAFE)
         return runtime.fetch(out)[: self.list.count].astype(np.float64)
 
-    def way_is_free(self, u: np.ndarray, step: np.ndarray) -> bool:
-        """Whether no two primitives meet on the way from u to u + step; narrow gaps may pass for closed."""
+    def is_collision_free(self, u: np.ndarray, step: np.ndarray) -> bool:
+        """Whether no two primitives meet on the motion from u to u + step; narrow gaps may pass for closed."""
         for _ in range(self.longest_march):
             share = self.safe_share(u, step)
             if share == 1 or share < 1e-3:
@@ -88,8 +88,8 @@ class ImplicitPairs(SurfacePairs):
         return False
 
     def check_end(self, u: np.ndarray, u_next: np.ndarray) -> None:
-        """Raise Tunnelling unless the way from u to u_next is free."""
-        if not self.way_is_free(u, u_next - u):
+        """Raise Tunnelling unless nothing collides on the motion from u to u_next."""
+        if not self.is_collision_free(u, u_next - u):
             self.fresh = False
             raise Tunnelling(
                 "beyond the middle of a step, where its forces were taken, surfaces may have gone through each other: take "

@@ -109,7 +109,7 @@ class ListedPair(Pair):
         return by_stiffness / share, share * (by_width - by_share / W), ti.cast(0.5, self.fp) * by_share / W
 
     @ti.func
-    def is_felt(self, p, scene: A):
+    def is_active(self, p, scene: A):
         """Whether pair p is nearer than the width, by the plane that `forces` left here."""
         return not scene.plane[p][3] > self.width(p, scene)
 

@@ -25,17 +25,19 @@ class PairFriction:
         self.pairs, a = pairs, pairs.a
         self.a, self.num_surface = a, len(a.mesh.surface_vertices)
         labels, rows = pairs.term.labels(a.mesh)
-        self.num_rows, guided = int(rows.max()) + 1, bool(len(a.supports.guided))
-        self.kernels = kernels_of(FrictionKernels, a.precision, pairs.first, pairs.parallel, guided, len(rows))
+        self.num_rows, partly_fixed = int(rows.max()) + 1, bool(len(a.supports.partly_fixed))
+        self.kernels = kernels_of(FrictionKernels, a.precision, pairs.first, pairs.parallel, partly_fixed, len(rows))
         n = self.num_surface
         self.own = SimpleNamespace(
-            any=runtime.array(ti.i32, 1), rubs=runtime.array(ti.i32, n), load=runtime.array(a.fp, n)
+            any=runtime.array(ti.i32, 1), in_friction=runtime.array(ti.i32, n), load=runtime.array(a.fp, n)
         )
-        runtime.fill(self.own.rubs, 0)
+        runtime.fill(self.own.in_friction, 0)
         self.own.label, self.own.row_of = runtime.upload(labels, ti.i32), runtime.upload(rows.ravel(), ti.i32)
         self.kept_u = self.kept_v = runtime.array(a.vector, 1, 1)
         self.adjoints = None
-        self._guides = dict(guide_slot=a.guide_slot, guides=a.guides) if guided else {}
+        self._sliding_supports = (
+            dict(sliding_slot=a.sliding_slot, sliding_supports=a.sliding_supports) if partly_fixed else {}
+        )
 
     def make_room(self) -> None:
         """Arrays of a new list."""
@@ -48,14 +50,14 @@ class PairFriction:
             setattr(self.own, name, self.pairs.list.buffers.take(f"{name} of friction", dtype, self.pairs.list.count))
 
     def run(self, kernel, at: dict, **numbers) -> None:
-        self.pairs.run(kernel, at | self._guides, self.own, **numbers)
+        self.pairs.run(kernel, at | self._sliding_supports, self.own, **numbers)
 
     def _state(self, history) -> dict:
         return dict(u=history.u, v=history.v, inverse_mass=self.a.inverse_mass, kept_u=self.kept_u, kept_v=self.kept_v)
 
     @staticmethod
     def pass_numbers(plan) -> dict:
-        """Length of a pass, and the way by a change of velocity after it."""
+        """Length of a pass, and the displacement by a change of velocity after it."""
         return dict(h=plan.h, ratio=plan.alpha / plan.decay)
 
     def keep(self, num_slots: int) -> None:
@@ -176,5 +178,5 @@ class PairFriction:
 
 
 def ratio_by_rate(plan) -> float:
-    """Derivative of the way by a change of velocity after a pass, alpha / decay, by the drag rate."""
+    """Derivative of the displacement by a change of velocity after a pass, alpha / decay, by the drag rate."""
     return (plan.alpha_by_rate * plan.decay - plan.alpha * plan.decay_by_rate) / plan.decay**2

@@ -80,7 +80,7 @@ class PairKernels(ListedPair):
             if scene.touched[s] > 0:
                 scene.touched[s] = 0
                 for k in range(scene.row[s], scene.row[s + 1]):
-                    if self.is_felt(scene.corner_of[k] >> 2, scene):
+                    if self.is_active(scene.corner_of[k] >> 2, scene):
                         total += scene.corner[scene.corner_of[k]]
             at.out[plan.first_out + s] = total
             scene.before[s] = at.u[plan.slot, scene.surface[s]]
@@ -99,7 +99,7 @@ class PairKernels(ListedPair):
     @ti.func
     def product(self, kind: A, p, scene: A, at: A, plan: A):
         h1, h2, h3, numbers = self.vec3(0), self.vec3(0), self.vec3(0), self.vec4(0)
-        if plan.has_planes == 0 or self.is_felt(p, scene):
+        if plan.has_planes == 0 or self.is_active(p, scene):
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
             d_rest = ti.cast(0, self.fp)

@@ -58,8 +58,8 @@ class ExplicitAdjoint:
         rates = "H_dot" in a.law.reads or any(x.reads_rates for x in has.interactions)
         out = dict.fromkeys(("u", "v", "w"), (1, n))
         out |= dict(corner=a.corner.shape, rate_corner=a.corner.shape if rates else (1,))
-        # of paths: what each vertex felt in the steps that a launch goes through, and the sums of that
-        out["felt"] = 2 * moving * self._most_steps(workspace), n if moving else 1
+        # of paths: the adjoint by each vertex in the steps that a launch goes through, and the sums of that
+        out["path_adjoint"] = 2 * moving * self._most_steps(workspace), n if moving else 1
         out["path"] = a.path.shape[0], moving * self.num_parts
         for x in a.interactions:
             out |= x.adjoints(a.values, has.shape)
@@ -129,7 +129,7 @@ class ExplicitAdjoint:
     def norm(self) -> tuple[float, float]:
         """Euclidean norms of the adjoints of displacement and velocity where the sweep stands.
 
-        Held vertices have no velocity, and affine sets only the motions that they can do.
+        Fixed vertices have no velocity, and affine sets only admissible motions.
         """
         self.complete()
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (self.u, self.v))

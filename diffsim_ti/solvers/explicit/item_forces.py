@@ -5,7 +5,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.mechanics.supports.guides import GUIDED
+from diffsim_ti.mechanics.supports.sliding_supports import SLIDING_SUPPORTS
 from diffsim_ti.runtime import let, traced
 from diffsim_ti.state.bodies import BODIES
 from diffsim_ti.state.features import Features
@@ -64,7 +64,7 @@ class ItemForces:
         has, out = self.features, {}
         for part in has.in_kernels:
             out |= part.arrays | part.derived
-        return out | (GUIDED if has.guided else {}) | (BODIES if has.reduced else {})
+        return out | (SLIDING_SUPPORTS if has.partly_fixed else {}) | (BODIES if has.reduced else {})
 
     @property
     def derived(self) -> dict:
@@ -82,7 +82,7 @@ class ItemForces:
         out = {}
         for part in self.features.in_kernels:
             out |= part.adjoints
-        return out | (dict(body_felt="doubles", body_sums="doubles") if self.features.reduced else {})
+        return out | (dict(body_adjoints="doubles", body_sums="doubles") if self.features.reduced else {})
 
     @property
     def counts(self) -> dict:

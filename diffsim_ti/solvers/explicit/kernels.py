@@ -397,7 +397,7 @@ class ExplicitKernels:
         """
         numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
         own = adjoints(self.with_record(CHANGE) | ADJOINT | OF_STEPS, self.vertex.features) | self.corners
-        own |= dict(w="vectors2", felt="vectors2") | self.items.adjoint
+        own |= dict(w="vectors2", path_adjoint="vectors2") | self.items.adjoint
         arrays = dict(state=self.with_record(RECORDED), adjoint=own)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 

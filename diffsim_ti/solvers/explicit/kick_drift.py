@@ -94,17 +94,17 @@ class KickDrift(VertexParts):
         if ti.static(self.features.gravity >= 0):
             if scene.inverse_mass[i] > 0:
                 a += self.gravity(scene.parameters)
-        if ti.static(self.features.guided):
-            a = self.guides.free(i, a, scene)
+        if ti.static(self.features.partly_fixed):
+            a = self.sliding_supports.free(i, a, scene)
         return kick(v, a, now)
 
     @ti.func
     def lead(self, i, u, v, now: A, scene: A, of: A):
-        """The way of vertex i in the pass in directions in which it is held; of: the scene, or its tangent."""
+        """The way of vertex i in the pass in directions in which it is fixed; of: the scene, or its tangent."""
         out = self.vector(0)
-        if ti.static(self.features.guided):
-            u_held, _ = self.guides.given(self.prescribed(i, scene), u, v, now, of)
-            out = self.guides.held(i, u_held - u, scene)
+        if ti.static(self.features.partly_fixed):
+            u_prescribed, _ = self.sliding_supports.given(self.prescribed(i, scene), u, v, now, of)
+            out = self.sliding_supports.held(i, u_prescribed - u, scene)
         return out
 
     # ---- the pass ----------------------------------------------------------------------------------------------------
@@ -150,10 +150,13 @@ class KickDrift(VertexParts):
             lead = self.lead(i, u, v, now, scene, scene)
             u_next, v_next = self.contact.advance(i, u, v_plus, lead, now, scene, state, plan)
         # prescribed motion
-        if ti.static(self.features.guided):
+        if ti.static(self.features.partly_fixed):
             k = self.prescribed(i, scene)
-            u_held, v_held = self.guides.given(k, u, v, now, scene)
-            u_next, v_next = self.guides.end(i, k, u_next, u_held, scene), self.guides.end(i, k, v_next, v_held, scene)
+            u_prescribed, v_prescribed = self.sliding_supports.given(k, u, v, now, scene)
+            u_next, v_next = (
+                self.sliding_supports.end(i, k, u_next, u_prescribed, scene),
+                self.sliding_supports.end(i, k, v_next, v_prescribed, scene),
+            )
         elif ti.static(self.features.motion):
             k = self.prescribed(i, scene)
             if k >= 0:
@@ -208,8 +211,8 @@ class KickDrift(VertexParts):
         if ti.static(self.features.gravity >= 0):
             if inverse > 0:
                 da += self.gravity(tangent.parameters)
-        if ti.static(self.features.guided):
-            da = self.guides.free(i, da, scene)
+        if ti.static(self.features.partly_fixed):
+            da = self.sliding_supports.free(i, da, scene)
         # kick, frame, kick
         dv_mid, dv_plus = kick(dv, da, now)
         if now.frame >= 0:
@@ -230,11 +233,11 @@ class KickDrift(VertexParts):
                 i, u, state.u[t, i] - u, before, du, dv_plus, lead, dlead, now, scene, state, tangent, plan
             )
         # prescribed motion
-        if ti.static(self.features.guided):
+        if ti.static(self.features.partly_fixed):
             k = self.prescribed(i, scene)
-            u_held, v_held = self.guides.given(k, du, dv, now, tangent)
-            du_next = self.guides.end(i, k, du_next, u_held, scene)
-            dv_next = self.guides.end(i, k, dv_next, v_held, scene)
+            u_prescribed, v_prescribed = self.sliding_supports.given(k, du, dv, now, tangent)
+            du_next = self.sliding_supports.end(i, k, du_next, u_prescribed, scene)
+            dv_next = self.sliding_supports.end(i, k, dv_next, v_prescribed, scene)
         elif ti.static(self.features.motion):
             k = self.prescribed(i, scene)
             if k >= 0:
@@ -268,9 +271,9 @@ class KickDrift(VertexParts):
         if ti.static(self.reads_rates):
             q += self.element.gather(i, scene, adjoint.rate_corner)
         # prescribed motion: the state after the pass comes from the motion alone
-        k, by_u_held, by_v_held = self.prescribed(i, scene), self.vector(0), self.vector(0)
-        if ti.static(self.features.guided):
-            p, q, by_u_held, by_v_held = self.guides.end_vjp(i, k, p, q, now, scene, adjoint)
+        k, by_u_prescribed, by_v_prescribed = self.prescribed(i, scene), self.vector(0), self.vector(0)
+        if ti.static(self.features.partly_fixed):
+            p, q, by_u_prescribed, by_v_prescribed = self.sliding_supports.end_vjp(i, k, p, q, now, scene, adjoint)
         elif ti.static(self.features.motion):
             if k >= 0 and now.alpha > 0:
                 before, after = adjoint.motion[now.row, k], adjoint.motion[now.next, k]
@@ -280,7 +283,7 @@ class KickDrift(VertexParts):
                 p, q = self.vector(0), self.vector(0)
         # drift and damping
         v_plus_adj = drift_vjp(p, q, now)
-        if ti.static(not self.features.guided):
+        if ti.static(not self.features.partly_fixed):
             if k >= 0:
                 v_plus_adj = q
         if ti.static(self.features.num_staged > 0):
@@ -290,8 +293,8 @@ class KickDrift(VertexParts):
                 i, u, moved, before, lead, p, q, now, scene, state, adjoint, plan
             )
             p += by_u
-            if ti.static(self.features.guided):
-                by_end, _ = self.guides.given_vjp(k, by_lead, self.vector(0), now, adjoint)
+            if ti.static(self.features.partly_fixed):
+                by_end, _ = self.sliding_supports.given_vjp(k, by_lead, self.vector(0), now, adjoint)
                 p += by_end - by_lead
             elif k >= 0:
                 v_plus_adj = q
@@ -310,9 +313,9 @@ class KickDrift(VertexParts):
             p += adjoint.frames_u[now.frame, i]
             v_mid_adj += adjoint.frames_v[now.frame, i]
         a_adj = kick_vjp(v_plus_adj, v_mid_adj, now)
-        if ti.static(self.features.guided):
-            a_adj = self.guides.free(i, a_adj, scene)
-            p, v_mid_adj = p + by_u_held, v_mid_adj + by_v_held
+        if ti.static(self.features.partly_fixed):
+            a_adj = self.sliding_supports.free(i, a_adj, scene)
+            p, v_mid_adj = p + by_u_prescribed, v_mid_adj + by_v_prescribed
         # forces
         inverse = scene.inverse_mass[i]
         f_adj, q = inverse * a_adj, v_mid_adj

@@ -11,14 +11,14 @@ from diffsim_ti import runtime
 from diffsim_ti.common.checked import between
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.gases import Chambers
-from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes
+from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
+from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
-from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces, feels_faces
+from diffsim_ti.mechanics.obstacles.face_contact_points import FaceContactPoints, has_face_contact
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
-from diffsim_ti.mechanics.obstacles.way import Way
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies
 from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import Workspace
@@ -99,7 +99,7 @@ class ExplicitSolver(Solver):
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
         alone = (
             self.scene.term(SelfContact)
-            or feels_faces(self.scene)
+            or has_face_contact(self.scene)
             or any(x.apart for x in self.scene.interactions)
             or self.scene.reduced
         )  # which act between passes
@@ -139,19 +139,19 @@ class ExplicitSolver(Solver):
 class ExplicitWorkspace(Workspace):
     """A run of an explicit solver: one launch for many passes, or one per pass on all threads."""
 
-    feels_faces = staticmethod(feels_faces)
+    has_face_contact = staticmethod(has_face_contact)
     work_per_launch = 4_000_000  # tetrahedra x passes in one launch: a tenth of a second, so that Ctrl-C is heard
 
     def __init__(self, solver, derived: Derived, bend: float = 0.0):
         self.table = PassTable(runtime.PRECISIONS[solver.scene.precision])
         super().__init__(solver, derived, bend)
-        self.in_parallel = 1 if self.arrays.feels_faces else solver.passes_per_launch()
+        self.in_parallel = 1 if self.arrays.has_face_contact else solver.passes_per_launch()
         self.repeated = self.parallel and self.in_parallel > 1
         features, a = self.arrays.features(), self.arrays
-        self.faces = FeltFaces(self) if a.feels_faces else None
+        self.faces = FaceContactPoints(self) if a.has_face_contact else None
         self.check_apart()
         self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
-        self.volumes = HeldVolumes(self) if self.scene.holds_volumes else None
+        self.volumes = VolumeConstraints(self) if self.scene.holds_volumes else None
         self.stages = stages_of(self)
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
@@ -160,7 +160,7 @@ class ExplicitWorkspace(Workspace):
             work=runtime.array(a.fp, a.num_vertices * (1 + features.pulled) if features.driven else 1),
             own_work=runtime.array(a.fp, a.num_vertices),
         )
-        self.hosts = host_forces(self.scene)  # for what looks between passes
+        self.hosts = host_forces(self.scene)  # for what is evaluated between passes
         self.probe = None  # room for a pass that is not taken
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.term(Growth) else None
 
@@ -194,32 +194,32 @@ class ExplicitWorkspace(Workspace):
     def check_apart(self) -> None:
         """Raise ValueError if a face is in an obstacle that faces feel."""
         a = self.arrays
-        if a.feels_faces:
+        if a.has_face_contact:
             far = 2 * self.faces.full_reach.max(initial=0) if self.faces else 0.0
-            distances = self.way.check_apart(*self._in_front_of_obstacles(), far)
+            distances = self.collisions.check_apart(*self._in_front_of_obstacles(), far)
             if self.faces:
                 self.faces.starts(distances)
 
     @property
-    def way(self) -> Way:
-        return self.kept("way", lambda: Way(self.arrays, self.parallel))
+    def collisions(self) -> CollisionDetection:
+        return self.kept("way", lambda: CollisionDetection(self.arrays, self.parallel))
 
     def _in_front_of_obstacles(self) -> tuple:
         return runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
 
-    def look_between_points(self, now: int) -> None:
+    def check_between_points(self, now: int) -> None:
         """Note what got into an obstacle before pass `now` between points of faces that do not reach as far as that."""
         if self.faces and self.faces.is_shortened:
             self.place_obstacles(now)
-            met = self.way.nearest(*self._in_front_of_obstacles())
+            met = self.collisions.nearest(*self._in_front_of_obstacles())
             if met is not None:
-                self.watch.note(met, int(self.way.found.argmin()) - self.way.num_vertices)
+                self.watch.note(met, int(self.collisions.found.argmin()) - self.collisions.num_vertices)
 
     def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
         return self.volumes.of_all(num_frames)
 
     def last_chamber_pressures(self) -> np.ndarray:
-        """Those of chambers whose volume is held after the last pass, shape (chambers,); zero before the first."""
+        """Those of chambers whose volume is constrained after the last pass, shape (chambers,); zero before the first."""
         return self.volumes.spread(self.volumes.last)
 
     def forces_at(self, j: int, num_passes: int) -> np.ndarray:

@@ -2,17 +2,17 @@
 
 from contextlib import nullcontext
 
-from diffsim_ti.mechanics.chambers.held_volume_derivatives import HeldAdjoint, HeldTangent
-from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes
-from diffsim_ti.mechanics.obstacles.felt_derivatives import FeltAdjoint, FeltTangent
-from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces
+from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import VolumeConstraintAdjoint, VolumeConstraintTangent
+from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
+from diffsim_ti.mechanics.obstacles.face_contact_derivatives import FaceContactAdjoint, FaceContactTangent
+from diffsim_ti.mechanics.obstacles.face_contact_points import FaceContactPoints
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.stages import SurfaceForces, SurfaceFriction
 
 # stages whose tangents and adjoints have buffers: what makes these of them for a run
 BUFFERED = dict(
-    tangent={HeldVolumes: HeldTangent, FeltFaces: FeltTangent},
-    adjoint={HeldVolumes: HeldAdjoint, FeltFaces: FeltAdjoint},
+    tangent={VolumeConstraints: VolumeConstraintTangent, FaceContactPoints: FaceContactTangent},
+    adjoint={VolumeConstraints: VolumeConstraintAdjoint, FaceContactPoints: FaceContactAdjoint},
 )
 
 

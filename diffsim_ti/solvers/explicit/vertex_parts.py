@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-from diffsim_ti.mechanics.loads.explicit import GivenForces
+from diffsim_ti.mechanics.loads.explicit import AppliedForces
 from diffsim_ti.mechanics.obstacles.contact_stage import ContactStage
 from diffsim_ti.mechanics.obstacles.obstacle_stages import ObstacleStages
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.mechanics.supports.guides import Guides
+from diffsim_ti.mechanics.supports.sliding_supports import SlidingSupports
 from diffsim_ti.runtime import number_type, vector_type
 from diffsim_ti.state.features import Features
 
@@ -49,9 +49,9 @@ class VertexParts:
         return ContactStage(self.features, self.precision)
 
     @cached_property
-    def given(self) -> GivenForces:
-        return GivenForces(self.features, self.precision)
+    def given(self) -> AppliedForces:
+        return AppliedForces(self.features, self.precision)
 
     @cached_property
-    def guides(self) -> Guides:
-        return Guides(self.precision, self.features.motion)
+    def sliding_supports(self) -> SlidingSupports:
+        return SlidingSupports(self.precision, self.features.motion)

@@ -39,7 +39,7 @@ class ImplicitAdjoint(RecordedPasses):
         n, num_obstacles = a.num_vertices, len(a.obstacles)
         self.potential = p
         self.lag = runtime.array(a.vector, 2, n if p.has_friction else 1)
-        self.walls = runtime.array(a.vector, a.walls.size, n if num_obstacles else 1)
+        self.poses = runtime.array(a.vector, a.poses.size, n if num_obstacles else 1)
         self.pressed = runtime.array(a.vector, *p.pressed.shape)
         self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, adjoint=(self, self.numbers))
         if self.z is not None:  # the state of the law
@@ -47,13 +47,13 @@ class ImplicitAdjoint(RecordedPasses):
             runtime.fill(corner, 0)  # also where surfaces in contact have theirs
             self._law = SimpleNamespace(z=self.z, corner=corner, y=y)
         self.law_frames = LawFrames(workspace) if workspace.law_frames else None
-        self.held = a.held_numbers()  # in a pass, by the law
+        self.held = a.frozen_numbers()  # in a pass, by the law
         self._vjp = self.kernels.vjp.bind(a.in_vectors, **own)
         if p.faces:
             faces = face_kernels(self.features, a.precision, workspace.parallel)
             self.face_areas = runtime.array(a.fp, nodes_of_faces(a).size if self.features.areas else 1)
             self._vjp_of_faces = p.faces.bind(faces.vjp, adjoint=(self, self.numbers))
-        self.chamber_record = ChamberRecord(workspace.solver, workspace.held_chambers)
+        self.chamber_record = ChamberRecord(workspace.solver, workspace.constrained_chambers)
         self.contacts, areas = None, self.face_areas if p.faces else runtime.array(a.fp, 1)
         if workspace.impulses:
             self.contacts = ContactRecord(workspace)
@@ -116,7 +116,7 @@ class ImplicitAdjoint(RecordedPasses):
                     self.law_frames.add_to(self.z, frame)
 
     def _pull_back_growth(self, j: int) -> None:
-        """What tetrahedra felt of growth in pass j goes to its step."""
+        """The adjoint of growth by tetrahedra in pass j goes to its step."""
         felt = self.ws.arrays.from_growth_blocks(runtime.fetch(self.numbers.growths).astype(np.float64))
         self.ws.growth_vjp(self.growth, j, self.stage, felt[0].sum(0))
         runtime.fill(self.numbers.growths, 0)
@@ -135,14 +135,14 @@ class ImplicitAdjoint(RecordedPasses):
         if friction is None:
             return seen, None
         p = self.potential
-        rubbed = p.rubbing.vjp(p.held_at, friction)
+        from_friction = p.surface_friction.vjp(p.held_at, friction)
         p.place(self.u_star)
-        return seen, rubbed
+        return seen, from_friction
 
     def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
-        seen, rubbed = self._pull_back_contacts(j, save_every)
-        by_contacts, by_x, by_lag = np.zeros((3, *p.shape)) if rubbed is None else rubbed
+        seen, from_friction = self._pull_back_contacts(j, save_every)
+        by_contacts, by_x, by_lag = np.zeros((3, *p.shape)) if from_friction is None else from_friction
         by_contacts = by_contacts if seen is None else by_contacts + seen[0]
         if s.static:
             q = np.zeros_like(q)
@@ -158,7 +158,7 @@ class ImplicitAdjoint(RecordedPasses):
             by_pressure = self.chamber_record.adjoint(j, save_every)
             by_star, nu = ws.volumes.adjoint(ws.potential.held_at, by_star, by_pressure, self.solve)
         runtime.fill(ws.potential.w, by_star[None])
-        for target in (self.lag, self.walls, *[self.pressed] * ws.potential.presses):
+        for target in (self.lag, self.poses, *[self.pressed] * ws.potential.presses):
             runtime.fill(target, 0)
         if ws.pairs:
             ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
@@ -172,9 +172,9 @@ class ImplicitAdjoint(RecordedPasses):
             reaction, by_x = reaction + by_place + by_speed / self.gamma, by_x - by_speed / self.gamma
         if ws.volumes:
             reaction = reaction + ws.volumes.add_targets(nu, ws.potential.held_at, self.by_hosts)
-        if ws.potential.rubbing:
-            by_place, by_rub, by_begin = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
-            reaction, by_x, by_lag = reaction + by_place, by_x + by_rub, by_lag + by_begin
+        if ws.potential.surface_friction:
+            by_place, by_friction, by_begin = ws.potential.surface_friction.vjp(ws.potential.held_at, by_star)
+            reaction, by_x, by_lag = reaction + by_place, by_x + by_friction, by_lag + by_begin
         share = ws.load_share(j, s)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self._add_mass(by_star, self.weight(share))
@@ -183,7 +183,7 @@ class ImplicitAdjoint(RecordedPasses):
             ws.solver.schedule.add_load(self.forces, j, ws.share_at_stage(j, s), keyed, felt)
         # where inertia starts from
         inertial = self.mass * by_star
-        reaction = reaction - inertial  # held vertices are felt by their neighbours' inertia too
+        reaction = reaction - inertial  # fixed vertices are felt by their neighbours' inertia too
         x_adj, by_begin = inertial - s.e0 / s.gamma * q_free + by_x, 0.0
         if ws.potential.has_friction:
             by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
@@ -193,8 +193,8 @@ class ImplicitAdjoint(RecordedPasses):
             by_place, by_begin = self._by_pressed.pull_back(by_pressed)
             by_lag = by_lag + by_place
         if self.path is not None:
-            by_walls = runtime.fetch(self.walls).astype(np.float64).sum(1)
-            ws.ways.vjp(by_walls + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
+            by_poses = runtime.fetch(self.poses).astype(np.float64).sum(1)
+            ws.collisions.vjp(by_poses + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
         self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()
@@ -247,7 +247,7 @@ class ImplicitAdjoint(RecordedPasses):
     def norm(self) -> tuple[float, float]:
         """Euclidean norms of the adjoints of displacement and velocity where the sweep stands.
 
-        Held vertices have no velocity, and sets that are `reduced` only the motions that they can do.
+        Fixed vertices have no velocity, and sets that are `reduced` only admissible motions.
         """
         reduced = self.ws.scene.reduced
         p, q = reduced.of(self.p), reduced.of(self.ws.arrays.supports.free(self.q))

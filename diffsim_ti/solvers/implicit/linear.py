@@ -15,7 +15,7 @@ from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Preconditio
 
 class Operator:
     """w -> c m w + d2E/du2 w at the potential's displacement, less what forces without an energy change; rows of fixed
-    vertices are zero. Sets that do not deform move as w says, and turn what they feel (mechanics/reduced/rigid_sets.py).
+    vertices are zero. Sets that do not deform move as w says, and turn the forces on them (mechanics/reduced/rigid_sets.py).
 
     mass: c m, shape (num_vertices, 1) [N/m]; free: what vertices may do (free.py); others: host forces without an energy;
     transposed: of these and such sets.

@@ -7,7 +7,7 @@ an open surface, drag) there is no Phi, but R: directions come from GMRES, and a
 first rounds, along which -R does negative work.
 a: where inertia alone would lead [m]; b: dead loads [N]; c = 1 / gamma^2 [1/s^2], zero for statics. Directions come from
 conjugate gradients on the exact Hessian. Where that is met to be indefinite they stop with what they have (buckling needs
-that), or, if that is early, each tetrahedron's d2psi/dF2 is made positive definite and the direction computed anew (crushed
+that), or, if that is early, each tetrahedron's d2psi/dF2 is made positive definite and the direction computed again (crushed
 starts need that).
 Kane, Marsden, Ortiz, West 2000, doi:10.1002/1097-0207(20001210)49:10<1295::AID-NME993>3.0.CO;2-W.
 """
@@ -19,7 +19,7 @@ import numpy as np
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import diagonal_of
 from diffsim_ti.mechanics.host_force import NONE, HostForces
-from diffsim_ti.mechanics.obstacles.way import Met
+from diffsim_ti.mechanics.obstacles.collision_detection import Met
 from diffsim_ti.mechanics.stress.projection import Projection
 from diffsim_ti.mechanics.supports.free import Free, cleaned, linear_of, mask_of
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
@@ -31,7 +31,7 @@ LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction
 class NewtonReport:
     """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
     Hessian, saddles that were left, evaluations of the energy, halvings in line searches; directions that an obstacle, or
-    the surface itself, cut short, and which obstacle cut the last one (mechanics/obstacles/way.py)."""
+    the surface itself, cut short, and which obstacle cut the last one (mechanics/obstacles/collision_detection.py)."""
 
     residuals: list = field(default_factory=list)
     products: int = 0
@@ -45,10 +45,10 @@ class NewtonReport:
 
 
 class Newton:
-    """Minimises Phi from a start. From iterate to iterate the surface meets no obstacle (obstacles/way.py) and does not pass
-    through itself. If the start has no J <= 0, J falls by a factor of ten at most, so that the energy's own resistance is
-    felt in time; only where no share of a direction down to `insist` lowers Phi so (a law that is finite at J = 0, pressed
-    beyond it) may it fall further.
+    """Minimises Phi from a start. From iterate to iterate the surface meets no obstacle
+    (obstacles/collision_detection.py) and does not pass through itself. If the start has no J <= 0, J falls by a factor
+    of ten at most, so that the energy's own resistance is felt in time; only where no share of a direction down to
+    `insist` lowers Phi so (a law that is finite at J = 0, pressed beyond it) may it fall further.
 
     tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
     at equilibrium), loads and inertia, all of the present round: where a solve began is no measure of where it ends. Beyond
@@ -82,10 +82,10 @@ class Newton:
         self.volumes = volumes  # of chambers, that are held (multipliers.py), or None
         self.others = others  # host forces without an energy
         self.moves = mask_of(free)  # in some direction
-        self.potential, self.free, self.way, self.preconditioners = potential, free, way, preconditioners
+        self.potential, self.free, self.collisions, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
-        self.report, self.reports = NewtonReport(), []  # of the last solve, of all since somebody looked
+        self.report, self.reports = NewtonReport(), []  # of the last solve, of all since the last report
         self.rigid = potential.rigid  # sets that do not deform
 
     @property
@@ -149,7 +149,7 @@ class Newton:
             direction, R = self._step(u, R, max(forcing, 10 * self.eps))
             moved = self._search(u, direction, R, E)
             if self.volumes:
-                self._count_anew(u, moved, direction)
+                self._recount(u, moved, direction)
             if moved is None and self.volumes and self.volumes.can_stiffen():
                 self.potential.place(u)
                 continue
@@ -194,7 +194,7 @@ class Newton:
         return self._downhill() is not None
 
     def follows(self, u: np.ndarray, change: np.ndarray, way: np.ndarray) -> np.ndarray | None:
-        """How the equilibrium at u goes on for a change of loads [N] and a way of held vertices, linearised there, with the
+        """How the equilibrium at u goes on for a change of loads [N] and a way of fixed vertices, linearised there, with the
         mass of the last solve; None where it is not stable."""
         self.potential.place(u)
         A = self.operator()
@@ -263,7 +263,7 @@ class Newton:
             self.report.products, R = self.report.products + A.products - done, R + change
         return cleaned(linear_of(self.free), direction), R
 
-    def _count_anew(self, u, moved, direction) -> None:
+    def _recount(self, u, moved, direction) -> None:
         """Multipliers go as far as the step from u along a direction that was found."""
         step = (u if moved is None else moved[0]) - u
         share = float((step * direction).sum()) / max(float((direction * direction).sum()), 1e-300)
@@ -339,7 +339,7 @@ class Newton:
     def _safe_share(self, u, d) -> float:
         """The longest step along d in which surfaces stay apart, from obstacles and from each other."""
         pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
-        free, self.report.met = self.way(u, d, most)
+        free, self.report.met = self.collisions(u, d, most)
         free = min(free, pairs.safe_share(u, d, free)) if pairs else free
         self.report.cuts += free < 1
         return free
@@ -347,7 +347,7 @@ class Newton:
     def is_free(self, u, step) -> bool:
         """Whether nothing is met on the way of a step."""
         pairs = self.potential.pairs
-        return self.way(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
+        return self.collisions(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
     def _against_loads(self, u, step) -> float:
         """Change of Phi along a step without those of E and W."""

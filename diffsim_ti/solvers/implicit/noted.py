@@ -19,7 +19,7 @@ class Noted:
 
     def note(self, j: int, num_passes: int, seconds: float, begin: tuple) -> None:
         """What pass j took; statics say where they left a branch of stable equilibria. begin: where the pass began, the same
-        with held vertices where they got, and its problem."""
+        with fixed vertices where they got, and its problem."""
         step, solves = self.ws.step_of(j, num_passes), self.ws.newton.reports
         self.ws.report.note(step, seconds, solves)
         saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
@@ -60,9 +60,9 @@ class Noted:
         return True
 
     def _was_stable(self, j: int) -> bool:
-        """Whether the potential stands at a stable state before pass j lays on anything."""
+        """Whether the potential stands at a stable state before pass j applies any load."""
         stage = self.ws.solver.stage(self.ws.rate, True, j)
-        self.ws.lay_on(j, stage, 0.0)
+        self.ws.apply_loads(j, stage, 0.0)
         stable = not self.ws.newton.is_unstable()
-        self.ws.lay_on(j, stage)
+        self.ws.apply_loads(j, stage)
         return stable

@@ -47,7 +47,9 @@ class BlockJacobi(Preconditioner):
         D = self.potential.blocks() + self.mass[:, :, None] * np.eye(3)
         if isinstance(self.free, FreeDirections):
             D = self.free.around(D)
-            D[self.free.guided] += self.free.guides * (size_of(D[self.free.guided]) / 3)[:, None, None]
+            D[self.free.partly_fixed] += (
+                self.free.sliding_supports * (size_of(D[self.free.partly_fixed]) / 3)[:, None, None]
+            )
         values, vectors = np.linalg.eigh(0.5 * (D + np.swapaxes(D, 1, 2)))
         values = np.maximum(np.abs(values), self.least)
         inverse = np.divide(mask_of(self.free), values, out=np.zeros_like(values), where=values > 0)

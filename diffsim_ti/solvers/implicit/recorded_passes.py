@@ -35,13 +35,13 @@ class RecordedPasses:
         self.gamma = ws.instant(j, stage).gamma  # of velocities that host forces read
         self.operator = Operator(ws.potential, self.mass, ws.free, ws.newton.others, self.transposed)
         ws.take_multipliers(j, ws.potential.held_at)
-        if ws.rigid:  # what they feel turns with them
+        if ws.rigid:  # forces on them turn with them
             ws.newton.residual_of(ws.problem(j, stage, self.x, self.y))
         self._preconditioner = None
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         """A^-1 b, or A^-T b, on the free vertices, zero elsewhere; of sets that do not deform their motion, or of A^-T, what
-        they feel."""
+        act on them."""
         rigid, transposed = self.ws.rigid, self.transposed
         b = rigid.motion_vjp(b * self.ws.linear) if transposed else b * self.ws.free
         if not b.any():

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 class ImplicitSolver(Solver):
     """Implicit steps: each is the minimum of an incremental potential that descends from where the step begins, found by
-    Newton's method (newton.py) at once or, where that fails, in parts of what the step lays on.
+    Newton's method (newton.py) in one solve or, where that fails, by load stepping.
 
     tolerance: residual of the equation of motion against the forces that meet at vertices, loads and inertia where the solve
         ends; gradients are as exact as the solve.
@@ -37,7 +37,7 @@ class ImplicitSolver(Solver):
         from 30 000 unknowns on with a warning.
 
     On the way from one state to the next no vertex or face meets an obstacle; what comes to the body, obstacles on their
-    paths and held vertices, makes room for itself. Where there is none, Blocked (a NotConverged) says what stands there.
+    paths and fixed vertices, makes room for itself. Where there is none, Blocked (a NotConverged) says what stands there.
     """
 
     arguments = ("dt", "substeps", "tolerance", "max_iterations", "parallel", "preconditioner")

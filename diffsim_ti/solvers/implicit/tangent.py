@@ -27,21 +27,21 @@ class ImplicitTangent(RecordedPasses):
         self.features = a.features()
         kernels = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
         self.numbers = Tangent(a, tangent)
-        self.lag, self.walls, self.pressed = (runtime.array(a.vector, *x.shape) for x in (p.lag, p.walls, p.pressed))
+        self.lag, self.poses, self.pressed = (runtime.array(a.vector, *x.shape) for x in (p.lag, p.poses, p.pressed))
         self._presses = PressedTangent(workspace, self) if p.presses else None
         self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, tangent=(self, self.numbers))
         if self.z is not None:
             runtime.fill(self.z, 0)
             self._law = SimpleNamespace(z=self.z, w=p.w)
         self.law_frames = LawFrames(workspace) if workspace.law_frames else None
-        self.held = a.held_numbers()
+        self.held = a.frozen_numbers()
         self._jvp = kernels.jvp.bind(a.in_vectors, **own)
         if p.faces:
             self._jvp_of_faces = p.faces.bind(p.faces.kernels.jvp, tangent=(self, self.numbers))
         self.contacts = ContactRecord(workspace) if workspace.impulses else None
         self._shares = Shares(workspace) if workspace.impulses and len(a.obstacles) else None
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
-        self.frames, self.chamber_record = ([], []), ChamberRecord(workspace.solver, workspace.held_chambers)
+        self.frames, self.chamber_record = ([], []), ChamberRecord(workspace.solver, workspace.constrained_chambers)
 
     @one_blas_thread
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
@@ -66,12 +66,12 @@ class ImplicitTangent(RecordedPasses):
             dy = dy + s.b1 * self.tangent_before[1] + db1 * self.before[1]
         place, speed = ws.prescribed(j, tangent)
         now = self.du[a.held]
-        held = ws.with_held(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
+        held = ws.with_frozen(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
         if ws.rigid:
             held = ws.rigid.held_jvp(held, self.du, tangent.rest)
-        rubbing, rubbed = ws.potential.rubbing, 0.0
-        if rubbing:
-            rubbed = rubbing.jvp(ws.potential.held_at, held, dx, self.du, self.numbers)
+        surface_friction, from_friction = ws.potential.surface_friction, 0.0
+        if surface_friction:
+            from_friction = surface_friction.jvp(ws.potential.held_at, held, dx, self.du, self.numbers)
             ws.potential.place(self.u_star)
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
@@ -79,11 +79,11 @@ class ImplicitTangent(RecordedPasses):
         if tangent.growths is not None:
             moved = ws.growth_of(tangent.growths, j, s)
             runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
-        walls = None if tangent.path is None else ws.ways.jvp(tangent.path, j, s)
-        if walls is not None:
-            runtime.fill(self.walls, walls)
+        poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
+        if poses is not None:
+            runtime.fill(self.poses, poses)
         if self._presses:
-            self._presses.begin(self.du, walls)
+            self._presses.begin(self.du, poses)
         if ws.strains:
             ws.strains.jvp(s, (self.u, self.du), (self.before, self.tangent_before), self)
         if ws.pairs:
@@ -98,12 +98,12 @@ class ImplicitTangent(RecordedPasses):
         self._jvp(**ws.potential.sizes())
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + self.mass_dot * self.weight(share)
-        dR += rubbed
+        dR += from_friction
         if ws.potential.faces:
             dR += self._jvp_of_faces()
         if a.features().gravity >= 0:
             dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
-        dR += ws.given_forces(tangent.forces, j, s)
+        dR += ws.applied_forces(tangent.forces, j, s)
         dR += ws.hosts.jvp(ws.potential.held_at, held, (held - dx) / self.gamma, tangent)
         if ws.rigid:
             dR += ws.rigid.turned(held + tangent.rest)
@@ -119,7 +119,7 @@ class ImplicitTangent(RecordedPasses):
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
         place, speed = (x[a.held] for x in before) if place is None else (place, speed)
-        self.du, self.dv = ws.with_held(self.du, place), ws.with_held(self.dv, speed)
+        self.du, self.dv = ws.with_frozen(self.du, place), ws.with_frozen(self.dv, speed)
         if s.static:
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before
@@ -128,8 +128,8 @@ class ImplicitTangent(RecordedPasses):
         """Change of the forces of obstacles, and of friction between surfaces, in pass j, u* changing by d_star."""
         p = self.ws.potential
         runtime.fill(p.w, d_star[None])
-        record = dict(tangent=(SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed), self.numbers))
-        friction = lambda: p.rubbing.jvp(p.held_at, d_star, dx, self.du, self.numbers)  # noqa: E731
+        record = dict(tangent=(SimpleNamespace(lag=self.lag, poses=self.poses, pressed=self.pressed), self.numbers))
+        friction = lambda: p.surface_friction.jvp(p.held_at, d_star, dx, self.du, self.numbers)  # noqa: E731
         self.contacts.add(j, save_every, self.stage.static, lambda: self._shares.forces("jvp", **record), friction)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:

@@ -11,21 +11,21 @@ from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
-from diffsim_ti.mechanics.obstacles.obstacle_ways import ObstacleWays
+from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
 from diffsim_ti.mechanics.obstacles.pressed import Pressed
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
-from diffsim_ti.mechanics.stress.held_strains import HeldStrains
+from diffsim_ti.mechanics.stress.frozen_strains import FrozenStrains
 from diffsim_ti.mechanics.stress.law_state import law_state_kernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.implicit.closing import Closing
-from diffsim_ti.solvers.implicit.given import GivenInPasses
-from diffsim_ti.solvers.implicit.laid_on import LaidOn
+from diffsim_ti.solvers.implicit.load_stepping import LoadStepping
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
+from diffsim_ti.solvers.implicit.prescribed import PrescribedInPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.history import History
 from diffsim_ti.state.stage import Stage
@@ -41,11 +41,11 @@ class TwoStepHistory(History):
         self.fresh = [True] * num_slots
 
 
-class ImplicitWorkspace(GivenInPasses):
+class ImplicitWorkspace(PrescribedInPasses):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
-    enough = 20  # rounds with which a solution that was not found is looked for in parts
+    enough = 20  # rounds with which a solution that was not found is found by load stepping
 
     def __init__(self, solver, derived, bend=0.0):
         self.potential, self._length, self.hosts = None, solver.substep, host_forces(solver.scene)
@@ -63,23 +63,28 @@ class ImplicitWorkspace(GivenInPasses):
             self.potential = Potential(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
             self.pressed = Pressed(self) if self.potential.presses else None
-            self.strains = HeldStrains(self) if self.potential.held is not None else None
+            self.strains = FrozenStrains(self) if self.potential.held is not None else None
         a = self.arrays
         self._mass = self.mass_of(derived)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
         self.rigid = self.potential.rigid = RigidSets(self.scene.reduced, derived.rest)
         if self.scene.reduced:
-            self.free = FreeBodies(self.free, a.supports.guided, a.supports.guides, self.scene.reduced, self.rigid)
-        elif a.features().guided:
-            self.free = FreeDirections(self.free, a.supports.guided, a.supports.guides)
+            self.free = FreeBodies(
+                self.free, a.supports.partly_fixed, a.supports.sliding_supports, self.scene.reduced, self.rigid
+            )
+        elif a.features().partly_fixed:
+            self.free = FreeDirections(self.free, a.supports.partly_fixed, a.supports.sliding_supports)
         self.linear = linear_of(self.free)
         eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         self.hosts.restrict(projectors_of(self.free), derived.rest)
         self.potential.hosts, others = self.hosts.with_energy, self.hosts.without_energy
-        self.volumes, self.multipliers = self.held_volumes(eps), {}  # the pressures [Pa] that each pass ended with
-        self.preconditioner, self.noted, self.ways = Preconditioners(self), Noted(self), ObstacleWays(self)
-        finders, more = (self.ways.past, self.preconditioner), (others, self.volumes)
+        self.volumes, self.multipliers = (
+            self.volume_constraints(eps),
+            {},
+        )  # the pressures [Pa] that each pass ended with
+        self.preconditioner, self.noted, self.collisions = Preconditioners(self), Noted(self), ObstacleCollisions(self)
+        finders, more = (self.collisions.past, self.preconditioner), (others, self.volumes)
         self.newton = Newton(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
         self.approach, self.closing = Approach(self), Closing(self)
         self.check_apart()
@@ -108,17 +113,17 @@ class ImplicitWorkspace(GivenInPasses):
     def restart(self) -> None:
         super().restart()
         self.multipliers = {}
-        self._begin_anew()
+        self._restart()
         if self.energy_watch:
             self.energy_watch.clear()
 
     def forget(self) -> None:
         """The state was set from outside: there is none before it."""
         super().forget()
-        self._begin_anew()
+        self._restart()
         self.check_apart()
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         if self.solver.multistep:
             self.state.fresh[0] = True
 
@@ -152,7 +157,7 @@ class ImplicitWorkspace(GivenInPasses):
             self.restore(self.record, first - base)
         if self.solver.substep != self._length:
             self._length = self.solver.substep
-            self._begin_anew()
+            self._restart()
         for j in range(first, last):
             frame = int(self.solver.schedule.shown(j, save_every))
             if frame >= 0:
@@ -163,7 +168,7 @@ class ImplicitWorkspace(GivenInPasses):
             try:
                 u_next, v_next = self._pass(j, u, v, before)
                 if self.bending:
-                    self.bending.look(j + 1, u_next)
+                    self.bending.check(j + 1, u_next)
                 self.note_contacts(j, save_every)
                 self.noted.note(j, num_passes, time.perf_counter() - begin, self.begun)
             except FloatingPointError as error:
@@ -213,7 +218,9 @@ class ImplicitWorkspace(GivenInPasses):
         problem = self.problem(j, stage, x, y)
         self.rigid.begin(u, stage.c0)
         starts = [] if stage.static else [problem[1], x + stage.gamma * y]
-        held = u if place is None else self.with_held(u, u[self.arrays.held] + (place - u[self.arrays.held]) / stage.c0)
+        held = (
+            u if place is None else self.with_frozen(u, u[self.arrays.held] + (place - u[self.arrays.held]) / stage.c0)
+        )
         self.begun = u, held, problem
         self.begin(j, stage, u, x)
         if self.strains:
@@ -222,7 +229,7 @@ class ImplicitWorkspace(GivenInPasses):
         try:
             u_star = self._solve(j, u, held, starts, problem, stage)
         except NotConverged as error:
-            raise self.ways.explained(error, u) from None
+            raise self.collisions.explained(error, u) from None
         self.u_star = u_star
         self.keep_multipliers(j)
         v_star = (u_star - x) / stage.gamma
@@ -230,13 +237,13 @@ class ImplicitWorkspace(GivenInPasses):
         v_next = stage.e0 * v_star + stage.e1 * y
         held = self.arrays.held
         place, speed = (u[held], v[held]) if place is None else (place, speed)
-        u_next, v_next = self.with_held(u_next, place), self.with_held(v_next, speed)
+        u_next, v_next = self.with_frozen(u_next, place), self.with_frozen(v_next, speed)
         # without what rounding adds
         u_next, v_next = self.rigid.end(self.scene.reduced.of(u_next)), self.scene.reduced.of(v_next)
         if stage.c0 != 1:
-            self.ways.check_end(j, u_star, u_next)
+            self.collisions.check_end(j, u_star, u_next)
         if self.energy_watch:
-            places = self.ways.before, self.ways.at_stage, self.ways.at_end(j)
+            places = self.collisions.before, self.collisions.at_stage, self.collisions.at_end(j)
             keeps = self.solver.may_gain_energy and not self.solver.multistep  # the midpoint rule, kinetic energy
             undamped = self.inertial(self.solver.stage(0.0, before is None, j), u, v, before)[1]
             added = 0.0 if keeps else self._kinetic_added(u, v, u_next, v_star, undamped, stage)
@@ -259,7 +266,7 @@ class ImplicitWorkspace(GivenInPasses):
         return added - float((rate * (self.mass * way)).sum())
 
     def _solve(self, j, u, held, starts: list, problem: tuple, stage: Stage) -> np.ndarray:
-        """The minimum of the pass that descends from `held`, where the body was, with held vertices where they get.
+        """The minimum of the pass that descends from `held`, where the body was, with fixed vertices where they get.
 
         starts: where inertia leads, and where velocities do; problem: mass, inertial, loads of `Newton.solve`.
         """
@@ -275,7 +282,7 @@ class ImplicitWorkspace(GivenInPasses):
         except NotConverged as error:
             if not parts or self.newton.report.cuts and not stage.static:
                 raise
-            return LaidOn(self)(j, stage, u, held, problem, error)
+            return LoadStepping(self)(j, stage, u, held, problem, error)
 
     def check_upright(self, u, there) -> None:
         """Raise NotConverged where the last solve has turned a tetrahedron inside out that was far from that at u."""
@@ -296,7 +303,7 @@ class ImplicitWorkspace(GivenInPasses):
             # surfaces are looked at together where they have not passed through each other
             if not self.pairs and not self.newton.rise(u, before, start, problem) < least:
                 continue
-            longest = min(self.ways.past(u, start - u)[0], self.pairs_share(u, start - u))
+            longest = min(self.collisions.past(u, start - u)[0], self.pairs_share(u, start - u))
             at = self.rigid.nearest(u + longest * (start - u))
             rise = self.newton.rise(u, before, at, problem)
             if rise < least and not (self.rigid and not self.newton.is_free(u, at - u)):  # it turns on another way
@@ -312,7 +319,7 @@ class ImplicitWorkspace(GivenInPasses):
 
     def check_apart(self) -> None:
         """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
-        self.ways.check_apart()
+        self.collisions.check_apart()
 
     def record_contacts(self) -> None:
         self.impulses = ContactRecord(self)
@@ -328,14 +335,14 @@ class ImplicitWorkspace(GivenInPasses):
         if self.impulses and save_every:
             at = self.potential.place(self.u_star)
             shares = self.kept("shares", lambda: Shares(self)) if len(self.arrays.obstacles) else None
-            friction = lambda: self.potential.rubbing.forces(at)  # noqa: E731
+            friction = lambda: self.potential.surface_friction.forces(at)  # noqa: E731
             self.impulses.add(j, save_every, self.is_static, lambda: shares.forces(), friction)
 
     # ---- what stands in the way --------------------------------------------------------------------------------------
 
     def check_pairs(self, u, step) -> None:
         """Prescribed vertices have to get where they are held."""
-        if self.pairs and not self.pairs.way_is_free(u, step):
+        if self.pairs and not self.pairs.is_collision_free(u, step):
             raise NotConverged("prescribed motion drives surfaces through each other: take smaller steps", [])
 
     def pairs_share(self, u, step) -> float:
@@ -346,16 +353,16 @@ class ImplicitWorkspace(GivenInPasses):
 
     def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray) -> None:
         """Tell the potential where obstacles are in pass j and where friction is measured from."""
-        self.ways.begin(j, stage)
-        self.potential.begin(u, x, 1 / stage.gamma, self.ways.rows)
+        self.collisions.begin(j, stage)
+        self.potential.begin(u, x, 1 / stage.gamma, self.collisions.rows)
         if self.pressed:
-            self.pressed.begin(u, self.ways.rows)
+            self.pressed.begin(u, self.collisions.rows)
         self.origin = x
-        self.lay_on(j, stage)
+        self.apply_loads(j, stage)
         if self.volumes:  # after all that the stiffness at rest is made of
             self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
 
     def share_at_stage(self, j: int, stage: Stage) -> float:
         """Share of the step at which pass j takes its forces."""
         schedule = self.solver.schedule
-        return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) * self.laid / stage.c0
+        return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) * self.applied_share / stage.c0

@@ -100,7 +100,7 @@ class Capsule(Obstacle):
     whose other arguments it takes.
     """
 
-    twin = CapsuleForce
+    counterpart = CapsuleForce
 
     def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options):
         ends = place("start", start, "capsule_start"), place("end", end, "capsule_end")

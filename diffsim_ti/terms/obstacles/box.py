@@ -76,7 +76,7 @@ class Box(Obstacle):
     contact's stiffness jumps.
     """
 
-    twin = BoxForce
+    counterpart = BoxForce
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class Cylinder(Obstacle):
     whose other arguments it takes.
     """
 
-    twin = CylinderForce
+    counterpart = CylinderForce
 
     def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options):
         ends = place("start", start, "cylinder_start"), place("end", end, "cylinder_end")

@@ -78,13 +78,13 @@ def normal_force(g, n, push):
     return [x / size for x in n], push * size
 
 
-def slide(g, n, push, v, wall, h_over_m, mu, eps):
-    """Velocity after friction: push n the barrier's force, v and wall the velocities of vertex and obstacle.
+def slide(g, n, push, v, v_obstacle, h_over_m, mu, eps):
+    """Velocity after friction: push n the barrier's force, the velocities of vertex and obstacle.
 
     Everything is a number of the graph `g`, or a list of three.
     """
     n, push = normal_force(g, n, push)
-    t, speed = tangential(g, n, v, wall)
+    t, speed = tangential(g, n, v, v_obstacle)
     lost = g.number(1) - keeps(g, speed, h_over_m * mu * push, eps)
     return [a - lost * x for a, x in zip(v, t)]
 
@@ -93,24 +93,24 @@ def slide(g, n, push, v, wall, h_over_m, mu, eps):
 # and the normal as they are at its beginning. It then has a potential in the displacement, as Newton's method likes it.
 
 
-def tangential(g, n, v, wall):
+def tangential(g, n, v, v_obstacle):
     """(t, |t|): the part of the velocity relative to the obstacle that lies in its surface."""
-    relative = [a - b for a, b in zip(v, wall)]
+    relative = [a - b for a, b in zip(v, v_obstacle)]
     towards = g.dot(relative, n)
     t = [r - towards * k for r, k in zip(relative, n)]
     return t, g.sqrt(g.dot(t, t))
 
 
-def rub(g, n, push, v, wall, mu, eps):
+def friction_force(g, n, push, v, v_obstacle, mu, eps):
     """The force of friction on a vertex."""
-    t, speed = tangential(g, n, v, wall)
+    t, speed = tangential(g, n, v, v_obstacle)
     slow = (eps * 2 - g.minimum(speed, eps)) / (eps * eps)
     share = g.select(speed.value < eps.value, slow, g.number(1) / g.maximum(speed, eps))
     factor = g.number(0) - mu * push * share
     return [factor * x for x in t]
 
 
-def dissipation(g, n, push, v, wall, mu, eps):
+def dissipation(g, n, push, v, v_obstacle, mu, eps):
     """Its potential by the velocity."""
-    _, speed = tangential(g, n, v, wall)
+    _, speed = tangential(g, n, v, v_obstacle)
     return mu * push * dissipated(speed, eps, g)

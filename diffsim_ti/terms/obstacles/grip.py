@@ -17,16 +17,16 @@ from diffsim_ti.terms.obstacles.turning import all_changes
 
 
 @traced
-def _record(force, parameters, first, X, u, v, wall, time, total):
+def _record(force, parameters, first, X, u, v, v_obstacle, time, total):
     """(graph, the obstacle's numbers, leaves of u, v, wall, [time, total], h mu N, impulse)"""
     g, p, moved, d, n = force.record(parameters, first, X, u)
-    before, walls = ([g.leaf(at(x, d)) for d in range(3)] for x in (v, wall))
+    before, obstacle = ([g.leaf(at(x, d)) for d in range(3)] for x in (v, v_obstacle))
     time, total, (mu, eps) = g.leaf(time), g.leaf(total), force.rough(p)
     n, push = friction.normal_force(g, n, force.push(g, p, d))
-    t, speed = friction.tangential(g, n, before, walls)
+    t, speed = friction.tangential(g, n, before, obstacle)
     load = time * mu * push
     factor = 0 - load * friction.lost_per(g, speed, total, eps)
-    return g, p, moved, before, walls, [time, total], load, [factor * x for x in t]
+    return g, p, moved, before, obstacle, [time, total], load, [factor * x for x in t]
 
 
 @traced
@@ -38,9 +38,9 @@ def load(force, parameters, first, X, u, time):
 
 
 @traced
-def impulse(force, parameters, first, X, u, v, wall, time, total):
+def impulse(force, parameters, first, X, u, v, v_obstacle, time, total):
     """p; total: C [m/s]."""
-    return force.vector_of([x.value for x in _record(force, parameters, first, X, u, v, wall, time, total)[-1]])
+    return force.vector_of([x.value for x in _record(force, parameters, first, X, u, v, v_obstacle, time, total)[-1]])
 
 
 @traced
@@ -54,26 +54,30 @@ def load_jvp(force, parameters, first, X, u, time, parameters_dot, du, dtime):
 
 
 @traced
-def impulse_jvp(force, parameters, first, X, u, v, wall, time, total, parameters_dot, du, dv, dwall, dtime, dtotal):
+def impulse_jvp(
+    force, parameters, first, X, u, v, v_obstacle, time, total, parameters_dot, du, dv, dv_obstacle, dtime, dtotal
+):
     """Change of p."""
-    g, p, moved, before, walls, numbers, _, out = _record(force, parameters, first, X, u, v, wall, time, total)
-    dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (walls, dwall))
+    g, p, moved, before, obstacle, numbers, _, out = _record(force, parameters, first, X, u, v, v_obstacle, time, total)
+    dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (obstacle, dv_obstacle))
     return force.vector_of(g.forward([*zip(numbers, (dtime, dtotal)), *dots], out))
 
 
 @traced
-def total_vjp(force, parameters, first, X, u, v, wall, time, total, w):
+def total_vjp(force, parameters, first, X, u, v, v_obstacle, time, total, w):
     """Adjoint of C for that of p."""
-    g, _, _, _, _, numbers, _, out = _record(force, parameters, first, X, u, v, wall, time, total)
+    g, _, _, _, _, numbers, _, out = _record(force, parameters, first, X, u, v, v_obstacle, time, total)
     return g.reverse([(k, let(at(w, d))) for d, k in enumerate(out)], numbers[1:])[0]
 
 
 @traced
-def vjp(force, parameters, first, X, u, v, wall, time, total, w, load_adj):
-    """(adjoints of u, v, wall as vectors, of time, of the obstacle's numbers, a tuple, and (p, h mu N) as a vector) for
-    those of p and of h mu N."""
-    g, p, moved, before, walls, numbers, loaded, out = _record(force, parameters, first, X, u, v, wall, time, total)
+def vjp(force, parameters, first, X, u, v, v_obstacle, time, total, w, load_adj):
+    """(adjoints of u, v and the obstacle's velocity as vectors, of time, of the obstacle's numbers, a tuple, and (p, h
+    mu N) as a vector) for those of p and of h mu N."""
+    g, p, moved, before, obstacle, numbers, loaded, out = _record(
+        force, parameters, first, X, u, v, v_obstacle, time, total
+    )
     seeds = [(loaded, load_adj), *((k, let(at(w, d))) for d, k in enumerate(out))]
-    adjoints, count = g.reverse(seeds, [*moved, *before, *walls, numbers[0], *p]), len(moved)
+    adjoints, count = g.reverse(seeds, [*moved, *before, *obstacle, numbers[0], *p]), len(moved)
     felt = let(ti.types.vector(4, force.fp)(*(x.value for x in out), loaded.value))
     return (*force.parted(adjoints, count), adjoints[count + 6], tuple(adjoints[count + 7 :]), felt)

@@ -41,7 +41,7 @@ class Ground(Obstacle):
     ['floor.height', 'floor.stiffness_per_area', 'floor.width', 'floor.friction', 'floor.friction_speed']
     """
 
-    twin = GroundForce
+    counterpart = GroundForce
 
     def __init__(self, height: float = 0.0, stiffness: float | None = None, width: float = 0.01, **options):
         super().__init__(

@@ -38,7 +38,7 @@ class HalfSpace(Obstacle):
     arguments it takes.
     """
 
-    twin = HalfSpaceForce
+    counterpart = HalfSpaceForce
 
     def __init__(self, point: ArrayLike = (0.0, 0.0, 0.0), normal: ArrayLike = (0.0, 1.0, 0.0), **options):
         present("normal", normal)

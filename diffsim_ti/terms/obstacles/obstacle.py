@@ -59,7 +59,7 @@ class Obstacle(Term):
     """
 
     acts_on_surface = True
-    twin: type  # the device counterpart of the shape
+    counterpart: type  # the device counterpart of the shape
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class Obstacle(Term):
         speed, felt = positive("friction_speed", friction_speed, "m/s"), positive("width", width, "m", "barrier_width")
         friction_of = Input("friction", friction, ((),), range=NOT_NEGATIVE), speed
         for described in friction_of:  # also of what is smooth
-            described.check_given(type(self).__name__)
+            described.check_value(type(self).__name__)
         rough = friction_of if friction_of[0].value > 0 else ()
         self.path, self.path_width = path, 3 if path is None else path_width(path)
         kind = type(self).__name__
@@ -182,7 +182,7 @@ class Obstacle(Term):
 
     def least_radius(self) -> float:
         """How round the obstacle is at least [m]: 0 where it has edges, infinite where it is flat or hollow."""
-        return np.inf if getattr(getattr(self, "twin", None), "hollow", False) is True else 0.0
+        return np.inf if getattr(getattr(self, "counterpart", None), "hollow", False) is True else 0.0
 
     def check_start(self, positions: np.ndarray, surface: np.ndarray, offset=(0.0, 0.0, 0.0)) -> None:
         gap = self.gap(positions[surface], offset)
@@ -221,4 +221,4 @@ class Obstacle(Term):
         return self.has_friction, self.path is not None, self.per_area, self.turns
 
     def kernel(self, precision: str) -> ObstacleForce:
-        return self.twin(precision, self.has_friction)
+        return self.counterpart(precision, self.has_friction)

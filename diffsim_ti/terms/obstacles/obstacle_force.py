@@ -127,13 +127,13 @@ class ObstacleForce(VertexForce):
         return self.record(parameters, first, X, u)[3].value
 
     @traced
-    def outlook(self, parameters, first, X, u):
+    def contact_plane(self, parameters, first, X, u):
         """(n, d): normal and distance [m]."""
         _, _, _, d, n = self.record(parameters, first, X, u)
         return let(ti.types.vector(4, self.fp)(*(k.value for k in n), d.value))
 
     @traced
-    def outlook_jvp(self, parameters, first, X, u, du, parameters_dot=None):
+    def contact_plane_jvp(self, parameters, first, X, u, du, parameters_dot=None):
         """Its change for changes of the place and, where given, of the obstacle's numbers."""
         g, p, moved, d, n = self.record(parameters, first, X, u)
         known = p if parameters_dot is not None else ()
@@ -141,7 +141,7 @@ class ObstacleForce(VertexForce):
         return let(ti.types.vector(4, self.fp)(*g.forward(dots, [*n, d])))
 
     @traced
-    def outlook_vjp(self, parameters, first, X, u, adjoint, sums, i):
+    def contact_plane_vjp(self, parameters, first, X, u, adjoint, sums, i):
         """Add to sums[first.., i] what an adjoint of (n, d) says of the obstacle's numbers."""
         g, p, _, d, n = self.record(parameters, first, X, u)
         adjoints = g.reverse([(x, let(at(adjoint, k))) for k, x in enumerate([*n, d])], p[: self.count])
@@ -151,16 +151,16 @@ class ObstacleForce(VertexForce):
     @traced
     def clearance(self, parameters, first, X, u):
         """(n, d) with a distance d [m] within which the obstacle is surely not met."""
-        return self.outlook(parameters, first, X, u)
+        return self.contact_plane(parameters, first, X, u)
 
     @ti.func
     def width(self, parameters: ti.template(), first):
-        """How far the obstacle is felt [m]."""
+        """The distance at which the barrier begins to act [m]."""
         return parameters[first + self.index.width]
 
     @ti.func
     def touches(self, parameters: ti.template(), first, X, u):
-        """Whether the barrier is felt."""
+        """Whether the barrier acts."""
         return self.gap(parameters, first, X, u) < self.width(parameters, first)
 
     @traced
@@ -240,37 +240,47 @@ class ObstacleForce(VertexForce):
     # ---- friction as a stage of explicit passes ----------------------------------------------------------------------
 
     @traced
-    def _record_slide(self, parameters, first, X, u, v, wall, h_over_m):
+    def _record_slide(self, parameters, first, X, u, v, v_obstacle, h_over_m):
         g, p, moved, d, n = self.record(parameters, first, X, u)
         before = [g.leaf(at(v, d)) for d in range(3)]
-        ratio, wall = g.leaf(h_over_m), [g.leaf(at(wall, d)) for d in range(3)]
-        after = friction.slide(g, n, self.push(g, p, d), before, wall, ratio, *self.rough(p))
-        return g, p, moved, before, wall, ratio, after
+        ratio, v_obstacle = g.leaf(h_over_m), [g.leaf(at(v_obstacle, d)) for d in range(3)]
+        after = friction.slide(g, n, self.push(g, p, d), before, v_obstacle, ratio, *self.rough(p))
+        return g, p, moved, before, v_obstacle, ratio, after
 
     @traced
-    def slide(self, parameters, first, X, u, v, wall, h_over_m):
-        """Velocity after friction in the time h on a vertex of mass m that touches; `wall`: the obstacle's velocity."""
-        return self.vector_of([k.value for k in self._record_slide(parameters, first, X, u, v, wall, h_over_m)[-1]])
+    def slide(self, parameters, first, X, u, v, v_obstacle, h_over_m):
+        """Velocity after friction in the time h on a vertex of mass m that touches; `v_obstacle`: the obstacle's
+        velocity."""
+        return self.vector_of(
+            [k.value for k in self._record_slide(parameters, first, X, u, v, v_obstacle, h_over_m)[-1]]
+        )
 
     @traced
-    def slide_jvp(self, parameters, first, X, u, v, wall, h_over_m, parameters_dot, du, dv, dwall, dh_over_m):
+    def slide_jvp(
+        self, parameters, first, X, u, v, v_obstacle, h_over_m, parameters_dot, du, dv, dv_obstacle, dh_over_m
+    ):
         """Its change."""
-        g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
-        dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (walls, dwall))
+        g, p, moved, before, obstacle, ratio, after = self._record_slide(
+            parameters, first, X, u, v, v_obstacle, h_over_m
+        )
+        dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (obstacle, dv_obstacle))
         return self.vector_of(g.forward([(ratio, dh_over_m), *dots], after))
 
     @traced
-    def slide_vjp(self, parameters, first, X, u, v, wall, h_over_m, w):
-        """(adjoints of u, v, wall as vectors, of h_over_m, and of the obstacle's numbers, a tuple) for the adjoint w."""
-        g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
-        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], [*moved, *before, *walls, ratio, *p])
+    def slide_vjp(self, parameters, first, X, u, v, v_obstacle, h_over_m, w):
+        """(adjoints of u, v and the obstacle's velocity as vectors, of h_over_m, and of the obstacle's numbers, a
+        tuple) for the adjoint w."""
+        g, p, moved, before, obstacle, ratio, after = self._record_slide(
+            parameters, first, X, u, v, v_obstacle, h_over_m
+        )
+        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], [*moved, *before, *obstacle, ratio, *p])
         return (*self.parted(adjoints, len(moved)), adjoints[len(moved) + 6], tuple(adjoints[len(moved) + 7 :]))
 
     # ---- friction as a force of implicit passes, at the velocity v; felt: (X, u), the place where N and n are those of the
     # barrier, or (None, N n), the normal force itself [N] -----------------------------------------------------------------
 
     @traced
-    def _record_rub(self, parameters, first, felt, v, wall):
+    def _record_friction_force(self, parameters, first, felt, v, v_obstacle):
         X, u = felt
         if X is None:
             g = Graph(self.fp, parameters)
@@ -280,47 +290,48 @@ class ObstacleForce(VertexForce):
         else:
             g, p, place, d, n = self.record(parameters, first, X, u)
             n, push = friction.normal_force(g, n, self.push(g, p, d))
-        speed, wall = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, wall))
-        return g, p, place, speed, wall, n, push
+        speed, v_obstacle = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, v_obstacle))
+        return g, p, place, speed, v_obstacle, n, push
 
     @traced
     def _numbers(self, parameters, first):
         return [at(parameters, first + k) for k in range(self.size)]
 
     @traced
-    def dissipation(self, parameters, first, felt, v, wall):
+    def dissipation(self, parameters, first, felt, v, v_obstacle):
         """Potential of friction by the velocity [W]."""
-        g, p, _, speed, wall, n, push = self._record_rub(parameters, first, felt, v, wall)
-        return friction.dissipation(g, n, push, speed, wall, *self.rough(p)).value
+        g, p, _, speed, v_obstacle, n, push = self._record_friction_force(parameters, first, felt, v, v_obstacle)
+        return friction.dissipation(g, n, push, speed, v_obstacle, *self.rough(p)).value
 
     @traced
-    def _rubbed(self, parameters, first, felt, v, wall):
-        g, p, moved, speed, wall, n, push = self._record_rub(parameters, first, felt, v, wall)
-        return g, p, moved, speed, wall, friction.rub(g, n, push, speed, wall, *self.rough(p))
+    def _with_friction(self, parameters, first, felt, v, v_obstacle):
+        g, p, moved, speed, v_obstacle, n, push = self._record_friction_force(parameters, first, felt, v, v_obstacle)
+        return g, p, moved, speed, v_obstacle, friction.friction_force(g, n, push, speed, v_obstacle, *self.rough(p))
 
     @traced
-    def rub(self, parameters, first, felt, v, wall):
-        """Force of friction [N]; `wall`: the obstacle's velocity."""
-        return self.vector_of([k.value for k in self._rubbed(parameters, first, felt, v, wall)[-1]])
+    def friction_force(self, parameters, first, felt, v, v_obstacle):
+        """Force of friction [N]; `v_obstacle`: the obstacle's velocity."""
+        return self.vector_of([k.value for k in self._with_friction(parameters, first, felt, v, v_obstacle)[-1]])
 
     @traced
-    def rub_product(self, parameters, first, felt, v, wall, dv):
+    def friction_product(self, parameters, first, felt, v, v_obstacle, dv):
         """Its change for a change of the velocity alone."""
-        g, _, _, speed, _, f = self._rubbed(parameters, first, felt, v, wall)
+        g, _, _, speed, _, f = self._with_friction(parameters, first, felt, v, v_obstacle)
         return self.vector_of(g.forward([(x, at(dv, d)) for d, x in enumerate(speed)], f))
 
     @traced
-    def rub_jvp(self, parameters, first, felt, v, wall, parameters_dot, du, dv, dwall):
+    def friction_force_jvp(self, parameters, first, felt, v, v_obstacle, parameters_dot, du, dv, dv_obstacle):
         """Its change for changes of everything."""
-        g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
-        dots = all_changes(p, parameters_dot, first, (moved, du), (speed, dv), (walls, dwall))
+        g, p, moved, speed, obstacle, f = self._with_friction(parameters, first, felt, v, v_obstacle)
+        dots = all_changes(p, parameters_dot, first, (moved, du), (speed, dv), (obstacle, dv_obstacle))
         return self.vector_of(g.forward(dots, f))
 
     @traced
-    def rub_vjp(self, parameters, first, felt, v, wall, w):
-        """(adjoints of u, v, wall as vectors, and of the obstacle's numbers, a tuple) for the adjoint w of the force."""
-        g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
-        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *walls, *p])
+    def friction_force_vjp(self, parameters, first, felt, v, v_obstacle, w):
+        """(adjoints of u, v and the obstacle's velocity as vectors, and of the obstacle's numbers, a tuple) for the
+        adjoint w of the force."""
+        g, p, moved, speed, obstacle, f = self._with_friction(parameters, first, felt, v, v_obstacle)
+        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *obstacle, *p])
         return (*self.parted(adjoints, len(moved)), tuple(adjoints[len(moved) + 6 :]))
 
     @traced

@@ -1,8 +1,8 @@
 """An obstacle at a vertex as a stage of explicit passes: Taichi functions of one obstacle, with tangents and adjoints.
 
 `force` is the obstacle's compile-time class (obstacle_force.py), of which only the distance is used. A plane is the vector
-(n, d) that its `outlook` gives where the pass begins. The push P is that of secant.py, for a distance that goes from d to
-y = d + n . move, `move` being the vertex's displacement in the pass relative to the obstacle. Friction is that of
+(n, d) that its `contact_plane` gives where the pass begins. The push P is that of secant.py, for a distance that goes
+from d to y = d + n . move, `move` being the vertex's displacement in the pass relative to the obstacle. Friction is that of
 friction.py, with P as the normal force.
 """
 
@@ -102,32 +102,32 @@ def push_vjp(force, parameters, first, X, u, move, damping, n_adj, push_adj):
 
 
 @traced
-def _record_slide(fp, plane, push, v, wall, ratio, mu, eps):
+def _record_slide(fp, plane, push, v, v_obstacle, ratio, mu, eps):
     """(graph, leaves: n, P, v, wall, ratio, mu, eps, and the velocity after it)"""
     g = Graph(fp)
-    n, before, walls = ([g.leaf(at(x, d)) for d in range(3)] for x in (plane, v, wall))
+    n, before, obstacle = ([g.leaf(at(x, d)) for d in range(3)] for x in (plane, v, v_obstacle))
     pushed, ratio, mu, eps = (g.leaf(x) for x in (push, ratio, mu, eps))
-    after = friction.slide(g, n, pushed, before, walls, ratio, mu, eps)
-    return g, [*n, pushed, *before, *walls, ratio, mu, eps], after
+    after = friction.slide(g, n, pushed, before, obstacle, ratio, mu, eps)
+    return g, [*n, pushed, *before, *obstacle, ratio, mu, eps], after
 
 
 @traced
-def slide(fp, plane, push, v, wall, ratio, mu, eps):
+def slide(fp, plane, push, v, v_obstacle, ratio, mu, eps):
     """Velocity after friction; ratio: h / m [s/kg]."""
-    return _vector(fp, [k.value for k in _record_slide(fp, plane, push, v, wall, ratio, mu, eps)[-1]])
+    return _vector(fp, [k.value for k in _record_slide(fp, plane, push, v, v_obstacle, ratio, mu, eps)[-1]])
 
 
 @traced
-def slide_jvp(fp, plane, push, v, wall, ratio, mu, eps, dplane, dv, dwall, dratio, dmu, deps):
+def slide_jvp(fp, plane, push, v, v_obstacle, ratio, mu, eps, dplane, dv, dv_obstacle, dratio, dmu, deps):
     """Its change; dplane: that of (n, P)."""
-    g, leaves, after = _record_slide(fp, plane, push, v, wall, ratio, mu, eps)
-    vectors = [at(x, d) for x, size in ((dplane, 4), (dv, 3), (dwall, 3)) for d in range(size)]
+    g, leaves, after = _record_slide(fp, plane, push, v, v_obstacle, ratio, mu, eps)
+    vectors = [at(x, d) for x, size in ((dplane, 4), (dv, 3), (dv_obstacle, 3)) for d in range(size)]
     return _vector(fp, g.forward(list(zip(leaves, [*vectors, dratio, dmu, deps])), after))
 
 
 @traced
-def slide_vjp(fp, plane, push, v, wall, ratio, mu, eps, w):
+def slide_vjp(fp, plane, push, v, v_obstacle, ratio, mu, eps, w):
     """(adjoints of (n, P), v, wall as vectors, of ratio, mu, eps) for that of the velocity after it."""
-    g, leaves, after = _record_slide(fp, plane, push, v, wall, ratio, mu, eps)
+    g, leaves, after = _record_slide(fp, plane, push, v, v_obstacle, ratio, mu, eps)
     x = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], leaves)
     return (_vector(fp, x[:3], x[3]), _vector(fp, x[4:7]), _vector(fp, x[7:10]), *x[10:])

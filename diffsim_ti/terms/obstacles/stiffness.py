@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.materials.moduli import pressure_wave_speed
 
-TIMES = np.linspace(0, 1, 41)  # [s] at which functions of time are looked at
+TIMES = np.linspace(0, 1, 41)  # [s] at which functions of time are evaluated
 
 
 def stiffness_of_impact(

@@ -1,4 +1,4 @@
-"""Whether the way of a scene's surface past its obstacles is free."""
+"""Collision detection along the motion of a scene's surface past its obstacles."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -27,10 +27,10 @@ class Met:
         return f"face ({', '.join(map(str, self.vertices))})"
 
 
-class Way:
+class CollisionDetection:
     """Vertices and faces of a surface against the obstacles of a scene, whose numbers are those that are loaded.
 
-    places, drifts: where obstacles are, and how they go meanwhile (state/walls.py).
+    places, drifts: where obstacles are, and how they go meanwhile (state/obstacle_poses.py).
     """
 
     far = 1e30
@@ -47,13 +47,13 @@ class Way:
         self._way = SimpleNamespace(
             corners=runtime.upload(self.corners_of.ravel(), ti.i32),
             step=runtime.array(a.vector, 1, a.num_vertices),
-            places=runtime.array(a.vector, a.walls.size // 3),
-            drifts=runtime.array(a.vector, a.walls.size // 3),
+            places=runtime.array(a.vector, a.poses.size // 3),
+            drifts=runtime.array(a.vector, a.poses.size // 3),
         )
         self._at = SimpleNamespace(u=runtime.array(a.vector, 1, a.num_vertices))
         self._out = SimpleNamespace(found=runtime.array(a.fp, self.count), blocker=runtime.array(ti.i32, self.count))
         self._launches = {}
-        self.met: Met | None = None  # what the last look found
+        self.met: Met | None = None  # what the last detection found
 
     def share(
         self, u: np.ndarray, step: np.ndarray, places: np.ndarray, drifts=0.0, most: float = 1.0, kept=0.1
@@ -65,7 +65,7 @@ class Way:
             return most
         runtime.fill(self._way.step, step[None])
         runtime.fill(self._way.drifts, drifts)
-        self._look("shares", u, places, most, kept)
+        self._check("shares", u, places, most, kept)
         return most if self.met is None else self.met.value
 
     def nearest(self, u: np.ndarray, places: np.ndarray, within: float = 0.0) -> Met | None:
@@ -74,7 +74,7 @@ class Way:
             return None
         runtime.fill(self._way.step, 0)
         runtime.fill(self._way.drifts, 0)
-        self._look("distances", u, places, max(within, 1e-30))
+        self._check("distances", u, places, max(within, 1e-30))
         return self.met
 
     def check_apart(self, u: np.ndarray, places: np.ndarray, within: float = 0.0) -> np.ndarray:
@@ -91,7 +91,7 @@ class Way:
             )
         return self.found[self.num_vertices :] if self.terms else np.zeros(0)
 
-    def _look(self, name: str, u, places, most: float, kept: float = 0.0) -> None:
+    def _check(self, name: str, u, places, most: float, kept: float = 0.0) -> None:
         if name not in self._launches:
             own = dict(scene=self.a, way=self._way, at=self._at, out=self._out)
             self._launches[name] = getattr(self._kernels, name).bind(**own)
@@ -108,8 +108,11 @@ class Way:
 
     @property
     def widths(self) -> list[float]:
-        """How far each obstacle is felt [m]."""
-        return [float(self.a.values.parameters[first + twin.index.width]) for twin, first, _ in self.a.obstacles]
+        """The distance at which each obstacle begins to act [m]."""
+        return [
+            float(self.a.values.parameters[first + counterpart.index.width])
+            for counterpart, first, _ in self.a.obstacles
+        ]
 
     @property
     def widest(self) -> float:

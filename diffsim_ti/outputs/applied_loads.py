@@ -20,7 +20,7 @@ def at_end(step: int, begins: bool = False) -> Instant:
     return Instant(STEPS, max(step - 1, 0), float(step > 0 and not begins))
 
 
-class GivenLoads:
+class AppliedLoads:
     """Forces [N], shape (num_vertices, 3): weight, dead loads and those of interactions, after so many steps: those of the
     last of these as it ends; with `begins`, as it begins.
 
@@ -68,7 +68,7 @@ class GivenLoads:
         return hosts
 
     def held_jvp(self, x: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Change of the forces for that of the pressures of held volumes."""
+        """Change of the forces for that of the pressures of constrained volumes."""
         return sum(change[k] * push for k, push in self._unit_forces(x))
 
     def held_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -104,7 +104,7 @@ class GivenLoads:
         v=None,
         dv=0.0,
     ) -> np.ndarray:
-        """Their change, at held pressures."""
+        """Their change, at frozen pressures."""
         out = np.zeros(x.shape)
         if self.gravity is not None:
             g, dg = (of.parameters[self.gravity][:3] for of in (derived, moved))

@@ -7,27 +7,27 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mechanics.obstacles.blocked import Blocked
-from diffsim_ti.mechanics.obstacles.way import Way
+from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
+from diffsim_ti.state.obstacle_poses import Moment
 from diffsim_ti.state.stage import Stage
-from diffsim_ti.state.walls import Moment
 
 
-class ObstacleWays:
-    """Of a workspace. rows: of its obstacles in the pass (state/walls.py); before, at_stage: displacements of theirs where
-    the pass begins and where it takes forces."""
+class ObstacleCollisions:
+    """Of a workspace. rows: of its obstacles in the pass (state/obstacle_poses.py); before, at_stage: displacements of
+    theirs where the pass begins and where it takes forces."""
 
     def __init__(self, workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
-        self.way = Way(workspace.arrays, workspace.parallel)
+        self.detection = CollisionDetection(workspace.arrays, workspace.parallel)
 
     # ---- in a pass ---------------------------------------------------------------------------------------------------
 
     def begin(self, j: int, stage: Stage) -> None:
         """Pass j."""
-        walls, path, moment = self.ws.arrays.walls, self.ws.arrays.rows["path"], self.moment(j, stage)
-        walls.check(path, moment)
-        self.rows = walls.value(path, moment)
+        poses, path, moment = self.ws.arrays.poses, self.ws.arrays.rows["path"], self.moment(j, stage)
+        poses.check(path, moment)
+        self.rows = poses.value(path, moment)
         self.at_stage, self.before = self.rows[::3].copy(), self.rows[1::3].copy()
 
     def moment(self, j: int, stage: Stage) -> Moment:
@@ -39,51 +39,51 @@ class ObstacleWays:
 
     def jvp(self, dpath: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
         """Change of the rows."""
-        return self.ws.arrays.walls.jvp(self.ws.arrays.rows["path"], dpath, self.moment(j, stage))
+        return self.ws.arrays.poses.jvp(self.ws.arrays.rows["path"], dpath, self.moment(j, stage))
 
     def vjp(self, rows_adj: np.ndarray, j: int, stage: Stage, path_adj: np.ndarray) -> None:
         """Add the adjoints of the rows of paths."""
-        self.ws.arrays.walls.vjp(self.ws.arrays.rows["path"], rows_adj, self.moment(j, stage), path_adj)
+        self.ws.arrays.poses.vjp(self.ws.arrays.rows["path"], rows_adj, self.moment(j, stage), path_adj)
 
     def at_end(self, j: int) -> np.ndarray:
         """Displacements of the obstacles at the end of pass j."""
         arrays = self.ws.arrays
-        return arrays.walls.value(arrays.rows["path"], self.moment(j, Stage(1.0)))[::3]
+        return arrays.poses.value(arrays.rows["path"], self.moment(j, Stage(1.0)))[::3]
 
     # ---- on the way of a step ----------------------------------------------------------------------------------------
 
     def past(self, u, step, most: float = 1.0) -> tuple:
         """(how far along a step no obstacle is met where obstacles are in the pass, what would be met then)."""
-        share = self.way.share(u, step, self.rows[::3], most=most)
-        return share, self.way.met
+        share = self.detection.share(u, step, self.rows[::3], most=most)
+        return share, self.detection.met
 
     def put(self, places: np.ndarray) -> None:
         """Take forces with obstacles elsewhere."""
         self.rows[::3] = places
         if len(places):
-            runtime.fill(self.ws.potential.walls, self.rows)
+            runtime.fill(self.ws.potential.poses, self.rows)
 
     def check_apart(self) -> None:
         """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
-        u, walls = runtime.fetch_row(self.ws.state.u, 0), runtime.fetch(self.ws.arrays.offsets)[::3].astype(np.float64)
+        u, poses = runtime.fetch_row(self.ws.state.u, 0), runtime.fetch(self.ws.arrays.offsets)[::3].astype(np.float64)
         faces = self.ws.potential.faces
         if faces is None:
-            self.way.check_apart(u, walls)
+            self.detection.check_apart(u, poses)
         else:
-            faces.begin(self.way.check_apart(u, walls, 2 * faces.reach.max(initial=0)))
+            faces.begin(self.detection.check_apart(u, poses, 2 * faces.reach.max(initial=0)))
 
     def check_end(self, j: int, u_star, u_next) -> None:
         """Raise Tunnelling where surfaces, or a surface and an obstacle, meet beyond the middle of a step."""
         if self.ws.pairs:
             self.ws.pairs.check_end(u_star, u_next)
-        drift = self.ws.arrays.walls.drift(self.rows[::3], self.at_end(j))
-        if self.way.share(u_star, u_next - u_star, self.rows[::3], drift) == 1:
+        drift = self.ws.arrays.poses.drift(self.rows[::3], self.at_end(j))
+        if self.detection.share(u_star, u_next - u_star, self.rows[::3], drift) == 1:
             return
-        met = self.way.met
+        met = self.detection.met
         speed = self._speed(met, u_star, u_next - u_star, self.rows[::3], drift) / 0.5
         raise Tunnelling(
             f"beyond the middle of a step, where its forces were taken, {met} meets "
-            f"{self.way.terms[met.obstacle]!r} at {speed:.4g} m/s: take a solver whose steps end where forces are "
+            f"{self.detection.terms[met.obstacle]!r} at {speed:.4g} m/s: take a solver whose steps end where forces are "
             "taken, ImplicitEulerSolver or BDF2Solver"
         )
 
@@ -95,26 +95,26 @@ class ObstacleWays:
 
     def carried(self, obstacle: int, u, places, drift, vertices=slice(None)) -> np.ndarray:
         """How far an obstacle takes vertices that it holds at displacements u."""
-        points, about = self.ws.arrays.values.rest[vertices] + u, self.way.terms[obstacle].about
-        return self.ws.arrays.walls.way_at(obstacle, places, drift, points, about)
+        points, about = self.ws.arrays.values.rest[vertices] + u, self.detection.terms[obstacle].about
+        return self.ws.arrays.poses.displacement_of(obstacle, places, drift, points, about)
 
     def explained(self, error: NotConverged, u) -> NotConverged:
         """The error, or what stood in the way."""
         report = self.ws.newton.report
         if isinstance(error, Blocked) or report.place is None or not report.cuts:
             return error
-        met = self.way.nearest(report.place, self.rows[::3], self.way.widest)
+        met = self.detection.nearest(report.place, self.rows[::3], self.detection.widest)
         if met is None:
             return error
-        drift = self.ws.arrays.walls.drift(self.before, self.at_stage)
+        drift = self.ws.arrays.poses.drift(self.before, self.at_stage)
         speed = self._speed(met, u, report.place - u, self.before, drift)
         return Blocked.at_an_obstacle(self.ws, error, report.place, met, speed)
 
     def gap_of(self, met, u) -> float:
         """Distance [m] of what stands before an obstacle."""
-        near = self.way.nearest(u, self.rows[::3], self.way.widest)
-        return near.value if near is not None else self.way.widest
+        near = self.detection.nearest(u, self.rows[::3], self.detection.widest)
+        return near.value if near is not None else self.detection.widest
 
     def width_of(self, obstacle: int) -> float:
         """The width [m] of an obstacle's barrier, as loaded."""
-        return self.way.widths[obstacle]
+        return self.detection.widths[obstacle]

@@ -35,7 +35,7 @@ class Moment:
     tau: float = 0.0
 
 
-class Walls:
+class ObstaclePoses:
     """obstacles: as `SceneArrays.obstacles`; rows of paths are columns of `inputs/poses.py`. away: what each obstacle's
     displacements have less, shape (obstacles, 3) [m] (origin.py)."""
 
@@ -48,7 +48,7 @@ class Walls:
         self.place_of = {k: row // 3 for (k, _), (row, _) in zip(turning, self.turning)}  # of obstacle k among places
 
     def check(self, path: np.ndarray | None, at: Moment) -> None:
-        """Raise ValueError for a pass in which an obstacle turns farther than its way is looked at."""
+        """Raise ValueError for a pass in which an obstacle turns farther than its motion is resolved."""
         for _, c in self.turning:
             most = np.linalg.norm(path[at.schedule.row_of(path, at.j), c + 2]) * (at.schedule.end(at.j) - at.begin)
             if most > 3.1:
@@ -109,7 +109,7 @@ class Walls:
             out[at] = _at_share(places[at], drift[at], share)
         return out
 
-    def way_at(
+    def displacement_of(
         self, k: int, places: np.ndarray, drift: np.ndarray, points: np.ndarray, about: np.ndarray
     ) -> np.ndarray:
         """How far obstacle k takes points [m] that it holds on a drift, shape (points, 3)."""
@@ -135,11 +135,11 @@ class Walls:
                 out[row + RATE] = dphi / at.schedule.step_length(at.j)
         return out
 
-    def vjp(self, path: np.ndarray, walls_adj: np.ndarray, at: Moment, path_adj: np.ndarray) -> None:
+    def vjp(self, path: np.ndarray, poses_adj: np.ndarray, at: Moment, path_adj: np.ndarray) -> None:
         """Add the adjoints of the rows of paths for those of the rows here."""
         schedule, j = at.schedule, at.j
         for k, c in self.columns:
-            by_stage, by_before, by_speed = walls_adj[3 * k : 3 * k + 3]
+            by_stage, by_before, by_speed = poses_adj[3 * k : 3 * k + 3]
             rows = path_adj[:, c]
             schedule.add_place(rows, j, at.at_stage, by_stage)
             schedule.add_place(rows, j, at.begin, by_before)
@@ -148,7 +148,7 @@ class Walls:
             s = schedule.row_of(path, j)
             phi = path[s, c + 2]
             for m, share in ((AT_STAGE, at.at_stage), (AT_BEGIN, at.begin)):
-                by, back = walls_adj[row + m], rotations.quaternion(-share * phi)
+                by, back = poses_adj[row + m], rotations.quaternion(-share * phi)
                 path_adj[s, c + 1] += rotations.turned(back, by)
                 path_adj[s, c + 2] += share * rotations.left_jacobian(share * phi).T @ by
-            path_adj[s, c + 2] += walls_adj[row + RATE] / schedule.step_length(j)
+            path_adj[s, c + 2] += poses_adj[row + RATE] / schedule.step_length(j)

@@ -1,26 +1,26 @@
 """Springs and cables in float64 on the host: energy, forces, their derivatives both ways.
 
-The numbers are those of inputs/ties.py: T = a + k e, e = L - L0 + s, and where a tie pulls only, e is zero where it would be
-less. d = D + C u: segments, D at rest, C from displacements of vertices.
+The numbers are those of inputs/lines.py: T = a + k e, e = L - L0 + s, and where a line element pulls only, e is zero
+where it would be less. d = D + C u: segments, D at rest, C from displacements of vertices.
 """
 
 import numpy as np
 
-from diffsim_ti.inputs.ties import directions
+from diffsim_ti.inputs.lines import directions
 from diffsim_ti.mechanics.host_force import HostForce
-from diffsim_ti.mechanics.ties.pull import across, tension, tension_jvp
+from diffsim_ti.mechanics.lines.pull import across, tension, tension_jvp
 
 
-class Ties(HostForce):
+class LinesOnHost(HostForce):
     """Springs and, after them, cables, of `SpringsAndCables`; `at` says what they are at a time."""
 
     has_energy = symmetric = True
 
-    def __init__(self, ties):
-        self.paths = paths = ties.paths
-        self.one_sided, self.cables, num_vertices = ties.one_sided, ties.cables, ties.mesh.num_vertices
-        self._may_be_slack = self.one_sided & ~ties.keyed  # as the run begins, and then for good
-        self._by_length = ~ties.by_tension
+    def __init__(self, lines):
+        self.paths = paths = lines.paths
+        self.one_sided, self.cables, num_vertices = lines.one_sided, lines.cables, lines.mesh.num_vertices
+        self._may_be_slack = self.one_sided & ~lines.keyed  # as the run begins, and then for good
+        self._by_length = ~lines.by_tension
         places, starts = paths.matrix(num_vertices), paths.starts
         self.parted = (places[starts + 1] - places[starts]).tocsr()  # C
         self.together = self.parted.T.tocsr()  # its transpose, built once
@@ -31,26 +31,26 @@ class Ties(HostForce):
         self._pair_path, self._pair_vertex = np.divmod(pairs, num_vertices)
         self.num_vertices = num_vertices
 
-    def at(self, segments: np.ndarray, tension: np.ndarray, slack: np.ndarray, stiffness: np.ndarray) -> "Ties":
-        """With segments at rest (points, 3) [m], and a, s, k of each tie."""
+    def at(self, segments: np.ndarray, tension: np.ndarray, slack: np.ndarray, stiffness: np.ndarray) -> "LinesOnHost":
+        """With segments at rest (points, 3) [m], and a, s, k of each line element."""
         self.D, self.a, self.s, self.k = segments[self.paths.starts], tension, slack, stiffness
         self._seen = None
         return self
 
     def take(self, values, instant):
         super().take(values, instant)
-        return self.at(values.tie_segments, *self._numbers(values.ties))
+        return self.at(values.line_segments, *self._numbers(values.lines))
 
     def _numbers(self, rows: np.ndarray) -> tuple:
         """(a, s, k) of the instant, of rows or of their change; the pull of springs is there from the start of statics."""
-        a, s, k = self.instant.schedule.ties(rows, self.instant.j, self.instant.share)
+        a, s, k = self.instant.schedule.lines(rows, self.instant.j, self.instant.share)
         return a * np.where(self.cables, self.instant.load, 1.0), s, k
 
     def stiffest(self, values, schedule):
         """The largest tension and stiffness of each in all rows, and its least length."""
-        ends = values.ties.reshape(len(values.ties), -1, 2, 3)
+        ends = values.lines.reshape(len(values.lines), -1, 2, 3)
         a, s = ends[:, :, 0, :2].max((0, 2)), ends[:, :, 1, :2].max((0, 2))
-        return self.at(values.tie_segments, a, s, ends[:, :, 0, 2].max(0))
+        return self.at(values.line_segments, a, s, ends[:, :, 0, 2].max(0))
 
     def _sums(self, of_segments):
         """Of each path."""
@@ -200,8 +200,8 @@ class Ties(HostForce):
         if moved is None:
             dT = k * self._sums((t * dd).sum(1))
         else:
-            dd = moved.tie_segments[self.paths.starts] + dd
-            dT = self.tensions_jvp(u, du, moved.tie_segments, *self._numbers(moved.ties))
+            dd = moved.line_segments[self.paths.starts] + dd
+            dT = self.tensions_jvp(u, du, moved.line_segments, *self._numbers(moved.lines))
         return -(self.together @ (dT[self.paths.path_of, None] * t + self._across(t, length, T, dd)))
 
     def vjp(self, u, w, adj=None):
@@ -210,15 +210,15 @@ class Ties(HostForce):
         by_u, segments, (a, s, k) = self.tensions_vjp(u, self._sums((t * w).sum(1)))
         across = self._across(t, length, T, w)
         if adj is not None:
-            adj.tie_segments += segments + self._of_points(across)
+            adj.line_segments += segments + self._of_points(across)
             a = a * np.where(self.cables, self.instant.load, 1.0)
-            self.instant.schedule.add_ties(adj.ties, self.instant.j, self.instant.share, (a, s, k))
+            self.instant.schedule.add_lines(adj.lines, self.instant.j, self.instant.share, (a, s, k))
         return by_u + self.together @ across, 0.0
 
     def resisted(self):
         """Along paths that are elastic and not slack as the run begins, or whose length is given over time."""
         size = np.abs(self.values.rest - self.values.rest.mean(0)).max()
-        slack = self.values.ties[0].reshape(-1, 2, 3)[:, 1, :2].max(1) < -1e-9 * size
+        slack = self.values.lines[0].reshape(-1, 2, 3)[:, 1, :2].max(1) < -1e-9 * size
         holds = (self.k > 0) & self._by_length & ~(self._may_be_slack & slack)
         C, t, path = self.parted.tocoo(), directions(self.D), self.paths.path_of
         rows, vertices, vectors = [], [], []

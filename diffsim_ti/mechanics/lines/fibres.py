@@ -1,7 +1,7 @@
-"""Fibres of muscles in explicit passes, eight at a time: what tie.py does with one, to the same digits.
+"""Fibres of muscles in explicit passes, eight at a time: what line.py does with one, to the same digits.
 
-A fibre is a tie with a given tension T, from the origin, which is no vertex, to a weighted sum of the vertices of its
-tetrahedron. So the points, the corners and the numbers of eight fibres in a row lie at equal distances, and
+A fibre is a line element with a given tension T, from the origin, which is no vertex, to a weighted sum of the vertices
+of its tetrahedron. So the points, the corners and the numbers of eight fibres in a row lie at equal distances, and
 each number of a formula is a vector of eight lanes.
 """
 
@@ -10,8 +10,8 @@ from functools import cached_property
 
 import taichi as ti
 
+from diffsim_ti.mechanics.lines.pull import across
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
-from diffsim_ti.mechanics.ties.pull import across
 from diffsim_ti.runtime import LANES, assign, at, let, traced
 from diffsim_ti.state.pass_table import between
 
@@ -30,7 +30,7 @@ class FibreBlock(StepNumbers):
     @traced
     def place(self, t, scene):
         """(the first point of fibre t, the first corner)"""
-        p = let(at(scene.tie_start, t))
+        p = let(at(scene.line_start, t))
         return p, let(at(scene.point_start, p + 1))
 
     @traced
@@ -106,42 +106,42 @@ class FibreBlock(StepNumbers):
     @traced
     def stretched(self, c, p, u, s, scene) -> list:
         """d, from the origins to the ends of the fibres."""
-        return [let(D + moved) for D, moved in zip(self.at_rest(p, scene.tie_segments), self.parted(c, u, s, scene))]
+        return [let(D + moved) for D, moved in zip(self.at_rest(p, scene.line_segments), self.parted(c, u, s, scene))]
 
     @traced
     def forces(self, t, now, scene, state, s, first) -> None:
         p, c = self.place(t, scene)
         there, _, unit = self.known(self.stretched(c, p, state.u, s, scene))
-        T = let(self.tension(t, now, scene.ties) * there)
+        T = let(self.tension(t, now, scene.lines) * there)
         self.store(c, first, self.minus([let(T * e) for e in unit]), scene, scene.corner)
 
     @traced
     def forces_jvp(self, t, now, scene, state, s, tangent, first) -> None:
         p, c = self.place(t, scene)
         there, size, unit = self.known(self.stretched(c, p, state.u, s, scene))
-        T, dT = self.tension(t, now, scene.ties), let(self.tension(t, now, tangent.ties) * there)
-        moved = zip(self.at_rest(p, tangent.tie_segments), self.parted(c, tangent.u, 0, scene))
+        T, dT = self.tension(t, now, scene.lines), let(self.tension(t, now, tangent.lines) * there)
+        moved = zip(self.at_rest(p, tangent.line_segments), self.parted(c, tangent.u, 0, scene))
         across = self.across(T, size, there, unit, [let(dD + part) for dD, part in moved])
         change = [let(dT * e + part) for e, part in zip(unit, across)]
         self.store(c, first, self.minus(change), scene, scene.corner)
 
     @traced
     def forces_vjp(self, t, now, scene, state, s, adjoint, first) -> None:
-        """As of TieElement; adds to adjoint.tie_rest only where adjoints of the shape are wanted."""
+        """As of LineElement; adds to adjoint.line_rest only where adjoints of the shape are wanted."""
         p, c = self.place(t, scene)
         there, size, unit = self.known(self.stretched(c, p, state.u, s, scene))
         w = self.minus(self.parted(c, adjoint.w, 0, scene))
-        push = self.across(self.tension(t, now, scene.ties), size, there, unit, w)
+        push = self.across(self.tension(t, now, scene.lines), size, there, unit, w)
         self.store(c, first, push, scene, adjoint.corner)
         zero = ti.cast(0, self.fp)
         if self.shape:
             for k in range(LANES):
-                target = at(adjoint.tie_rest, p + 2 * k if k else p)
+                target = at(adjoint.line_rest, p + 2 * k if k else p)
                 assign(target, target + self.vector(*(at(x, k) for x in push), zero))
         by_T = let(self.dot(unit, w) * there)
         for r, share, weight in self.kicks(now):
             by = let(weight * by_T)
             begin, end = let((1 - share) * by), let(share * by)
             for k in range(LANES):
-                target = at(adjoint.tie_felt, r, 2 * t + 2 * k)
+                target = at(adjoint.line_adjoint, r, 2 * t + 2 * k)
                 assign(target, target + self.vector(at(begin, k), at(end, k), zero, zero))

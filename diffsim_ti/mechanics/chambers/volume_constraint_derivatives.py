@@ -1,4 +1,4 @@
-"""The tangent and the adjoint of the stage that holds volumes (held_volumes.py), along recorded passes."""
+"""The tangent and the adjoint of the stage that holds volumes (volume_constraints.py), along recorded passes."""
 
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -6,18 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.inputs import Derived
-from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes, Walls, along, slopes
 from diffsim_ti.mechanics.chambers.record import ChamberRecord
+from diffsim_ti.mechanics.chambers.volume_constraints import ChamberWalls, VolumeConstraints, along, slopes
 from diffsim_ti.mechanics.stage import Passes, Stage
 
 
 @dataclass
-class HeldPass:
+class VolumeConstraintPass:
     """A recorded pass j, between its slots."""
 
     j: int
     now: object  # its numbers
-    walls: Walls
+    walls: ChamberWalls
     ends: np.ndarray  # places of the walls after it
     s: np.ndarray | None  # None where there was no stage
     frame: int  # whose velocity it shows between kicks, or -1
@@ -40,12 +40,14 @@ class HeldPass:
         return self.now.alpha * (self.now.pre + self.now.post)
 
 
-def recorded(held: HeldVolumes, at: Passes, shows: bool = False) -> HeldPass:
+def recorded(held: VolumeConstraints, at: Passes, shows: bool = False) -> VolumeConstraintPass:
     """A pass of the record; shows: its velocity between kicks is looked at also where it is no frame's."""
     ws, kept, now, history, slot, j = held.ws, held.kept.get(at.end), at.now, at.history, at.slot, at.j
     u, v = held.rows(history.u, slot), held.rows(history.v, slot)
     walls, ends = held.walls(u), held.rest + held.rows(history.u, at.end)
-    one = HeldPass(j, now, walls, ends, None if kept is None else kept[2], held.frame(j, at.save_every, now))
+    one = VolumeConstraintPass(
+        j, now, walls, ends, None if kept is None else kept[2], held.frame(j, at.save_every, now)
+    )
     if one.frame >= 0 or (shows and now.pre > 0):
         a, gravity = ws.arrays.values, ws.arrays.features().gravity
         weight = a.parameters[gravity:][:3] if gravity >= 0 else np.zeros(3)
@@ -55,10 +57,10 @@ def recorded(held: HeldVolumes, at: Passes, shows: bool = False) -> HeldPass:
     return one
 
 
-class HeldTangent(Stage):
+class VolumeConstraintTangent(Stage):
     """Of a run, which holds the changes of the state and of frames, and those of all else."""
 
-    def __init__(self, held: HeldVolumes, run):
+    def __init__(self, held: VolumeConstraints, run):
         self.held, self.change = held, run.tangent
         run.chamber_record = self.chambers = ChamberRecord(held.ws.solver, held.places)
         self.rest, mass = self.change.rest[held.nodes], held.ws.arrays.values.mass[held.nodes, None]
@@ -92,12 +94,12 @@ class HeldTangent(Stage):
             held.put(run.frames.frames_v, one.frame, dv + np.tensordot(dq, walls.d, 1) + pushed)
 
 
-class HeldAdjoint(Stage):
+class VolumeConstraintAdjoint(Stage):
     """Of a run, which holds the adjoints of the state and of frames: sums over passes."""
 
     in_kicks = True  # where the velocity that a state shows is not yet tangent
 
-    def __init__(self, held: HeldVolumes, run):
+    def __init__(self, held: VolumeConstraints, run):
         self.held, self.drag = held, run.features.drag
         run.chamber_record = self.chambers = ChamberRecord(held.ws.solver, held.places)
 
@@ -130,10 +132,10 @@ class HeldAdjoint(Stage):
         if one.s is not None:
             u_adj, v_adj = held.rows(run.u, 0), held.rows(run.v, 0)
             by_pressure = self.chambers.adjoint(j, save_every) / one.per_pressure
-            G, way_adj = walls.gradients(one.ends), u_adj + one.ratio * v_adj
-            mu = np.linalg.solve(slopes(G, walls.d).T, along(walls.d, way_adj) + by_pressure)
+            G, displacement_adj = walls.gradients(one.ends), u_adj + one.ratio * v_adj
+            mu = np.linalg.solve(slopes(G, walls.d).T, along(walls.d, displacement_adj) + by_pressure)
             z = -np.tensordot(mu, G, 1)
-            self._push(walls, one.s, way_adj + z)
+            self._push(walls, one.s, displacement_adj + z)
             self.rest += z
             held.put(run.u, 0, u_adj + z)
             schedule.add_pressure(rows, j, schedule.end(j), self._of_all(mu))
@@ -144,7 +146,7 @@ class HeldAdjoint(Stage):
             frame_adj = held.rows(run.frames.frames_v, one.frame)
             held.put(run.frames.frames_v, one.frame, frame_adj + self._show(one, frame_adj))
 
-    def _halt(self, one: HeldPass, run) -> None:
+    def _halt(self, one: VolumeConstraintPass, run) -> None:
         """From the state between the kicks of a pass to that with a tangent velocity, of which all later ones are functions
         likewise."""
         held = self.held
@@ -160,7 +162,7 @@ class HeldAdjoint(Stage):
             self.end(run)
         self.halted = None
 
-    def _show(self, one: HeldPass, frame_adj: np.ndarray) -> np.ndarray:
+    def _show(self, one: VolumeConstraintPass, frame_adj: np.ndarray) -> np.ndarray:
         """What comes to the adjoint of a velocity that is shown, before it is made tangent; adds those of all else."""
         walls, rows, schedule = one.walls, self.follower, self.held.ws.solver.schedule
         mu = np.linalg.solve(slopes(walls.g, walls.d).T, along(walls.d, frame_adj))
@@ -173,7 +175,7 @@ class HeldAdjoint(Stage):
         row[:, 1] += rate
         return z
 
-    def _push(self, walls: Walls, s: np.ndarray, adjoint: np.ndarray) -> None:
+    def _push(self, walls: ChamberWalls, s: np.ndarray, adjoint: np.ndarray) -> None:
         by_x, by_inverse = walls.pushed_vjp(s, adjoint)
         self.by_x, self.inverse = self.by_x + by_x, self.inverse + by_inverse
 

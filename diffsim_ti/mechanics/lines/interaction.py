@@ -6,11 +6,11 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs.foundation import FoundationRows
-from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
+from diffsim_ti.inputs.lines import JoinedRows, JoinedSegments
 from diffsim_ti.mechanics.interaction import Interaction
-from diffsim_ti.mechanics.ties.foundations import FoundationForce, FoundationOnHost
-from diffsim_ti.mechanics.ties.tie_force import TieForce
-from diffsim_ti.mechanics.ties.ties import Ties
+from diffsim_ti.mechanics.lines.foundations import FoundationForce, FoundationOnHost
+from diffsim_ti.mechanics.lines.line_force import LineForce
+from diffsim_ti.mechanics.lines.on_host import LinesOnHost
 from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.runtime import LANES
 from diffsim_ti.state.corners import slots
@@ -24,8 +24,8 @@ class SpringsAndCables(Interaction):
     that is given, however long it is (by_tension), and whether what is given changes within steps (keyed).
     """
 
-    name, kinds, pulls = "ties", (Spring, Cable), True
-    derived = TieForce.derived
+    name, kinds, pulls = "lines", (Spring, Cable), True
+    derived = LineForce.derived
 
     def __init__(self, scene, terms):
         super().__init__(scene, tuple(sorted(terms, key=lambda t: (isinstance(t, Cable), t.of_fibres))))
@@ -51,19 +51,19 @@ class SpringsAndCables(Interaction):
 
     def links(self, own):
         rows, segments = ([f"{own[t]} {part}" for t in self.terms] for part in ("rows", "segments"))
-        return [JoinedRows(rows, "ties"), JoinedSegments(segments, "tie_segments")]
+        return [JoinedRows(rows, "lines"), JoinedSegments(segments, "line_segments")]
 
     @cached_property
     def topology(self):
         paths = self.paths
-        # 1: pulls only, 0: pushes too, -1: pulls as it is told, whose length nobody asks for
+        # 1: pulls only, 0: pushes too, -1: pulls as it is told, whose length is not asked for
         sides = np.where(self.by_tension, -1, self.one_sided)
-        out = dict(tie_start=paths.first_point, point_start=paths.first_corner, point_vertex=paths.vertices)
-        return out | dict(point_weight=np.asarray(paths.weights, np.float64), tie_sides=sides)
+        out = dict(line_start=paths.first_point, point_start=paths.first_corner, point_vertex=paths.vertices)
+        return out | dict(point_weight=np.asarray(paths.weights, np.float64), line_sides=sides)
 
     @property
     def num_fibre_blocks(self) -> int:
-        """Eights of fibres, the last ties, where kernels may take them so."""
+        """Eights of fibres, the last line elements, where kernels may take them so."""
         fibres = sum(len(term.paths(self.mesh)) for term in self.terms if term.of_fibres)
         return (self.scene.law.lanes and runtime.runs_on_cpu()) * (fibres // LANES)
 
@@ -74,20 +74,20 @@ class SpringsAndCables(Interaction):
     def kernel(self, values, precision, shape):
         fibres = self.num_fibre_blocks > 0
         nodes = self.mesh.reference.num_nodes if fibres else 0
-        return TieForce(precision, len(values.ties) > 1, self.is_load, fibres, nodes, shape and fibres)
+        return LineForce(precision, len(values.lines) > 1, self.is_load, fibres, nodes, shape and fibres)
 
     def host(self):
-        return Ties(self)
+        return LinesOnHost(self)
 
     def adjoints(self, values, shape):
-        return dict(tie_felt=values.ties.shape[:2], tie_rest=values.tie_segments.shape[:1])
+        return dict(line_adjoint=values.lines.shape[:2], line_rest=values.line_segments.shape[:1])
 
     def collect(self, found, out, shape):
-        out.ties, out.tie_segments = found["tie_felt"], found["tie_rest"]
+        out.lines, out.line_segments = found["line_adjoint"], found["line_rest"]
 
     def pulls_steadily(self, values):
-        """By tension and slack as each step begins and ends (inputs/ties.py)."""
-        ends = values.ties.reshape(len(values.ties), -1, 2, 3)[..., :2]
+        """By tension and slack as each step begins and ends (inputs/lines.py)."""
+        ends = values.lines.reshape(len(values.lines), -1, 2, 3)[..., :2]
         return bool((ends == ends[0, :, :, :1]).all())
 
 
@@ -117,7 +117,7 @@ class Foundations(Interaction):
         return FoundationOnHost(self.acts_at)
 
     def adjoints(self, values, shape):
-        return dict(foundation_felt=values.foundation.shape[:1])
+        return dict(foundation_adjoint=values.foundation.shape[:1])
 
     def collect(self, found, out, shape):
-        out.foundation = found["foundation_felt"]
+        out.foundation = found["foundation_adjoint"]

@@ -1,4 +1,4 @@
-"""Changes and adjoints of what faces do in recorded explicit passes (felt_faces.py): pushes, and then friction."""
+"""Changes and adjoints of what faces do in recorded explicit passes (face_contact_points.py): pushes, and then friction."""
 
 from contextlib import contextmanager
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.mechanics.obstacles.felt_faces import Alone, FeltFaces
+from diffsim_ti.mechanics.obstacles.face_contact_points import Alone, FaceContactPoints
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.pair_friction import ratio_by_rate
 from diffsim_ti.mesh import geometry
@@ -16,7 +16,7 @@ from diffsim_ti.runtime.slots import VertexRows
 class FaceChanges(Stage):
     """Changes, or adjoints, of what faces do in recorded passes."""
 
-    def __init__(self, faces: FeltFaces, run):
+    def __init__(self, faces: FaceContactPoints, run):
         a, self.faces, self.features = faces.a, faces, run.features
         self.shift_dot, self.speed_dot, self.seed, self.begin_dot = (
             runtime.array(a.vector, faces.num_surface) for _ in range(4)
@@ -31,7 +31,7 @@ class FaceChanges(Stage):
         self.faces.run_parts(name, plan, alone.history, alone.slot, alone.n, back, **own)
 
 
-class FeltTangent(FaceChanges):
+class FaceContactTangent(FaceChanges):
     """The tangent of passes; run: what holds the changes of the state and of all else."""
 
     @contextmanager
@@ -59,35 +59,35 @@ class FeltTangent(FaceChanges):
         self._run_parts("jvp", alone, at.numbers, tangent=(at.run, at.run.numbers))
 
     def _slide(self, alone: Alone, run) -> np.ndarray | None:
-        """Then friction; the changes of the impulses of each obstacle that rubs, where one does."""
+        """Then friction; the changes of the impulses of each obstacle with friction, where one does."""
         rub, faces, nodes = alone.rub, self.faces, self.rows.nodes
         if rub is None:
             return None
         a, change, u, v = faces.a, run.tangent, self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         dx = runtime.fetch(self.begin_dot).astype(np.float64) + change.rest[nodes]
         inverse_dot = -(faces.friction.inverse**2) * change.mass[nodes, None]
-        walls = a.walls.jvp(a.rows["path"], change.path, rub.moment)
+        poses = a.poses.jvp(a.rows["path"], change.path, rub.moment)
         impulses = faces.impulses(self.impulse_dot)
-        gained, each = faces.friction.jvp(rub, impulses, v, dx, inverse_dot, change.parameters, walls)
+        gained, each = faces.friction.jvp(rub, impulses, v, dx, inverse_dot, change.parameters, poses)
         self.rows.put(run.v, 0, v + gained)
         by_rate = run.rate_dot * ratio_by_rate(rub.now) * rub.gained
         self.rows.put(run.u, 0, u + rub.ratio * gained + by_rate)
         return each
 
 
-class FeltAdjoint(FaceChanges):
+class FaceContactAdjoint(FaceChanges):
     """The adjoint of passes: sums over them, by faces and surface vertices."""
 
-    def __init__(self, faces: FeltFaces, run):
+    def __init__(self, faces: FaceContactPoints, run):
         super().__init__(faces, run)
         a, features = faces.a, run.features
         self.path, self.num_parts = run.path, run.num_parts
         self.sums = runtime.array(a.fp, features.num_parameters, faces.num_faces)
-        self.felt = runtime.array(a.vector, 2 * features.moving, faces.num_faces if features.moving else 1)
+        self.path_adjoint = runtime.array(a.vector, 2 * features.moving, faces.num_faces if features.moving else 1)
         self.rest_adj, self.by_areas = runtime.array(a.vector, faces.num_surface), runtime.array(a.fp, faces.num_faces)
 
     def clear(self) -> None:
-        for x in (self.sums, self.felt, self.rest_adj, self.by_areas):
+        for x in (self.sums, self.path_adjoint, self.rest_adj, self.by_areas):
             runtime.fill(x, 0)
         values = self.faces.a.values
         self.parameters, self.by_rate, self.by_mass = np.zeros_like(values.parameters), 0.0, np.zeros_like(values.mass)
@@ -115,7 +115,7 @@ class FeltAdjoint(FaceChanges):
             self._run("begin_vjp", alone, at.numbers, adjoint=run)
 
     def _slide(self, alone: Alone, run, impulses_adj: np.ndarray | None) -> None:
-        """Go back through friction, the very last thing; impulses_adj: of those of each obstacle that rubs."""
+        """Go back through friction, the very last thing; impulses_adj: of those of each obstacle with friction."""
         rub, faces, self._by_x = alone.rub, self.faces, None
         if rub is None:
             if faces.friction:
@@ -133,7 +133,7 @@ class FeltAdjoint(FaceChanges):
         self.rest += by.x
         self._by_x = by.x
         if self.path_adj is not None:
-            faces.a.walls.vjp(faces.a.rows["path"], by.walls, rub.moment, self.path_adj)
+            faces.a.poses.vjp(faces.a.rows["path"], by.poses, rub.moment, self.path_adj)
 
     def _push(self, alone: Alone, at: Passes) -> None:
         alone.go(at.numbers)

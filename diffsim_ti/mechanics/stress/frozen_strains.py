@@ -26,8 +26,8 @@ NUMBERS = dict(num_items="int", num_vertices="int", a0="float", a1="float")
 
 
 @dataclass(frozen=True)
-class HeldStrainKernels:
-    """The held strains, their change, and their adjoint."""
+class FrozenStrainKernels:
+    """The frozen strains, their change, and their adjoint."""
 
     law: object
     features: Features
@@ -61,7 +61,7 @@ class HeldStrainKernels:
 
     @cached_property
     def forward(self) -> Kernel:
-        return self._kernel("held_strains", self.all_forward, out=dict(held="blocks2"))
+        return self._kernel("frozen_strains", self.all_forward, out=dict(held="blocks2"))
 
     @traced
     def hold_jvp(self, e, scene, at, tangent, plan):
@@ -84,7 +84,7 @@ class HeldStrainKernels:
     @cached_property
     def jvp(self) -> Kernel:
         """The change tangent.held, for changes tangent.du of the states and of the rest shape."""
-        return self._kernel("held_strains_jvp", self.all_jvp, tangent=TANGENT | dict(du="vectors2", held="blocks2"))
+        return self._kernel("frozen_strains_jvp", self.all_jvp, tangent=TANGENT | dict(du="vectors2", held="blocks2"))
 
     @traced
     def hold_vjp(self, e, scene, at, adjoint, plan):
@@ -93,7 +93,7 @@ class HeldStrainKernels:
             pushes = []
             for q, D in enumerate(el.edges(e, scene, at.u, s)):
                 B = el.gradients_of(e, scene.gradients, q)
-                by_E = six_adjoint(el.held_of(e, adjoint.held, q), self.law.real(0.5))
+                by_E = six_adjoint(el.frozen_of(e, adjoint.held, q), self.law.real(0.5))
                 by_H = add_to_diagonal(D @ B, 1) @ by_E * a
                 pushes.append((by_H * self.law.real(-1)) @ B.transpose())
                 if self.features.shape:
@@ -114,14 +114,15 @@ class HeldStrainKernels:
     def vjp(self) -> Kernel:
         """adjoint.y of both states, from adjoint.held; adds that of the rest shape."""
         own = dict(held="blocks2", corner="vectors", corner_before="vectors", y="vectors2")
-        return self._kernel("held_strains_vjp", self.all_vjp, adjoint=OF_TETRAHEDRA | own)
+        return self._kernel("frozen_strains_vjp", self.all_vjp, adjoint=OF_TETRAHEDRA | own)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         return Kernel(name, body, self.law.precision, dict(scene=SCENE, at=AT) | arrays, NUMBERS)
 
 
-class HeldStrains:
-    """The strains that the passes of a run hold, in `potential.held`, with the rate 1 / gamma, zero in statics."""
+class FrozenStrains:
+    """The strains that are frozen in the passes of a run, in `potential.held`, with the rate 1 / gamma, zero in static
+    solves."""
 
     def __init__(self, workspace):
         self.ws, a = weakref.proxy(workspace), workspace.arrays  # which holds this: no circle
@@ -131,7 +132,7 @@ class HeldStrains:
     def _launch(self, name: str, features, stage: Stage, u: np.ndarray, before, **records) -> None:
         ws, a = self.ws, self.ws.arrays
         runtime.fill(self.u, np.stack([u, u if before is None else before[0]]))
-        kernel = getattr(kernels_of(HeldStrainKernels, a.law, features, ws.parallel, a.in_lanes), name)
+        kernel = getattr(kernels_of(FrozenStrainKernels, a.law, features, ws.parallel, a.in_lanes), name)
         a0, a1 = (stage.a0, stage.a1) if before is not None else (1.0, 0.0)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices)
         ws.bound(kernel, at=self, **records)(**sizes, a0=a0, a1=a1)

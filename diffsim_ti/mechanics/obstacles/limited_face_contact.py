@@ -1,4 +1,5 @@
-"""Vertices that contact within faces leads towards an obstacle of their own: what they take of the way (held_back.py)."""
+"""Vertices that contact within faces leads towards an obstacle of their own: what they take of the way
+(limited_displacement.py)."""
 
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class FaceWalls(FaceForces):
+class LimitedFaceContact(FaceForces):
     """Taichi functions of vertex i; a pass without contact within faces moves it from u by z, and that by e from there."""
 
     @ti.func

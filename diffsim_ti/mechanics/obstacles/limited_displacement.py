@@ -1,4 +1,4 @@
-"""Ways that would lead a vertex behind an obstacle, of which it takes a share.
+"""Displacements that would lead a vertex behind an obstacle, of which it takes a share.
 
 The stage moves a vertex by z to a distance y > 0 from the tangent plane, normal n, that each obstacle has where the pass
 begins (contact_stage.py). What comes after that, friction and contact within faces, adds a way e, of which the vertex takes
@@ -22,7 +22,7 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class HeldBack(ObstacleStages):
+class LimitedDisplacement(ObstacleStages):
     """Taichi functions of vertex i; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
 
     @ti.func
@@ -39,40 +39,40 @@ class HeldBack(ObstacleStages):
     def plane(self, g: A, k, i, u, now: A, scene: A):
         """(n, d) of an obstacle at u, where it is when the pass begins."""
         X = self.seen_now(g, k, scene.rest[i], now, scene)
-        return g.force.outlook(scene.parameters, g.first + k * g.size, X, u)
+        return g.force.contact_plane(scene.parameters, g.first + k * g.size, X, u)
 
     @ti.func
     def way_to(self, g: A, k, i, u, z, now: A, scene: A):
         """A move z from u as the obstacle sees it."""
-        return z - now.h * self.wall(g, k, self.seen_now(g, k, scene.rest[i], now, scene), u, now, scene)
+        return z - now.h * self.v_obstacle(g, k, self.seen_now(g, k, scene.rest[i], now, scene), u, now, scene)
 
     @ti.func
     def change_of_x(self, g: A, k, i, u, du, z, dz, e, de, x, now: A, scene: A, tangent: A):
         """Change of x, which obstacle k has, for a vertex that the stage has moved by z from u."""
         first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
         moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
-        plane = g.force.outlook(scene.parameters, first, X, u)
-        turned = g.force.outlook_jvp(scene.parameters, first, X, u, moved, tangent.parameters)
+        plane = g.force.contact_plane(scene.parameters, first, X, u)
+        turned = g.force.contact_plane_jvp(scene.parameters, first, X, u, moved, tangent.parameters)
         n, dn, way = self.normal(plane), self.normal(turned), self.way_to(g, k, i, u, z, now, scene)
-        dway = dz - now.h * self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+        dway = dz - now.h * self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
         dy = turned.w + dn.dot(way) + n.dot(dway)
         return -(dn.dot(e) + n.dot(de) + x * dy) / (plane.w + n.dot(way))
 
     @ti.func
     def adjoint_of_x(self, g: A, k, i, column, u, z, e, x, by_x, now: A, scene: A, adjoint: A, out: A):
-        """(adjoints of e, z, u) for that of x; adds those of the obstacle's numbers, and of its path to out.felt.
+        """(adjoints of e, z, u) for that of x; adds those of the obstacle's numbers, and of its path to out.path_adjoint.
 
         The change of n by u is symmetric.
         """
         first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
-        plane = g.force.outlook(scene.parameters, first, X, u)
+        plane = g.force.contact_plane(scene.parameters, first, X, u)
         n, way = self.normal(plane), self.way_to(g, k, i, u, z, now, scene)
         ratio = by_x / (plane.w + n.dot(way))
         by_y = -ratio * x
         by_e, by_z, seed = -ratio * n, by_y * n, by_y * way + -ratio * e
         seed.w = by_y
-        turned = g.force.outlook_jvp(scene.parameters, first, X, u, seed)
-        g.force.outlook_vjp(scene.parameters, first, X, u, seed, adjoint.sums, i)
+        turned = g.force.contact_plane_jvp(scene.parameters, first, X, u, seed)
+        g.force.contact_plane_vjp(scene.parameters, first, X, u, seed, adjoint.sums, i)
         by_place = self.turn_of_plane(g, self.normal(turned) + by_y * n, n, seed)
         by_u = self.spread(g, k, i, X, u, by_place, -now.h * by_z, now, scene, adjoint, out, column)
         return by_e, by_z, by_u

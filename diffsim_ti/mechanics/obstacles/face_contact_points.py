@@ -1,4 +1,4 @@
-"""Faces of a run of an explicit solver that feel obstacles between their corners."""
+"""Contact of faces with obstacles between their corners, in a run of an explicit solver."""
 
 from contextlib import contextmanager
 
@@ -11,30 +11,30 @@ from diffsim_ti.mechanics.obstacles.face_derivatives import face_derivatives
 from diffsim_ti.mechanics.obstacles.face_friction import FaceFriction
 from diffsim_ti.mechanics.obstacles.face_lattice import BENT, lattices, nodes_of_faces, shortened
 from diffsim_ti.mechanics.stage import Passes, Stage
-from diffsim_ti.mesh.curved_triangles import are_felt
+from diffsim_ti.mesh.curved_triangles import are_treated_as_curved
 from diffsim_ti.runtime.slots import VertexRows, copy_slot
 from diffsim_ti.terms.obstacles.barrier import beta
 
 TRAVEL, LOAD = 0.2, 0.2
 
 
-def feels_faces(scene, bend: float = 0.0) -> bool:
+def has_face_contact(scene, bend: float = 0.0) -> bool:
     """Whether a scene has an obstacle that could reach into a face of the body between its corners; bend: how far faces have
     bent in a run [m] (state/bending.py).
 
     A ball of radius R that touches a face, whose longest edge is L, is nearer to it than its corners say by L^2 / 6 R at
     most. Where that is less than what points within faces feel in full, BENT widths (face_lattice.py), corners
-    speak for the face. L is that at rest, a fifth longer. Curved faces are felt as are_felt says.
+    stand for the face. L is that at rest, a fifth longer. Curved faces are felt as are_treated_as_curved says.
     """
     x = scene.mesh.vertices[scene.mesh.surface_triangles]
     longest = 1.2 * np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0)
     obstacles = [t for t in scene.terms if t.acts_on_surface and "barrier_width" in t.values]
-    return are_felt(scene.mesh, obstacles, bend) or any(
+    return are_treated_as_curved(scene.mesh, obstacles, bend) or any(
         longest**2 > 6 * t.least_radius() * BENT * float(t.values["barrier_width"]) for t in obstacles
     )
 
 
-class FeltFaces(Stage):
+class FaceContactPoints(Stage):
     """Their arrays, and what kernels (explicit_face_kernels.py) do with them, at a slot of a run's states.
 
     A pass is gone in a power of two of parts, `most_parts` at most: in each no face goes farther than TRAVEL widths, and
@@ -69,7 +69,7 @@ class FeltFaces(Stage):
         runtime.fill(self.work, 0)
         self.row, self.place = runtime.array(a.vector, 1, a.num_vertices), None
         self._make_room(1)
-        self.friction, self.rub = FaceFriction(workspace, surface), None  # what rubbed in the last pass
+        self.friction, self.rub = FaceFriction(workspace, surface), None  # friction of the last pass
         rows = faces.size * len(a.contacts) if self.friction else 0
         self.impulse, self.rows = runtime.array(a.vector, rows or 1), VertexRows(a, surface)
         self.corners_of = own.reshape(faces.shape)
@@ -91,7 +91,7 @@ class FeltFaces(Stage):
         kernels = face_kernels if features is None else face_derivatives
         features = a.features() if features is None else features
         kernel = getattr(kernels(features, a.precision, ws.parallel), name)
-        # bound anew with the scene's, or with more room for parts
+        # bound again with the scene's, or with more room for parts
         launches = ws.kept(("faces", id(self.place)), lambda: (self.place, {}))[1]
         parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
         key = (kernel, id(state.u), *map(id, parts))
@@ -174,11 +174,11 @@ class FeltFaces(Stage):
         return runtime.fetch(array).astype(np.float64).reshape(self.num_faces, len(self.a.contacts), -1, 3)
 
     def impulses_of_friction(self) -> np.ndarray | None:
-        """Of each obstacle that rubs on surface vertices in the last pass [N s]; None where nothing rubbed."""
+        """Of each obstacle with friction on surface vertices in the last pass [N s]; None where there was no friction."""
         return None if self.rub is None else self.friction.impulses(self.rub)
 
     def clear_work(self) -> None:
-        """Of moving obstacles, to be counted anew."""
+        """Of moving obstacles, to be counted again."""
         runtime.fill(self.work, 0)
         self.work_of_friction = 0.0
 
@@ -237,7 +237,7 @@ class FeltFaces(Stage):
 class Alone:
     """A recorded pass, gone again without contact within faces and then with it; `with` leaves the record as it was."""
 
-    def __init__(self, faces: FeltFaces, history, slot: int):
+    def __init__(self, faces: FaceContactPoints, history, slot: int):
         self.faces, self.history, self.slot = faces, history, slot
         self.n, self._state, self.pushes, self.rub = faces.kept[slot]
 

@@ -1,7 +1,7 @@
 """Springs and cables in explicit passes: each a path of points with one tension along it.
 
 Point p of a path lies at X_p + U_p, U_p the weighted sum of its vertices' displacements, and d_p leads from it to the next.
-T = a + k e, e = sum (|d_p| - |D_p|) + s, D_p: d_p at rest (inputs/ties.py). Corner c of the paths' points writes corner
+T = a + k e, e = sum (|d_p| - |D_p|) + s, D_p: d_p at rest (inputs/lines.py). Corner c of the paths' points writes corner
 `first + c`, and vertices gather it with those of tetrahedra. Lengths come as changes of lengths, so that single precision
 keeps its digits near rest.
 """
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.mechanics.lines import pull
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
-from diffsim_ti.mechanics.ties import pull
 from diffsim_ti.state.pass_table import between
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -19,8 +19,8 @@ tension, tension_jvp, across = (ti.func(f) for f in (pull.tension, pull.tension_
 
 
 @dataclass(frozen=True)
-class TieElement(StepNumbers):
-    """Functions of one tie in a pass; per_step: whether its numbers have a row for each step."""
+class LineElement(StepNumbers):
+    """Functions of one line element in a pass; per_step: whether its numbers have a row for each step."""
 
     @ti.func
     def length(self, d):
@@ -61,8 +61,8 @@ class TieElement(StepNumbers):
     def stretch(self, t, u: A, s, scene: A):
         """L - L0."""
         out = ti.cast(0, self.fp)
-        for p in range(scene.tie_start[t], scene.tie_start[t + 1] - 1):
-            D, moved = scene.tie_segments[p], self.parted(p, u, s, scene)
+        for p in range(scene.line_start[t], scene.line_start[t + 1] - 1):
+            D, moved = scene.line_segments[p], self.parted(p, u, s, scene)
             both = self.length(D) + self.length(D + moved)
             if both > 0:
                 out += moved.dot(D + (D + moved)) / both
@@ -72,16 +72,16 @@ class TieElement(StepNumbers):
     def pull(self, t, n, u: A, s, scene: A):
         """(T, e as far as it pulls, k as far as e does)"""
         e, k, zero = ti.cast(0, self.fp), n[2], ti.cast(0, self.fp)
-        if scene.tie_sides[t] >= 0:
+        if scene.line_sides[t] >= 0:
             e = self.stretch(t, u, s, scene) + n[1]
-            if scene.tie_sides[t] > 0 and e <= 0:
+            if scene.line_sides[t] > 0 and e <= 0:
                 e, k = zero, zero
         return self.vector(tension(n[0], n[2], e), e, k, zero)
 
     @ti.func
     def is_single(self, t, scene: A):
         """Whether it runs through two points, as springs and muscles do."""
-        return scene.tie_start[t + 1] - scene.tie_start[t] == 2
+        return scene.line_start[t + 1] - scene.line_start[t] == 2
 
     @ti.func
     def store_both(self, p, f, first, scene: A, corner: A):
@@ -106,71 +106,71 @@ class TieElement(StepNumbers):
 
     @ti.func
     def forces(self, t, now: A, scene: A, state: A, s, first):
-        T = self.pull(t, self.numbers(t, now, scene.ties), state.u, s, scene)[0]
-        before, begin, last = self.vector(0), scene.tie_start[t], scene.tie_start[t + 1] - 1
+        T = self.pull(t, self.numbers(t, now, scene.lines), state.u, s, scene)[0]
+        before, begin, last = self.vector(0), scene.line_start[t], scene.line_start[t + 1] - 1
         if self.is_single(t, scene):
-            f = T * self.unit(scene.tie_segments[begin] + self.parted(begin, state.u, s, scene))
+            f = T * self.unit(scene.line_segments[begin] + self.parted(begin, state.u, s, scene))
             self.store_both(begin, f, first, scene, scene.corner)
         else:
             for p in range(begin, last + 1):
                 after = self.vector(0)
                 if p < last:
-                    after = T * self.unit(scene.tie_segments[p] + self.parted(p, state.u, s, scene))
+                    after = T * self.unit(scene.line_segments[p] + self.parted(p, state.u, s, scene))
                 self.store(p, after - before, first, scene, scene.corner)
                 before = after
 
     @ti.func
     def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, first):
-        n, dn = self.numbers(t, now, scene.ties), self.numbers(t, now, tangent.ties)
+        n, dn = self.numbers(t, now, scene.lines), self.numbers(t, now, tangent.lines)
         pulled, de = self.pull(t, n, state.u, s, scene), dn[1]
-        last = scene.tie_start[t + 1] - 1
-        for p in range(scene.tie_start[t], last):
-            D, dD = scene.tie_segments[p], tangent.tie_segments[p]
+        last = scene.line_start[t + 1] - 1
+        for p in range(scene.line_start[t], last):
+            D, dD = scene.line_segments[p], tangent.line_segments[p]
             d, dd = D + self.parted(p, state.u, s, scene), dD + self.parted(p, tangent.u, 0, scene)
             de += self.unit(d).dot(dd) - self.unit(D).dot(dD)
         dT = tension_jvp(pulled[2], pulled[1], dn[0], dn[2], de)
         before = self.vector(0)
-        for p in range(scene.tie_start[t], last + 1):
+        for p in range(scene.line_start[t], last + 1):
             after = self.vector(0)
             if p < last:
-                d = scene.tie_segments[p] + self.parted(p, state.u, s, scene)
-                dd = tangent.tie_segments[p] + self.parted(p, tangent.u, 0, scene)
+                d = scene.line_segments[p] + self.parted(p, state.u, s, scene)
+                dd = tangent.line_segments[p] + self.parted(p, tangent.u, 0, scene)
                 after = dT * self.unit(d) + self.across(pulled[0], n[2], d, dd)
             self.store(p, after - before, first, scene, scene.corner)
             before = after
 
     @ti.func
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, first):
-        """Products of the derivative, which is symmetric, with adjoint.w, to corners; adds the adjoints of a tie's numbers
-        to adjoint.tie_felt and those of its segments at rest to adjoint.tie_rest."""
-        n, zero = self.numbers(t, now, scene.ties), ti.cast(0, self.fp)
+        """Products of the derivative, which is symmetric, with adjoint.w, to corners; adds the adjoints of a line
+        element's numbers to adjoint.line_adjoint and those of its segments at rest to adjoint.line_rest."""
+        n, zero = self.numbers(t, now, scene.lines), ti.cast(0, self.fp)
         pulled, T_adj, e_adj = self.pull(t, n, state.u, s, scene), zero, zero
-        begin, last, before = scene.tie_start[t], scene.tie_start[t + 1] - 1, self.vector(0)
+        begin, last, before = scene.line_start[t], scene.line_start[t + 1] - 1, self.vector(0)
         if self.is_single(t, scene):
-            D = scene.tie_segments[begin]
+            D = scene.line_segments[begin]
             d, w = D + self.parted(begin, state.u, s, scene), self.vector(0) - self.parted(begin, adjoint.w, 0, scene)
             T_adj = self.unit(d).dot(w)
             e_adj = T_adj * pulled[2]
             push = e_adj * self.unit(d) + self.across(pulled[0], n[2], d, w)
-            adjoint.tie_rest[begin] = adjoint.tie_rest[begin] + push - e_adj * self.unit(D)
+            adjoint.line_rest[begin] = adjoint.line_rest[begin] + push - e_adj * self.unit(D)
             self.store_both(begin, self.vector(0) - push, first, scene, adjoint.corner)
         else:
             for p in range(begin, last):
-                d = scene.tie_segments[p] + self.parted(p, state.u, s, scene)
+                d = scene.line_segments[p] + self.parted(p, state.u, s, scene)
                 T_adj += self.unit(d).dot(self.vector(0) - self.parted(p, adjoint.w, 0, scene))
             e_adj = T_adj * pulled[2]
             for p in range(begin, last + 1):
                 after = self.vector(0)
                 if p < last:
-                    D = scene.tie_segments[p]
+                    D = scene.line_segments[p]
                     d, w = D + self.parted(p, state.u, s, scene), self.vector(0) - self.parted(p, adjoint.w, 0, scene)
                     after = e_adj * self.unit(d) + self.across(pulled[0], n[2], d, w)
-                    adjoint.tie_rest[p] = adjoint.tie_rest[p] + after - e_adj * self.unit(D)
+                    adjoint.line_rest[p] = adjoint.line_rest[p] + after - e_adj * self.unit(D)
                 self.store(p, before - after, first, scene, adjoint.corner)
                 before = after
         for r, share, weight in ti.static(self.kicks(now)):
             by_a, by_s = weight * T_adj, weight * e_adj
             pull = self.vector((1 - share) * by_a, share * by_a, weight * T_adj * pulled[1], zero)
             slack = self.vector((1 - share) * by_s, share * by_s, zero, zero)
-            adjoint.tie_felt[r, 2 * t] = adjoint.tie_felt[r, 2 * t] + pull
-            adjoint.tie_felt[r, 2 * t + 1] = adjoint.tie_felt[r, 2 * t + 1] + slack
+            adjoint.line_adjoint[r, 2 * t] = adjoint.line_adjoint[r, 2 * t] + pull
+            adjoint.line_adjoint[r, 2 * t + 1] = adjoint.line_adjoint[r, 2 * t + 1] + slack

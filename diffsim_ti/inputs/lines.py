@@ -1,7 +1,8 @@
 """Links of springs and cables: from stiffness, lengths, tensions and anchors to what kernels read.
 
-A tie pulls along its path with the tension T = a + k e, e = L - L0 + s, where L is its length, L0 that at rest, and s the
-slack at rest: L0 less the length without force. Numbers of ties lie as rows of steps, two vectors for each:
+A line element pulls along its path with the tension T = a + k e, e = L - L0 + s, where L is its length, L0 that at
+rest, and s the slack at rest: L0 less the length without force. Numbers of line elements lie as rows of steps, two
+vectors for each:
 (a when the step begins, a when it ends, k) and (s, s, 0). Segments are X_next - X of the points of a path at rest [m], zero
 for the last point of each.
 """
@@ -46,9 +47,10 @@ class Segments(Link):
         return rest, by_anchors.reshape(x[1].shape)
 
 
-class TieRows(Link):
-    """Rows of a term's ties. stiffness [N/m]: a number, or one for each; tension [N] and length [m] without force in time,
-    as `InTime` has them, of all ties together or of each; what is None is none, of a length: that at rest."""
+class LineRows(Link):
+    """Rows of a term's line elements. stiffness [N/m]: a number, or one for each; tension [N] and length [m] without
+    force in time, as `InTime` has them, of all line elements together or of each; what is None is none, of a length:
+    that at rest."""
 
     def __init__(
         self,
@@ -69,7 +71,7 @@ class TieRows(Link):
         return [next(rest) if given else None for given in self.given]
 
     def _whole(self, part: np.ndarray) -> np.ndarray:
-        """Of what is given in time, shape (2, rows) or (2, rows, ties): that of each tie."""
+        """Of what is given in time, shape (2, rows) or (2, rows, ties): that of each line element."""
         return np.broadcast_to(part.reshape(*part.shape[:2], -1), (*part.shape[:2], len(self.paths)))
 
     def _filled(self, x, at_rest) -> np.ndarray:
@@ -132,7 +134,7 @@ class JoinedSegments(Link):
 
 
 class JoinedRows(_Together):
-    """Rows of ties of several terms, of which those of one row hold in all steps, side by side."""
+    """Rows of line elements of several terms, of which those of one row hold in all steps, side by side."""
 
     @staticmethod
     def rows(x) -> int:

@@ -1,4 +1,4 @@
-"""Springs and cables: ties between points of the body, and between these and points fixed in space."""
+"""Springs and cables: line elements between points of the body, and between these and points fixed in space."""
 
 from collections.abc import Sequence
 
@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import numbers, present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.description import Range, length
+from diffsim_ti.inputs.lines import LineRows, Segments
 from diffsim_ti.inputs.loads import InTime
-from diffsim_ti.inputs.ties import Segments, TieRows
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.terms.marks import Lines, Points
@@ -44,7 +44,7 @@ class Anchor:
 Point = int | str | ArrayLike | Anchor  # vertices, material points as places at rest, anchors
 
 
-class Tie(OnMesh, Term):
+class LineTerm(OnMesh, Term):
     """What runs along paths through points, with one tension each."""
 
     num_numbers = 0  # what kernels read of it lies in arrays of its own
@@ -55,13 +55,13 @@ class Tie(OnMesh, Term):
     _found: tuple[TetrahedralMesh, Paths] | None = None
 
     def paths(self, mesh: TetrahedralMesh) -> Paths:
-        """Where its ties run, found once."""
+        """Where its line elements run, found once."""
         if self._found is None or self._found[0] is not mesh:
             self._found = mesh, self.found_paths(mesh)
         return self._found[1]
 
     def found_paths(self, mesh: TetrahedralMesh) -> Paths:
-        """Where its ties run; ValueError for what does not fit the mesh."""
+        """Where its line elements run; ValueError for what does not fit the mesh."""
         raise NotImplementedError
 
     def check(self, mesh: TetrahedralMesh) -> None:
@@ -84,7 +84,7 @@ class Tie(OnMesh, Term):
             if (name := self._named(names, part)) is not None:
                 made[part] = f"{own} {part} in time"
                 out.append(InTime(name, made[part], self.ndim, self.keyed))
-        return [*out, TieRows(paths, segments, f"{own} rows", self._named(names, "stiffness"), **made)]
+        return [*out, LineRows(paths, segments, f"{own} rows", self._named(names, "stiffness"), **made)]
 
     def sizes(self, mesh):
         return {i.name: len(np.atleast_2d(i.value)) for i in self.described if i.name == "anchors"}
@@ -132,7 +132,7 @@ def _points(mesh: TetrahedralMesh, given: Point, kind: str) -> list[tuple]:
     return [(vertices[k], own[k]) for vertices, own, k in zip(located.vertices, weights, kept)]
 
 
-class Spring(Tie):
+class Spring(LineTerm):
     """Linear springs between points, each with the force T = k (L - l) along it, also where it is compressed, and the energy
     k (L - l)^2 / 2; several in one term. L: its length, l: without force.
 
@@ -143,7 +143,7 @@ class Spring(Tie):
     Forces on points of the body sum to zero with those of the anchors, and so do their moments.
     Inputs with gradient: "spring_stiffness", "spring_rest_length", "spring_tension", "spring_anchors" where given, or
     "<name>.stiffness" and so on. The rest shape counts through lengths at rest.
-    Explicit steps have to follow sqrt(k (1 / m_a + 1 / m_b)), which `stable_dt` knows.
+    Explicit steps have to follow sqrt(k (1 / m_a + 1 / m_b)), which `stable_dt` takes into account.
     Raises ValueError for numbers of points that do not fit, points outside the body, stiffness or length below zero, and
     rest_length together with tension.
     Zienkiewicz, Taylor 2000, The Finite Element Method, vol. 2, 5th ed., sec. 10.2 (bars at large displacements).
@@ -199,7 +199,7 @@ class Spring(Tie):
         return Paths.of([[a, b] for a, b in zip(start, end)])
 
 
-class Cable(GivenOverTime, Tie):
+class Cable(GivenOverTime, LineTerm):
     """A cable (tendon) that slides without friction through points, with one tension T along all of it.
 
     tension [N]: given, T = tension, whatever its length; or length [m]: that without force, of an elastic cable with

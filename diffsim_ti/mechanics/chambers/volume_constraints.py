@@ -29,7 +29,7 @@ class VolumeLost(FloatingPointError):
 
 
 @dataclass
-class Walls:
+class ChamberWalls:
     """Of chambers where a pass begins: places x, shape (n, 3), 1 / m, shape (n, 1), what they may do, shape (n, 3, 3)."""
 
     enclosures: list[Enclosure]
@@ -98,7 +98,7 @@ def along(G: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.tensordot(G, x, ([1, 2], [0, 1]))
 
 
-class HeldVolumes(Stage):
+class VolumeConstraints(Stage):
     """Those of a run's scene; `pressures` [Pa] of the last pass and of frames, `work` [J] on the body so far."""
 
     def __init__(self, workspace):
@@ -130,9 +130,9 @@ class HeldVolumes(Stage):
     def rest(self) -> np.ndarray:
         return self.ws.arrays.values.rest[self.nodes]
 
-    def walls(self, u: np.ndarray) -> Walls:
+    def walls(self, u: np.ndarray) -> ChamberWalls:
         """At displacements of theirs."""
-        return Walls(self.enclosures, self.rest + u, 1 / self.ws.arrays.values.mass[self.nodes, None], self.free)
+        return ChamberWalls(self.enclosures, self.rest + u, 1 / self.ws.arrays.values.mass[self.nodes, None], self.free)
 
     # ---- what is asked for -------------------------------------------------------------------------------------------
 
@@ -189,12 +189,12 @@ class HeldVolumes(Stage):
             self._count_work(now, before, v_next, change, walls)
 
     @staticmethod
-    def tangent_part(walls: Walls, v: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def tangent_part(walls: ChamberWalls, v: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(what makes v tangent, q)."""
         q = np.linalg.solve(slopes(walls.g, walls.d), rates - along(walls.g, v))
         return np.tensordot(q, walls.d, 1), q
 
-    def _count_work(self, now, before: np.ndarray, after: np.ndarray, change: np.ndarray, walls: Walls) -> None:
+    def _count_work(self, now, before: np.ndarray, after: np.ndarray, change: np.ndarray, walls: ChamberWalls) -> None:
         """As `work_of_pass` (outside_work.py) has it of loads."""
         whole, mass = now.pre + now.post, 1 / walls.inverse
         uneven = (now.pre - now.post) * (after - before)  # (pre^2 - post^2) times the body's own acceleration

@@ -1,10 +1,10 @@
-"""A pass that Newton's method does not solve at once, along the solutions that lead there.
+"""Load stepping of a pass that Newton's method does not solve in one solve, along the solutions that lead there.
 
-What the pass lays on comes in parts: at a share s, statics take that share of the change of loads, pressures, growth and
-times, and all passes that of the way of held vertices and obstacles. What is out of balance where the pass begins all the
-same, R0 (inertia; loads that jump from step to step), is laid on with it: R(u, s) - (1 - s) R0 = 0, which the start solves
-for s = 0. Shares grow where solves succeed and halve where they fail. Where no share helps, the path of equilibria may have
-turned back (a limit point) or branched (a bifurcation).
+The load of the pass comes in parts: at a share s, static solves take that share of the change of loads, pressures,
+growth and times, and all passes that of the way of fixed vertices and obstacles. What is out of balance where the pass
+begins all the same, R0 (inertia; loads that jump from step to step), is applied with it: R(u, s) - (1 - s) R0 = 0,
+which the start solves for s = 0. Shares grow where solves succeed and halve where they fail. Where no share helps, the
+path of equilibria may have turned back (a limit point) or branched (a bifurcation).
 Allgower, Georg 2003, Introduction to Numerical Continuation Methods, doi:10.1137/1.9780898719154.
 """
 
@@ -16,7 +16,7 @@ from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.state.stage import Stage
 
 
-class LaidOn:
+class LoadStepping:
     """Of a workspace."""
 
     first, rounds = 0.25, 30  # share; Newton's rounds in a part
@@ -26,32 +26,34 @@ class LaidOn:
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
 
     def __call__(self, j: int, stage: Stage, u, held, problem: tuple, error: NotConverged) -> np.ndarray:
-        """The solution of pass j with held vertices as in `held`, from u; error: what a solve at once said.
+        """The solution of pass j with fixed vertices as in `held`, from u; error: what the solve without load stepping said.
 
         Raises it or, in statics, NotConverged, which says how far the path of equilibria goes and how it ends.
         """
         ws, newton, (mass, inertial, loads) = self.ws, self.ws.newton, problem
-        most, walls = newton.max_iterations, (ws.ways.before, ws.ways.at_stage)
-        drift, way = ws.arrays.walls.drift(*walls), held - u
+        most, poses = newton.max_iterations, (ws.collisions.before, ws.collisions.at_stage)
+        drift, way = ws.arrays.poses.drift(*poses), held - u
         done, share, place = 0.0, self.first, u
 
-        def lay_on(s: float) -> tuple:
-            ws.ways.put(ws.arrays.walls.moved(walls[0], drift, s))
-            ws.lay_on(j, stage, s)
+        def apply_loads(s: float) -> tuple:
+            ws.collisions.put(ws.arrays.poses.moved(poses[0], drift, s))
+            ws.apply_loads(j, stage, s)
             return mass, inertial, ws.loads(j, stage) if stage.static else loads
 
         newton.max_iterations, newton.steady = min(self.rounds, most), 0  # a smaller part costs less than more rounds
         try:
             ws.start_multipliers(j, u)
             ws.potential.place(u)
-            out_of_balance = newton.residual_of(lay_on(0.0))
+            out_of_balance = newton.residual_of(apply_loads(0.0))
             if not np.all(np.isfinite(out_of_balance)):
                 raise error
             while done < 1:
                 s = min(done + share, 1.0)
-                part = lay_on(s)
+                part = apply_loads(s)
                 part = *part[:2], part[2] - (1 - s) * out_of_balance
-                ws.ways.before, ws.ways.at_stage = (ws.arrays.walls.moved(walls[0], drift, x) for x in (done, s))
+                ws.collisions.before, ws.collisions.at_stage = (
+                    ws.arrays.poses.moved(poses[0], drift, x) for x in (done, s)
+                )
                 try:
                     near = ws.approach(place, place + (s - done) * way, [], part)
                     there = newton.solve(near, *part, leave_saddles=stage.static and s == 1)
@@ -61,7 +63,7 @@ class LaidOn:
                     share = 0.5 * min(share, 1 - done)
                     if stage.static and share < max(self.nearly * ws.reached(j, stage, done), self.least):
                         ws.potential.place(place)
-                        newton.residual_of(lay_on(done))
+                        newton.residual_of(apply_loads(done))
                         why = self._why(error, self._share_of_loads(j, stage, done))
                         raise NotConverged(why, error.residuals) from None
                     if not stage.static and share < self.in_motion:
@@ -69,18 +71,18 @@ class LaidOn:
         finally:
             newton.max_iterations = most
             del newton.steady
-            ws.ways.before, ws.ways.at_stage = walls
-            lay_on(1.0)
+            ws.collisions.before, ws.collisions.at_stage = poses
+            apply_loads(1.0)
         return place
 
     def _share_of_loads(self, j: int, stage: Stage, done: float) -> float:
-        """Of what its step lays on; in the first step loads that change in time, too, grow faster than its share."""
+        """Of the load of its step; in the first step loads that change in time, too, grow faster than its share."""
         ws, sizes = self.ws, []
         share = ws.reached(j, stage, done)
         if ws.pass_of_all(j) >= ws.solver.substeps or ws.volumes:
             return share
-        for k, laid in ((j, done), (int(ws.solver.schedule.first(ws.solver.schedule.row(j) + 1)) - 1, 1.0)):
-            ws.lay_on(k, stage, laid)
+        for k, applied_share in ((j, done), (int(ws.solver.schedule.first(ws.solver.schedule.row(j) + 1)) - 1, 1.0)):
+            ws.apply_loads(k, stage, applied_share)
             forces = ws.loads(k, stage)
             sizes.append(np.linalg.norm(forces + ws.newton.others.forces(np.zeros_like(forces))))
         return sizes[0] / sizes[1] if sizes[1] > 0 else share

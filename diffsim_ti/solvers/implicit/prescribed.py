@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
-from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, HeldVolumes
+from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, VolumeConstraints
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.workspace import Workspace
@@ -13,29 +13,29 @@ from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms import Chamber
 
 
-class GivenInPasses(Workspace):
+class PrescribedInPasses(Workspace):
     """The part of ImplicitWorkspace that knows what passes are told, but for obstacles."""
 
-    laid = 1.0  # share of what a pass of statics lays on that is there (laid_on.py)
+    applied_share = 1.0  # share of the load of a static pass that is applied (load_stepping.py)
 
     # ---- supports ----------------------------------------------------------------------------------------------------
 
-    def with_held(self, x: np.ndarray, held: np.ndarray) -> np.ndarray:
+    def with_frozen(self, x: np.ndarray, held: np.ndarray) -> np.ndarray:
         """x with what is held of each held vertex replaced; held: shape (num_held, 3)."""
         a, out = self.arrays, np.array(x)
-        if not a.features().guided:
+        if not a.features().partly_fixed:
             out[a.held] = held
             return out
         out[a.held] += np.einsum("kij,kj->ki", a.supports.held, held - out[a.held])
         return out
 
     def of_held(self, x: np.ndarray) -> np.ndarray:
-        """What is held of vectors of the held vertices, shape (num_held, 3)."""
+        """What is held of vectors of the fixed vertices, shape (num_held, 3)."""
         a = self.arrays
-        return np.einsum("kij,kj->ki", a.supports.held, x) if a.features().guided else x
+        return np.einsum("kij,kj->ki", a.supports.held, x) if a.features().partly_fixed else x
 
     def prescribed(self, j: int, of: Derived) -> tuple:
-        """(displacement [m], velocity [m/s]) of the held vertices after pass j; None where they are held.
+        """(displacement [m], velocity [m/s]) of the fixed vertices after pass j; None where they are held.
 
         of: the values of the run, or their tangent: what is prescribed is linear in them.
         """
@@ -47,9 +47,9 @@ class GivenInPasses(Workspace):
 
     # ---- loads -------------------------------------------------------------------------------------------------------
 
-    def lay_on(self, j: int, stage: Stage, share: float = 1.0) -> None:
+    def apply_loads(self, j: int, stage: Stage, share: float = 1.0) -> None:
         """Set host forces and growth of pass j; of statics a share of what it lays on."""
-        self.laid = share if stage.static else 1.0
+        self.applied_share = share if stage.static else 1.0
         if self.hosts:
             self.hosts.take(self.arrays.now, self.instant(j, stage))
         self.grow(j, stage)
@@ -62,7 +62,7 @@ class GivenInPasses(Workspace):
     def instant(self, j: int, stage: Stage) -> Instant:
         """When host forces act in pass j."""
         gamma = np.inf if stage.static else stage.gamma
-        shares = self.share_at_stage(j, stage), self.load_share(j, stage), self.laid
+        shares = self.share_at_stage(j, stage), self.load_share(j, stage), self.applied_share
         return Instant(self.solver.schedule, j, *shares, self.origin, gamma)
 
     def growth_of(self, rows: np.ndarray, j: int, stage: Stage) -> np.ndarray:
@@ -80,17 +80,17 @@ class GivenInPasses(Workspace):
             self.arrays.hold_growth(self.growth_of(self.arrays.rows["growths"], j, stage))
 
     @property
-    def held_chambers(self) -> list[int]:
+    def constrained_chambers(self) -> list[int]:
         """Places of those that hold a volume among the scene's."""
         return self.volumes.places if self.volumes else []
 
-    def held_volumes(self, eps: float) -> HeldVolumes | None:
+    def volume_constraints(self, eps: float) -> VolumeConstraints | None:
         """The scene's chambers that hold a volume."""
         force = self.hosts.only(HeldPressure)
-        return force and HeldVolumes(force, self.linear, self.arrays.values.rest, self.solver.tolerance, eps)
+        return force and VolumeConstraints(force, self.linear, self.arrays.values.rest, self.solver.tolerance, eps)
 
     def start_multipliers(self, j: int, u: np.ndarray) -> None:
-        """Begin pass j with the pressures of held volumes that the pass before it ended with."""
+        """Begin pass j with the pressures of constrained volumes that the pass before it ended with."""
         if self.volumes:
             now = self.pass_of_all(j)
             if j == 0:  # steps that come one by one are not to fill the memory
@@ -112,16 +112,16 @@ class GivenInPasses(Workspace):
         out = np.zeros((num_frames, len(self.scene.terms_of(Chamber))))
         for frame in range(1, num_frames):
             last = self.solver.num_passes(frame * save_every) - 1
-            out[frame, self.held_chambers] = self.multipliers.get(
+            out[frame, self.constrained_chambers] = self.multipliers.get(
                 self.pass_of_all(last), 0.0
             )  # of none that it came to
         return out
 
     def last_chamber_pressures(self) -> np.ndarray:
-        """Those of chambers whose volume is held after the last pass, shape (chambers,); zero before the first."""
+        """Those of chambers whose volume is constrained after the last pass, shape (chambers,); zero before the first."""
         out = np.zeros(len(self.scene.terms_of(Chamber)))
         if self.multipliers:
-            out[self.held_chambers] = self.multipliers[max(self.multipliers)]
+            out[self.constrained_chambers] = self.multipliers[max(self.multipliers)]
         return out
 
     @property
@@ -157,7 +157,7 @@ class GivenInPasses(Workspace):
         values, features = self.arrays.values, self.arrays.features()
         if features.gravity >= 0:
             inertial = inertial + values.parameters[features.gravity :][:3] / stage.inertia
-        return inertial, self.given_forces(self.arrays.rows["forces"], j, stage)
+        return inertial, self.applied_forces(self.arrays.rows["forces"], j, stage)
 
     def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:
         if rows is not None:
@@ -165,7 +165,7 @@ class GivenInPasses(Workspace):
             out[self.dead_loads.acts_at] += self.solver.schedule.load(rows, j, share, keyed)
         return out
 
-    def given_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
+    def applied_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
         """Given forces on each vertex in pass j [N], from rows of them or of their tangent, without weight."""
         out = np.zeros_like(self.arrays.values.displacement)
         return self._add_forces(rows, out, j, stage) * self.load_share(j, stage)
@@ -174,7 +174,7 @@ class GivenInPasses(Workspace):
         """Share of the loads in pass j."""
         if not stage.static:
             return 1.0
-        return min(1.0, (self.pass_of_all(j) + self.laid) / self.solver.substeps)
+        return min(1.0, (self.pass_of_all(j) + self.applied_share) / self.solver.substeps)
 
     @cached_property
     def dead_loads(self) -> DeadLoads | None:

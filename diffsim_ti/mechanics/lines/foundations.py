@@ -19,11 +19,11 @@ class FoundationForce(VertexwiseForce):
     name = "foundation"
     arrays = dict(foundation_slot="ints")  # place among those on one, or -1
     derived = dict(foundation="vectors")  # three rows of K each [N/m]
-    adjoints = dict(foundation_felt="vectors")
+    adjoints = dict(foundation_adjoint="vectors")
 
     @traced
     def sizes(self, plan) -> dict:
-        return super().sizes(plan) | dict(foundation_felt=plan.len_foundation)
+        return super().sizes(plan) | dict(foundation_adjoint=plan.len_foundation)
 
     @ti.func
     def product(self, i, u, scene: A, stiffness: A):
@@ -47,8 +47,8 @@ class FoundationForce(VertexwiseForce):
         k = scene.foundation_slot[i]
         if k >= 0:
             for d in ti.static(range(3)):
-                row = adjoint.foundation_felt[3 * k + d]
-                adjoint.foundation_felt[3 * k + d] = row - w[d] * u
+                row = adjoint.foundation_adjoint[3 * k + d]
+                adjoint.foundation_adjoint[3 * k + d] = row - w[d] * u
         return self.product(i, w, scene, scene.foundation), self.vector(0)
 
 

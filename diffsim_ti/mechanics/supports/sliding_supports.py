@@ -1,6 +1,7 @@
-"""Vertices that are held in some directions alone, in explicit passes: what they may do, and what holds them.
+"""Vertices that are fixed in some directions only, in explicit passes: what they may do, and what holds them.
 
-`guide_slot` says which of them a vertex is, -1 none; `guides` has three rows each of the projector Q onto what is held.
+`sliding_slot` says which of them a vertex is, -1 none; `sliding_supports` has three rows each of the projector Q onto
+what is held.
 """
 
 from dataclasses import dataclass
@@ -10,12 +11,12 @@ import taichi as ti
 from diffsim_ti.runtime import vector_type
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
-GUIDED = dict(guide_slot="ints", guides="vectors")
+SLIDING_SUPPORTS = dict(sliding_slot="ints", sliding_supports="vectors")
 
 
 @dataclass(frozen=True)
-class Guides:
-    """Functions of one vertex i. Those that are held wholly have no mass (SceneArrays) and, if they move, a place k >= 0 in
+class SlidingSupports:
+    """Functions of one vertex i. Those that are fixed wholly have no mass (SceneArrays) and, if they move, a place k >= 0 in
     the prescribed motion."""
 
     precision: str
@@ -25,11 +26,11 @@ class Guides:
 
     @ti.func
     def held(self, i, x, scene: A):
-        """What is held of a vector, none where a vertex is free, or held wholly."""
-        out, g = self.vector(0), scene.guide_slot[i]
+        """What is held of a vector, none where a vertex is free, or fixed wholly."""
+        out, g = self.vector(0), scene.sliding_slot[i]
         if g >= 0:
             for d in ti.static(range(3)):
-                out[d] = scene.guides[3 * g + d].dot(x)
+                out[d] = scene.sliding_supports[3 * g + d].dot(x)
         return out
 
     @ti.func
@@ -40,27 +41,27 @@ class Guides:
     @ti.func
     def given(self, k, u, v, now: A, of: A):
         """Displacement and velocity of what is held at the end of a pass; of: the scene, or its tangent."""
-        u_held, v_held = u, v
+        u_prescribed, v_prescribed = u, v
         if ti.static(self.motion):
             if k >= 0 and now.alpha > 0:
                 change = of.motion[now.next, k] - of.motion[now.row, k]
-                u_held = of.anchor[k] + of.motion[now.row, k] + now.end * change
-                v_held = now.per_step * change
-        return u_held, v_held
+                u_prescribed = of.anchor[k] + of.motion[now.row, k] + now.end * change
+                v_prescribed = now.per_step * change
+        return u_prescribed, v_prescribed
 
     @ti.func
-    def end(self, i, k, x, x_held, scene: A):
-        """x in what vertex i may do, x_held in the rest."""
-        out = x + self.held(i, x_held - x, scene)
-        if k >= 0 and scene.guide_slot[i] < 0:
-            out = x_held
+    def end(self, i, k, x, x_prescribed, scene: A):
+        """x in what vertex i may do, x_prescribed in the rest."""
+        out = x + self.held(i, x_prescribed - x, scene)
+        if k >= 0 and scene.sliding_slot[i] < 0:
+            out = x_prescribed
         return out
 
     @ti.func
     def of_held(self, i, k, x, scene: A):
-        """What of an adjoint of the end belongs to x_held."""
+        """What of an adjoint of the end belongs to x_prescribed."""
         out = self.held(i, x, scene)
-        if k >= 0 and scene.guide_slot[i] < 0:
+        if k >= 0 and scene.sliding_slot[i] < 0:
             out = x
         return out
 

@@ -1,6 +1,6 @@
 """What springs and cables pull with, written once for kernels, one by one and in lanes, and for the host.
 
-T = a + k e, e = L - L0 + s (inputs/ties.py). If a segment d, of direction t, changes by x, its force changes by that of T
+T = a + k e, e = L - L0 + s (inputs/lines.py). If a segment d, of direction t, changes by x, its force changes by that of T
 along t, and by T/|d| times what of x lies across t.
 """
 
