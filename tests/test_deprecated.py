@@ -37,6 +37,15 @@ def test_an_old_argument_is_the_new_one(function, old, new):
         function(**{old: "rope", new: "rope"})
 
 
+def test_an_obstacle_of_users_may_say_its_kernels_by_the_old_name():
+    with pytest.warns(DeprecationWarning, match="Ball.twin is called counterpart;") as caught:
+
+        class Ball(ds.Capsule):
+            twin = ds.Capsule.counterpart
+
+    assert Ball.counterpart is ds.Capsule.counterpart and caught[0].filename == __file__
+
+
 def test_an_import_statement_warns_where_it_stands_and_hides_no_function():
     """In a process of its own: an import of the old module `modes` sets the attribute `modes` of the package."""
     program = """

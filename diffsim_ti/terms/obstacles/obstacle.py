@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common import deprecated
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.terms.described import place, positive
@@ -60,6 +61,12 @@ class Obstacle(Term):
 
     acts_on_surface = True
     counterpart: type  # the device counterpart of the shape
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        if "twin" in vars(cls):
+            deprecated.warn(f"{cls.__name__}.twin", "counterpart")
+            cls.counterpart = vars(cls)["twin"]
 
     def __init__(
         self,
