@@ -71,7 +71,7 @@ class LineRows(Link):
         return [next(rest) if given else None for given in self.given]
 
     def _whole(self, part: np.ndarray) -> np.ndarray:
-        """Of what is given in time, shape (2, rows) or (2, rows, ties): that of each line element."""
+        """Of what is given in time, shape (2, rows) or (2, rows, line elements): that of each line element."""
         return np.broadcast_to(part.reshape(*part.shape[:2], -1), (*part.shape[:2], len(self.paths)))
 
     def _filled(self, x, at_rest) -> np.ndarray:

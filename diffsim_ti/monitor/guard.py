@@ -49,7 +49,7 @@ class Crossing(Divergence):
 class Guard:
     """Checks a run every so many passes: is the state finite, did a vertex cross an obstacle, is the step still stable?
 
-    Keeps the last good state, from which `diagnose` finds the exact step. Looking costs 2 to 7 %; where the step is
+    Keeps the last good state, from which `_diagnose` finds the exact step. Checks cost 2 to 7 %; where the step is
     within a tenth of the stable one it checks more often, for beyond it a motion soon grows e-fold in ten passes.
     """
 

@@ -43,9 +43,9 @@ class Scene(MadeAgain):
     material: a law with its numbers (materials/).
     density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4. Ten-node tetrahedra
         have consistent masses and weight, lumped ones (HRZ) in explicit steps.
-    terms: loads, contacts, damping (terms/); gravity, drag and self-contact at most once. What is not listed costs
-        nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act one after
-        the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
+    terms: loads, contacts, damping (terms/); gravity, drag, a rotating frame and self-contact at most once. What is not
+        listed costs nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act
+        one after the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
     fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names. Or
         {name of a vertex or surface set: in which directions it is fixed}: axes such as "x" or "xyz", a direction (3
         numbers) or several, or "normal" of a flat surface set; so are rollers and symmetry planes made.
@@ -58,7 +58,7 @@ class Scene(MadeAgain):
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
         on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
-    mass_scaling: the share of the mass, such as .01, that may be added to the vertices that limit explicit steps
+    mass_scaling: the share of the mass, such as 0.01, that may be added to the vertices that limit explicit steps
         (mass_scaling.py): bad tetrahedra then do not rule. Gravity acts on it, so that free fall stays as it is; weight and
         reactions grow by the share. By which factors vertices are heavier is found for the numbers given here, and kept
         whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how

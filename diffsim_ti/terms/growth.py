@@ -26,7 +26,7 @@ class Growth(OfTetrahedra, Term):
 
         psi = det(F_g) psi_material(F F_g^-1) [J/m^3],    g = growth of `Grown` + sum of all Growth terms,
 
-    felt in every substep and every Newton iteration. Forces sum to zero in each tetrahedron, and a free body with uniform
+    in every substep and every Newton iteration. Forces sum to zero in each tetrahedron, and a free body with uniform
     growth takes its new size without stress. A scene makes its material `Grown(material, 0)` if it is not Grown itself.
 
     growth [-], > -1, over time: one number, one for each step (shape (steps,)), a function of time [s], or keyframes

@@ -50,7 +50,7 @@ class LineTerm(OnMesh, Term):
     num_numbers = 0  # what kernels read of it lies in arrays of its own
     one_sided = False  # whether it pulls only
     by_tension = False  # whether it pulls with a tension that is given, however long it is
-    of_fibres = False  # whether each tie is one of a tetrahedron, with a tension that is given
+    of_fibres = False  # whether each line element is a fibre of a tetrahedron, with a tension that is given
 
     _found: tuple[TetrahedralMesh, Paths] | None = None
 

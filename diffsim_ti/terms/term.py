@@ -27,7 +27,7 @@ class Term(ABC):
     `links`, where kernels read something else than its inputs as they are; `check`, `settled` and `check_start`, to refuse
     what does not fit and to choose what is left to the scene; `kernel`, the device counterpart of a term that acts by a
     force on each vertex (VertexForce); `drawn`, what pictures, films, the window and series show of it. Gravity, drag and
-    external forces are stages of the step itself.
+    external forces are parts of the step itself; `interaction` is the class that says what any other force does.
     """
 
     acts_on_surface = False

@@ -28,7 +28,7 @@ class Potential:
         n, m, num_obstacles = a.num_vertices, a.num_places, len(a.obstacles)
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))  # displacement, direction, result
         self.has_friction = bool(a.features().rough)
-        self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the walls
+        self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the poses
         self.poses = runtime.array(a.vector, a.poses.size)
         self.faces = FaceContact(self, parallel) if FaceContact.is_active(arrays) else None
         self.presses = any(g.force.friction and a.features().reaches(g) for g in a.features().groups)

@@ -27,7 +27,7 @@ class LineForce(ItemForce):
     name, pulls, asks_for_steps = "lines", True, True
     arrays = dict.fromkeys(("line_start", "point_start", "point_vertex", "line_sides"), "ints")
     arrays |= dict(point_weight="scalars")
-    # between points at rest (points, 3) [m]; numbers of each (inputs/lines.py), (1 or steps, 2 ties, 3)
+    # between points at rest (points, 3) [m]; numbers of each (inputs/lines.py), (1 or steps, 2 elements, 3)
     derived = dict(line_segments="vectors", lines="vectors2")
     adjoints = dict(line_adjoint="vectors2", line_rest="vectors")
 

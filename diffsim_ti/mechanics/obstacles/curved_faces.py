@@ -1,7 +1,7 @@
 """Points within curved faces, which lie on them by their six nodes (mesh/curved_triangles.py), in the energy of faces.py.
 
 d_a stay the distances of a triangle's own corners, so that t is what the bow of the face adds as well. Obstacles that are
-flat or hollow, to which no point of a flat triangle is nearer than its corners, are felt by
+flat or hollow, to which no point of a flat triangle is nearer than its corners, act by
 
     E = k c w^2 beta(s) h(1 - r),    r = sum_a s_a beta(d_a / w) / beta(s),    h(x) = x^3 (6 - 8 x + 3 x^2) for x > 0
 

@@ -1,7 +1,7 @@
 """Contact of points within faces as a stage of explicit passes: their forces along the displacement that a pass has found.
 
 A pass leads a surface vertex of mass m from u0 to u1. Barriers of points are stiffer than it can follow, and narrower than
-it is long, so that the way is gone again in n equal parts of length d = h / n, with their forces f (face_forces.py):
+it is long, so that the pass is integrated again in n equal parts of length d = h / n, with their forces f (face_forces.py):
 
     u  = u0 + (k + 1/2) / n (u1 - u0) + e + d v / 2        where forces of part k are taken
     v' = v + d f(u) / m,    e' = e + d (v + v') / 2,       from v = e = 0; at the end e (limited_face_contact.py) and v
@@ -152,7 +152,7 @@ class FaceKernels(LimitedFaceContact):
 
     @cached_property
     def approaches(self) -> Kernel:
-        """Notes faces that come near an obstacle in the pass, and their ways in widths."""
+        """Notes faces that come near an obstacle in the pass, and how many widths they move."""
         return self._kernel("approaches", self.all_approaches)
 
     # ---- forces ------------------------------------------------------------------------------------------------------

@@ -64,7 +64,7 @@ class FaceContactPoints(Stage):
             fp, len(faces) * len(a.contacts)
         )  # by each obstacle in a pass, more than 0 if at all
         self.near, self.load = runtime.array(ti.i32, len(faces)), runtime.array(fp, len(surface))
-        # of each face: energy; work of moving obstacles in a pass, and in all (EnergyBalance); its way in widths
+        # of each face: energy; work of moving obstacles in a pass, and in all (EnergyBalance); how many widths it moves
         self.energy, self.done, self.work, self.need = (runtime.array(fp, len(faces)) for _ in range(4))
         runtime.fill(self.work, 0)
         self.row, self.place = runtime.array(a.vector, 1, a.num_vertices), None
@@ -130,7 +130,7 @@ class FaceContactPoints(Stage):
         copy_slot(history.u, slot, self.begin, 0)
 
     def _after(self, at: Passes) -> None:
-        """The rest of the pass is done: go its way again where faces come near, and note what they did."""
+        """The rest of the pass is done: integrate it again where faces come near, and note what they did."""
         history, slot, plan, recording = at.history, at.end, at.numbers, at.stride > 0
         asked = self.ws.impulses is not None
         self.kept.pop(slot, None)
@@ -194,7 +194,7 @@ class FaceContactPoints(Stage):
         return out
 
     def _fewest_parts(self) -> int:
-        """How many parts the ways of faces ask for; 0 if none comes near."""
+        """How many parts the motions of faces ask for; 0 if none comes near."""
         if not _seen(self.near).any():
             return 0
         need = float(_seen(self.need).max())
@@ -235,7 +235,7 @@ class FaceContactPoints(Stage):
 
 
 class Alone:
-    """A recorded pass, gone again without contact within faces and then with it; `with` leaves the record as it was."""
+    """A recorded pass, computed again without contact within faces and then with it; `with` leaves the record as it was."""
 
     def __init__(self, faces: FaceContactPoints, history, slot: int):
         self.faces, self.history, self.slot = faces, history, slot

@@ -183,7 +183,7 @@ class FaceFriction:
     ) -> tuple[np.ndarray, np.ndarray]:
         """(change of what vertices gain, of the impulses of each obstacle) for changes of everything.
 
-        dI: (faces, obstacles, nodes, 3); dv, dx, inverse_dot: of the surface's vertices; dwalls: rows as poses are.
+        dI: (faces, obstacles, nodes, 3); dv, dx, inverse_dot: of the surface's vertices; dposes: rows as poses are.
         """
         k = self._known(rub)
         dI = dI[:, self.number][rub.face, rub.obstacle]
@@ -214,7 +214,7 @@ class FaceFriction:
 
     def vjp(self, rub: FaceFrictionPass, gained_adj: np.ndarray, impulses_adj: np.ndarray | None) -> SimpleNamespace:
         """Adjoints, by name, for that of what vertices gain and of the impulses of each obstacle: impulses (faces rows as
-        `rub` has them), v, x and inverse of the surface's vertices, parameters, walls."""
+        `rub` has them), v, x and inverse of the surface's vertices, parameters, poses."""
         k, N = self._known(rub), np.abs
         g = self.freed(k.inverse * gained_adj)[rub.corners]  # of the impulses at nodes
         if impulses_adj is not None:

@@ -62,9 +62,9 @@ class ExplicitSolver(Solver):
     contact: "stage", the default: obstacles act in a stage of each pass (contact_stage.py), which no step is too large
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
-        are `reduced` feel obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
-        Points within faces feel what is narrower than they are in either by a stage of its own, which goes the way of the
-        pass again in as many parts as barrier and speed ask for (explicit_face_kernels.py), and then friction acts there.
+        are `reduced` take obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
+        In both, what is narrower than faces acts on points within them in a stage of its own, which integrates the pass
+        again in as many parts as barrier and speed ask for (explicit_face_kernels.py), and then friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.

@@ -1,7 +1,7 @@
 """Load stepping of a pass that Newton's method does not solve in one solve, along the solutions that lead there.
 
 The load of the pass comes in parts: at a share s, static solves take that share of the change of loads, pressures,
-growth and times, and all passes that of the way of fixed vertices and obstacles. What is out of balance where the pass
+growth and times, and all passes that of the motion of fixed vertices and obstacles. What is out of balance where the pass
 begins all the same, R0 (inertia; loads that jump from step to step), is applied with it: R(u, s) - (1 - s) R0 = 0,
 which the start solves for s = 0. Shares grow where solves succeed and halve where they fail. Where no share helps, the
 path of equilibria may have turned back (a limit point) or branched (a bifurcation).

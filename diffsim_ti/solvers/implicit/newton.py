@@ -194,8 +194,8 @@ class Newton:
         return self._downhill() is not None
 
     def follows(self, u: np.ndarray, change: np.ndarray, way: np.ndarray) -> np.ndarray | None:
-        """How the equilibrium at u goes on for a change of loads [N] and a way of fixed vertices, linearised there, with the
-        mass of the last solve; None where it is not stable."""
+        """How the equilibrium at u goes on for a change of loads [N] and a motion of fixed vertices, linearised there, with
+        the mass of the last solve; None where it is not stable."""
         self.potential.place(u)
         A = self.operator()
         self.preconditioner.update(u)
