@@ -45,7 +45,8 @@ class Scene(MadeAgain):
         have consistent masses and weight, lumped ones (HRZ) in explicit steps.
     terms: loads, contacts, damping (terms/); gravity, drag, a rotating frame and self-contact at most once. What is not
         listed costs nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act
-        one after the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
+        one after the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs:
+        "floor.stiffness".
     fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names. Or
         {name of a vertex or surface set: in which directions it is fixed}: axes such as "x" or "xyz", a direction (3
         numbers) or several, or "normal" of a flat surface set; so are rollers and symmetry planes made.

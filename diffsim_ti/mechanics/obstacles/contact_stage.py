@@ -6,7 +6,8 @@ After the kick by all other forces, a vertex of mass m moves by
 
 P_k is the push of obstacle k's barrier for the distance d_k at the pass's begin and the one it leads to (secant.py),
 y_k = d_k + n_k . (z - h v_k), v_k its velocity; z = alpha v+ + alpha (1 + c) / 2 delta is solved for all obstacles of a
-vertex together, the minimum of a convex function, so there is one. vs is v+ after the friction of each obstacle with normal force P_k.
+vertex together, the minimum of a convex function, so there is one. vs is v+ after the friction of each obstacle with
+normal force P_k.
 
 c is the solver's `contact_damping`: 1 is backward Euler of the barriers alone, 0 their discrete gradients, which keep the
 energy. The kinetic and the barriers' energy together never grow but by obstacles that move: where obstacles are flat
