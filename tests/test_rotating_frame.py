@@ -113,6 +113,12 @@ def test_batches(kind):
     np.testing.assert_allclose(found["rest_positions"], summed, rtol=1e-7, atol=1e-9 * np.abs(summed).max())
 
 
+def test_work_of_the_frame_is_not_taken_for_a_gain_of_the_steps():
+    """Passes do not note what loads do that act vertex by vertex, so runs with these do not watch their energy."""
+    workspace = ds.Simulator(rollout_of(ds.VelocityVerletSolver).solver).workspace
+    assert workspace.energy_watch is None and workspace.balance() is None
+
+
 def test_in_float32():
     far = rollout_of(ds.VelocityVerletSolver, precision="f32").forward().positions
     np.testing.assert_allclose(far, rollout_of(ds.VelocityVerletSolver).forward().positions, atol=1e-6)

@@ -144,7 +144,7 @@ class InertialForceOnHost(HostForce):
 
 
 class InertialForces(Interaction):
-    name, kinds = "inertial", (RotatingFrame,)
+    name, kinds, works = "inertial", (RotatingFrame,), "a rotating frame"
 
     def __init__(self, scene, terms):
         super().__init__(scene, terms)

@@ -162,7 +162,8 @@ class ExplicitWorkspace(Workspace):
         )
         self.hosts = host_forces(self.scene)  # for what is evaluated between passes
         self.probe = None  # room for a pass that is not taken
-        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.term(Growth) else None
+        unwatched = self.scene.term(Growth) or features.loads_at_vertices
+        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not unwatched else None
 
     def load(self, derived: Derived) -> None:
         super().load(derived)
