@@ -170,7 +170,7 @@ class EnergyBalance:
         mass, features = values.mass[:, None] * free[:, None], a.features()
         weight = mass * values.parameters[features.gravity :][:3] if features.gravity >= 0 else 0 * mass
         kinetic = 0.5 * float((mass * a.supports.free(v) ** 2).sum())
-        stored = quantities.elastic_energy(ws) + sum(quantities.attached_energies(ws).values())
+        stored = quantities.elastic_energy(ws) + sum(quantities.stored_energies(ws).values())
         if features.groups:  # a stage does not act on fixed vertices
             stored += float((quantities.barrier_energies(ws) * (free if features.num_staged else 1)).sum())
         if ws.faces:

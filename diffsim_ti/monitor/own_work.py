@@ -44,7 +44,7 @@ class OwnWork:
     def _own_energy(self) -> float:
         """V [J]; the weight of fixed vertices is carried by what holds them."""
         ws, a = self.ws, self.ws.arrays
-        out = quantities.elastic_energy(ws) + sum(quantities.attached_energies(ws).values())
+        out = quantities.elastic_energy(ws) + sum(quantities.stored_energies(ws).values())
         at = a.features().gravity
         if at >= 0:
             mass = a.values.mass * (runtime.fetch(a.inverse_mass) > 0)

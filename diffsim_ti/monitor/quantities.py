@@ -171,7 +171,7 @@ def barrier_energies(workspace: Workspace) -> np.ndarray:
     return runtime.fetch(out.contact).astype(np.float64)
 
 
-def attached_energies(workspace: Workspace) -> dict[str, float]:
+def stored_energies(workspace: Workspace) -> dict[str, float]:
     """Energies [J] of forces, such as of springs and foundations, in the current state."""
     hosts = workspace.kept("hosts", lambda: host_forces(workspace.scene).with_energy)
     if not hosts:
@@ -199,4 +199,4 @@ def energy(workspace: Workspace) -> Energy:
         parts["contact"] += float(workspace.faces.energies().sum())
     if workspace.pairs:
         parts["contact"] = parts.get("contact", 0.0) + workspace.pairs.look(workspace.state.u)[0]
-    return Energy(parts | attached_energies(workspace))
+    return Energy(parts | stored_energies(workspace))
