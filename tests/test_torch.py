@@ -541,13 +541,13 @@ def test_float32_gradients_agree_with_float64():
 def test_copies_and_pickles_leave_the_graph():
     sim = simulator()
     sim.step()
-    counterpart = copy.deepcopy(sim)
-    assert not counterpart.positions.requires_grad and torch.equal(counterpart.positions, sim.positions)
-    for s in (sim, counterpart):
+    other = copy.deepcopy(sim)
+    assert not other.positions.requires_grad and torch.equal(other.positions, sim.positions)
+    for s in (sim, other):
         s.step()
-    assert torch.equal(counterpart.positions, sim.positions)
+    assert torch.equal(other.positions, sim.positions)
     sim.positions.sum().backward()
-    assert sim.material.E.grad is not None and counterpart.material.E.grad is None
+    assert sim.material.E.grad is not None and other.material.E.grad is None
 
 
 def identification(make_optimizer, iterations):

@@ -27,8 +27,8 @@ def main(picture_folder: str | None = None, quick: bool = False) -> dict:
     mesh = ds.TetrahedralMesh.create_box(
         (cells + 1, 3, 3), (LENGTH, HEIGHT, WIDTH), origin=(0, -HEIGHT / 2, 0), pattern="five"
     )
-    sliding_supports = np.linspace(0.05, 0.95, 10)[:, None] * [LENGTH, 0, 0] + [0, SIDE - HEIGHT / 2, WIDTH / 2]
-    tendon = ds.Cable([ds.Anchor([-0.01, *sliding_supports[0, 1:]]), *sliding_supports], tension=1.0, name="tendon")
+    guides = np.linspace(0.05, 0.95, 10)[:, None] * [LENGTH, 0, 0] + [0, SIDE - HEIGHT / 2, WIDTH / 2]
+    tendon = ds.Cable([ds.Anchor([-0.01, *guides[0, 1:]]), *guides], tension=1.0, name="tendon")
     tip = np.array([LENGTH, 0, WIDTH / 2])
     scene = ds.Scene(mesh, ds.StableNeoHookean(2e5, 0.4), 1100.0, [ds.Gravity(), tendon], "xmin", precision="f64")
     rollout = ds.Rollout(
@@ -48,10 +48,9 @@ def main(picture_folder: str | None = None, quick: bool = False) -> dict:
         tension = tension - off / slope
     seconds, place = time.perf_counter() - start, now["tip"][-1, 0]
 
-    through = ds.MaterialPoints(sliding_supports).settled(scene).value(now)[-1]
+    through = ds.MaterialPoints(guides).settled(scene).value(now)[-1]
     pulled = (
-        np.linalg.norm(np.diff(sliding_supports, axis=0), axis=1).sum()
-        - np.linalg.norm(np.diff(through, axis=0), axis=1).sum()
+        np.linalg.norm(np.diff(guides, axis=0), axis=1).sum() - np.linalg.norm(np.diff(through, axis=0), axis=1).sum()
     )
     if picture_folder:
         shown = [mesh.vertices, *(frames[key].positions[-1] for key in (1.0, tension))]

@@ -33,10 +33,8 @@ class Finger:
         mesh = ds.TetrahedralMesh.create_box(resolution, SIZE, pattern="five")
         self.mesh = mesh = mesh.quadratic() if order == 2 else mesh
         self.cage = Cage(mesh, (STATIONS, 2, 2))
-        sliding_supports = np.linspace(0.05, 0.95, 10)[:, None] * [SIZE[0], 0, 0] + [0, SIDE, SIZE[2] / 2]
-        tendon = ds.Cable(
-            [ds.Anchor([-0.01, *sliding_supports[0, 1:]]), *sliding_supports], tension=TENSION, name="tendon"
-        )
+        guides = np.linspace(0.05, 0.95, 10)[:, None] * [SIZE[0], 0, 0] + [0, SIDE, SIZE[2] / 2]
+        tendon = ds.Cable([ds.Anchor([-0.01, *guides[0, 1:]]), *guides], tension=TENSION, name="tendon")
         ends = [np.array([AT, -GAP - BAR, z]) for z in (-0.5 * SIZE[2], 1.5 * SIZE[2])]
         bar = ds.Capsule(*ends, BAR, stiffness_per_area=3e7, width=0.001, name="bar")
         self.scene = scene = ds.Scene(mesh, ds.StableNeoHookean(E, 0.4), 1100.0, [tendon, bar], "xmin", precision="f64")
