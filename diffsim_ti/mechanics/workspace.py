@@ -44,7 +44,7 @@ class Workspace:
     faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
-    last_multipliers = None  # of held volumes, in implicit steps
+    last_multipliers = None  # of constrained volumes, in implicit steps
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
     law_frames = None  # what the law remembers in each frame, where an output reads it
 

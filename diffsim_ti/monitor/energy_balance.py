@@ -48,10 +48,7 @@ class EnergyBalance:
 
     usual = 800  # passes from check to check at least; a check costs about as much as six of them
     first = 20  # where cables and muscles set a body in motion; twice as many from check to check
-    small, seldom = (
-        1000,
-        2.5,
-    )  # tetrahedra below which a check costs more than that, and comes up to so much more seldom
+    small, seldom = 1000, 2.5  # tetrahedra below which it costs more than that, and comes up to so much more seldom
 
     def __init__(self, workspace: Workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle

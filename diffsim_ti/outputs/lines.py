@@ -51,7 +51,7 @@ class _OfLines(Output):
         """Adjoints of u, of segments at rest, of (a, s, k)."""
 
     def _frames(self, frames, derived):
-        """(line elements as they are in each frame, displacements)"""
+        """(line elements as they are in each frame, displacements, when that is)"""
         for step, x in zip(frames.steps, frames.positions.astype(np.float64)):
             instant = at_end(int(step))
             yield self.lines.take(derived, instant), x - derived.rest, instant

@@ -76,9 +76,8 @@ class SceneArrays:
         self.bodies = BodyArrays(scene, fp, self.vector) if self._features["reduced"] else None
         vars(self).update(self.bodies.arrays if self.bodies else {})
         self.origin, away = scene.origin, [scene.inputs.away.get(term, np.zeros(3)) for term in self.contacts]
-        self.poses = ObstaclePoses(
-            self.obstacles, np.reshape(away, (-1, 3))
-        )  # (potential/) as they are evaluated between passes
+        # as they are evaluated between passes
+        self.poses = ObstaclePoses(self.obstacles, np.reshape(away, (-1, 3)))
         self.offsets = runtime.array(self.vector, self.poses.size)
         self.values: Derived | None = None
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values

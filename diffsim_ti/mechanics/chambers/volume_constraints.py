@@ -56,7 +56,7 @@ class ChamberWalls:
 
     @cached_property
     def d(self) -> np.ndarray:
-        """Ways by the pressures."""
+        """Displacements by the pressures."""
         return np.stack([self.freed(self.inverse * g) for g in self.g])
 
     def meet(self, y: np.ndarray, targets: np.ndarray) -> np.ndarray | None:

@@ -40,9 +40,8 @@ class Potential:
         self._points = None
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
         self.held = arrays.frozen_numbers()  # what the law measures rates from in a pass
-        self.rate = (
-            runtime.array(a.fp, 1) if a.law.viscous else None
-        )  # [1/s], of changes in a pass; zero in static solves
+        # [1/s], of changes in a pass; zero in static solves
+        self.rate = runtime.array(a.fp, 1) if a.law.viscous else None
         self.hosts = NONE  # host forces that have an energy: set by whom a time is known
         self.rigid: RigidSets | None = None  # sets that do not deform: set by whom passes are known
 
@@ -123,10 +122,8 @@ class Potential:
     @contextmanager
     def without_friction(self):
         """What has a potential in the state alone, for friction has one in a pass."""
-        a, surface_friction = (
-            self.arrays,
-            getattr(self.surface_friction, "inner", self.surface_friction),
-        )  # that of curved faces acts on corners
+        a = self.arrays
+        surface_friction = getattr(self.surface_friction, "inner", self.surface_friction)  # of curved faces: on corners
         rough = [first + force.index.friction for force, first, _ in a.obstacles if force.friction]
         if not (rough or surface_friction):
             yield

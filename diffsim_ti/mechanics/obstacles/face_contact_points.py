@@ -60,9 +60,8 @@ class FaceContactPoints(Stage):
         self.share, self.begin = runtime.array(a.vector, faces.size), runtime.array(a.vector, 1, a.num_vertices)
         self.whole, self.shift = (runtime.array(a.vector, len(surface)) for _ in range(2))
         self.least, self.offsets = runtime.array(fp, len(faces) * len(a.contacts)), a.offsets
-        self.pushed = runtime.array(
-            fp, len(faces) * len(a.contacts)
-        )  # by each obstacle in a pass, more than 0 if at all
+        # by each obstacle in a pass, more than 0 if at all
+        self.pushed = runtime.array(fp, len(faces) * len(a.contacts))
         self.near, self.load = runtime.array(ti.i32, len(faces)), runtime.array(fp, len(surface))
         # of each face: energy; work of moving obstacles in a pass, and in all (EnergyBalance); how many widths it moves
         self.energy, self.done, self.work, self.need = (runtime.array(fp, len(faces)) for _ in range(4))

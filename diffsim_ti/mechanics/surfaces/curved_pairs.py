@@ -89,11 +89,8 @@ class FinerArrays:
         self.scene, self.mesh, self.precision = arrays, surface, arrays.precision
         self.self_contact, self.num_vertices = arrays.self_contact, surface.num_vertices
         self.parameters_of_self_contact = arrays.parameters_of_self_contact
-        self.fp, self.vector, self.supports = (
-            arrays.fp,
-            arrays.vector,
-            SimpleNamespace(partly_fixed=()),
-        )  # nodes are held
+        self.fp, self.vector = arrays.fp, arrays.vector
+        self.supports = SimpleNamespace(partly_fixed=())  # nodes are held
         self.rest = runtime.array(arrays.vector, surface.num_vertices)
         self.corner = runtime.array(arrays.vector, len(surface.surface_vertices))
         self._rest_of = None

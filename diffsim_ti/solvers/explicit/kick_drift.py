@@ -100,7 +100,7 @@ class KickDrift(VertexParts):
 
     @ti.func
     def lead(self, i, u, v, now: A, scene: A, of: A):
-        """The way of vertex i in the pass in directions in which it is fixed; of: the scene, or its tangent."""
+        """The displacement of vertex i in the pass where it is fixed; of: the scene, or its tangent."""
         out = self.vector(0)
         if ti.static(self.features.partly_fixed):
             u_prescribed, _ = self.sliding_supports.given(self.prescribed(i, scene), u, v, now, of)

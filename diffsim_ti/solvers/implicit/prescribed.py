@@ -1,4 +1,4 @@
-"""What is given in the passes of an implicit run: prescribed places, dead loads, when host forces act, held volumes."""
+"""What is given in the passes of an implicit run: prescribed places, dead loads, when host forces act, volumes."""
 
 from functools import cached_property
 
@@ -126,7 +126,7 @@ class PrescribedInPasses(Workspace):
 
     @property
     def last_multipliers(self) -> np.ndarray | None:
-        """Those that the last pass ended with; None before the first, and without held volumes."""
+        """Those that the last pass ended with; None before the first, and without such chambers."""
         return self.multipliers[max(self.multipliers)] if self.multipliers else None
 
     def go_on_from(self, multipliers: np.ndarray, step: int) -> None:

@@ -79,10 +79,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         self.hosts.restrict(projectors_of(self.free), derived.rest)
         self.potential.hosts, others = self.hosts.with_energy, self.hosts.without_energy
-        self.volumes, self.multipliers = (
-            self.volume_constraints(eps),
-            {},
-        )  # the pressures [Pa] that each pass ended with
+        self.volumes = self.volume_constraints(eps)
+        self.multipliers = {}  # the pressures [Pa] that each pass ended with
         self.preconditioner, self.noted, self.collisions = Preconditioners(self), Noted(self), ObstacleCollisions(self)
         finders, more = (self.collisions.past, self.preconditioner), (others, self.volumes)
         self.newton = Newton(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
