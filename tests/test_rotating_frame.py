@@ -114,7 +114,7 @@ def test_batches(kind):
 
 
 def test_work_of_the_frame_is_not_taken_for_a_gain_of_the_steps():
-    """Passes do not note what loads do that act vertex by vertex, so runs with these do not watch their energy."""
+    """Passes do not note the work of forces that act vertex by vertex, so runs with these do not watch their energy."""
     workspace = ds.Simulator(rollout_of(ds.VelocityVerletSolver).solver).workspace
     assert workspace.energy_watch is None and workspace.balance() is None
 

@@ -40,8 +40,8 @@ class EnergyBalance:
     take. Passes note the work of loads, of prescribed motion and of moving obstacles, and what drag takes
     (solvers/explicit/kick_drift.py), but for drag that acts alone, which can hide a gain. So whatever rises beyond the
     lowest level is the steps' own.
-    Laws that read a rate or remember may take or do work of their own, and nothing notes that of loads which act vertex by
-    vertex, such as those of a rotating frame: runs with these are not watched.
+    Laws that read a rate or remember may take or do work of their own, and nothing notes that of forces without an energy
+    which act vertex by vertex, such as those of a rotating frame: runs with these are not watched.
     Hairer, Lubich, Wanner 2003, Geometric numerical integration illustrated by the Stoermer-Verlet method,
     doi:10.1017/S0962492902000144, 4.1 and 5.
     """

@@ -27,8 +27,7 @@ class OwnWork:
         """Whether the forces of a scene are those of an energy that does not change with time, at each vertex by itself."""
         scene, law = workspace.scene, workspace.arrays.law
         energetic = law.reads == ("H",) and not law.state_names and not scene.term(Growth)
-        features = workspace.arrays.features()
-        return energetic and not (scene.reduced or features.pressing or features.loads_at_vertices)
+        return energetic and not (scene.reduced or workspace.arrays.features().pressing or workspace.has_unnoted_work)
 
     def begin(self) -> None:
         """From the present state on."""

@@ -112,11 +112,6 @@ class Features:
         return any(x.is_load for x in self.interactions)
 
     @property
-    def loads_at_vertices(self) -> bool:
-        """Whether loads act vertex by vertex, whose work passes do not note."""
-        return any(x.is_load for x in self.at_vertices)
-
-    @property
     def pulled(self) -> bool:
         """Whether some loads may be counted as energy of the body's own as well."""
         return any(x.is_load and x.pulls for x in self.interactions)

@@ -162,12 +162,18 @@ class ExplicitWorkspace(Workspace):
         )
         self.hosts = host_forces(self.scene)  # for what is evaluated between passes
         self.probe = None  # room for a pass that is not taken
-        unwatched = self.scene.term(Growth) or features.loads_at_vertices
+        unwatched = self.scene.term(Growth) or self.has_unnoted_work
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not unwatched else None
 
     def load(self, derived: Derived) -> None:
         super().load(derived)
         self.check_apart()
+
+    @property
+    def has_unnoted_work(self) -> bool:
+        """Whether forces without an energy act vertex by vertex, whose work passes do not note."""
+        on_host = (x for x in self.scene.interactions if x.on_host)
+        return any(x.in_kernels and not len(x.vertices) and not f.has_energy for x, f in zip(on_host, self.hosts))
 
     def balance(self) -> OwnWork | None:
         if not OwnWork.serves(self):
