@@ -16,7 +16,7 @@ class RotatingFrame(Term):
     starts with initial_velocities -Omega x (x - c). Gravity stays as given, so it turns with the frame.
     Of ten-node tetrahedra implicit steps and equilibria take the consistent mass, as of inertia. Explicit steps turn
     velocities by Cayley's rotation, which keeps their size; implicit ones take those of the step. Static solves have the
-    centrifugal force alone: spinning bodies at rest in the frame.
+    centrifugal force alone: spinning bodies at rest in the frame. Explicit runs do not look for gains of energy.
     Inputs with gradient: "angular_velocity", "rotation_center", or "<name>.angular_velocity", "<name>.center".
     Raises ValueError for other shapes.
     Goldstein, Poole, Safko, Classical Mechanics, 3rd ed., 2002, sec. 4.10.
