@@ -15,7 +15,7 @@ POINTS = np.vstack([RNG.uniform([-0.4, -0.3, -0.4], [0.9, 0.4, 0.7], (60, 3)), B
 
 
 def evaluate(term, positions, precision="f64"):
-    """(gap, energy, force) of the compile-time twin at positions."""
+    """(gap, energy, force) of the device counterpart at positions."""
     fp = runtime.PRECISIONS[precision]
     vec = ti.types.vector(4, fp)
     own = dict(table=len(np.concatenate([v.ravel() for v in term.values.values()]))) if term.table.size else {}

@@ -1,7 +1,8 @@
 """Old public names, which work for one version: each use gives a DeprecationWarning that names the new one.
 
-Three tables: module paths, names of the package, and arguments (`renamed_arguments`). An entry of a version is deleted when
-the next one is released; tests/test_deprecated.py goes through all of them.
+Module paths and names of the package stand in tables here; arguments at their functions (`renamed_arguments`), and what a
+subclass of a user's may still write where it is read (`warn`: `Obstacle.twin`). What is of a version is deleted when the next
+one is released; tests/test_deprecated.py goes through all of it.
 """
 
 import functools
