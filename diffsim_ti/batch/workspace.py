@@ -64,7 +64,7 @@ class BatchWorkspace:
         own |= {"inverse_mass"} if _differ(derived, "mass") else set()
         self.rates = tuple(self._rate(d) for d in derived)
         own |= {"table"} if len(set(self.rates)) > 1 else set()
-        self.own, self.kernels_of_run = frozenset(own), None
+        self.own = frozenset(own)
         sources = self._sources(derived)
         if self.numbers is None:
             self.numbers = SimpleNamespace(corner=self.room_for_corners())

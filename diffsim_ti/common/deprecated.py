@@ -1,8 +1,8 @@
 """Old public names, which work for one version: each use gives a DeprecationWarning that names the new one.
 
 Module paths and names of the package stand in tables here; arguments at their functions (`renamed_arguments`), and what a
-subclass of a user's may still write where it is read (`warn`: `Obstacle.twin`). What is of a version is deleted when the next
-one is released; tests/test_deprecated.py goes through all of it.
+subclass of a user's may still write where it is read (`warn`: `Obstacle.twin`). What is of a version is deleted when the
+next one is released; tests/test_deprecated.py goes through all of it.
 """
 
 import functools
