@@ -18,7 +18,7 @@ from diffsim_ti.mechanics.obstacles.contact_impulses import (
     seed_of_friction,
 )
 from diffsim_ti.mechanics.obstacles.limited_displacement import LimitedDisplacement
-from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
+from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, VELOCITY, ObstacleStages
 from diffsim_ti.terms.obstacles import stage
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -80,7 +80,7 @@ class ContactFriction(ObstacleStages):
         """Velocity after the friction of an obstacle, whose push is noted."""
         pushed, felt, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + NUMBERS, i], v
         if pushed.x > 0 and felt.z > 0:
-            plane, v_obstacle = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + WALL, i]
+            plane, v_obstacle = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + VELOCITY, i]
             after = stage.slide(self.fp, plane, pushed.x, v, v_obstacle, ratio, felt.z, felt.w)
             if ti.static(self.features.partly_fixed):
                 after = v + self.along(i, self.normal(plane), after - v, scene)
@@ -120,7 +120,7 @@ class ContactFriction(ObstacleStages):
                 row = ROWS * (ti.static(self.features.first_staged) + c)
                 plane = state.stage[row + PLANE, i]
                 n = self.normal(plane)
-                y = plane.w + n.dot(z - now.h * state.stage[row + WALL, i])
+                y = plane.w + n.dot(z - now.h * state.stage[row + VELOCITY, i])
                 x = -n.dot(e) / y
                 if y > 0 and x > most:
                     most, number = x, ti.static(self.features.first_staged) + c
@@ -144,7 +144,7 @@ class ContactFriction(ObstacleStages):
         row, first = ROWS * (g.number + k), g.first + k * g.size
         pushed, felt = state.stage[row + PUSH, i], state.stage[row + NUMBERS, i]
         if pushed.x > 0:
-            plane, v_obstacle = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+            plane, v_obstacle = state.stage[row + PLANE, i], state.stage[row + VELOCITY, i]
             X = self.seen_now(g, k, scene.rest[i], now, scene)
             dv_obstacle = self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
             change = state.stage[row + SEED, i]
@@ -222,7 +222,7 @@ class ContactFriction(ObstacleStages):
                 if ti.static(self.features.partly_fixed):
                     held_adj = self.sliding_supports.held(i, v_adj, scene)
                     v_adj = v_adj + -1 * held_adj
-                plane, v_obstacle = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+                plane, v_obstacle = state.stage[row + PLANE, i], state.stage[row + VELOCITY, i]
                 if ti.static(self.features.recorded):
                     v_adj += share * seed_of_friction(self, before, i, now, scene, adjoint)
                 by_n = self.vector(0)
@@ -244,7 +244,7 @@ class ContactFriction(ObstacleStages):
                     state.stage[row + SEED, i] = state.stage[row + SEED, i] + by_n
                 pushed.z, pushed.w = by_mu, by_eps
                 state.stage[row + PUSH, i] = pushed
-            state.stage[row + WALL, i] = by_v_obstacle
+            state.stage[row + VELOCITY, i] = by_v_obstacle
         return v_adj, by_ratio
 
     @ti.func

@@ -23,7 +23,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.contact_friction import ContactFriction
 from diffsim_ti.mechanics.obstacles.contact_impulses import note_impulses, note_pushes_jvp, seed_impulses
-from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
+from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, VELOCITY, ObstacleStages
 from diffsim_ti.mechanics.obstacles.outside_work import add_work, work_of_lead, work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
 
@@ -75,7 +75,7 @@ class ContactStage(ObstacleStages):
                             felt = stage.numbers(g.force, scene.parameters, first)
                             felt.x = self.on_area(g, i, felt.x, scene)
                             state.stage[row + NUMBERS, i] = felt
-                            state.stage[row + WALL, i] = v_obstacle
+                            state.stage[row + VELOCITY, i] = v_obstacle
         return near
 
     @ti.func
@@ -83,7 +83,7 @@ class ContactStage(ObstacleStages):
         """Note the push of an obstacle for the move z; returns (n, P, -dP/dy, the smaller one of d and y)."""
         plane, felt = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + NUMBERS, i]
         n, width = self.normal(plane), felt.y
-        y = plane.w + n.dot(z - now.h * state.stage[ROWS * o + WALL, i])
+        y = plane.w + n.dot(z - now.h * state.stage[ROWS * o + VELOCITY, i])
         p, by_t = secant.push_by_end(plane.w / width, y / width, plan.contact_damping, self.fp)
         P, K, zero = felt.x * width * p, felt.x * by_t, ti.cast(0, self.fp)
         state.stage[ROWS * o + PUSH, i] = self.vector(P, K, zero, zero)
@@ -202,7 +202,7 @@ class ContactStage(ObstacleStages):
                 X = self.seen_now(g, k, scene.rest[i], now, scene)
                 moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
                 dv_obstacle = self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
-                own, dmove = z - now.h * state.stage[row + WALL, i], -now.h * dv_obstacle
+                own, dmove = z - now.h * state.stage[row + VELOCITY, i], -now.h * dv_obstacle
                 if ti.static(self.features.partly_fixed):
                     dmove += dlead
                 change = stage.push_jvp(
@@ -327,7 +327,7 @@ class ContactStage(ObstacleStages):
                     at_mu, at_eps = first + g.force.index.friction, first + g.force.index.friction_speed
                     adjoint.sums[at_mu, i] = adjoint.sums[at_mu, i] + pushed.z
                     adjoint.sums[at_eps, i] = adjoint.sums[at_eps, i] + pushed.w
-                    by_v_obstacle += state.stage[row + WALL, i]
+                    by_v_obstacle += state.stage[row + VELOCITY, i]
                 by_u = self.spread(g, k, i, X, u, by_place, by_v_obstacle, now, scene, adjoint, adjoint)
                 u_adj += by_u
                 self.add_to_rest(i, by_u, adjoint)

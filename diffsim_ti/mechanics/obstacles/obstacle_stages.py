@@ -22,7 +22,7 @@ from diffsim_ti.terms.obstacles import turning
 A = ti.template()  # an array or Bundle handed to a Taichi function
 # what a contact stage notes of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu,
 # friction speed); its velocity; (P, -dP/dy, adjoint of mu, of the friction speed); change or adjoint of (n, P)
-PLANE, NUMBERS, WALL, PUSH, SEED = range(5)
+PLANE, NUMBERS, VELOCITY, PUSH, SEED = range(5)
 ROWS = 5
 
 

@@ -6,7 +6,7 @@ that of forces which are the body's own.
 
 import taichi as ti
 
-from diffsim_ti.mechanics.obstacles.obstacle_stages import PLANE, PUSH, ROWS, WALL
+from diffsim_ti.mechanics.obstacles.obstacle_stages import PLANE, PUSH, ROWS, VELOCITY
 from diffsim_ti.runtime import Bundle, at, let, traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -114,7 +114,7 @@ def work_of_stage(contact: A, i, v, now: A, scene: A, state: A):
     inverse, work = scene.inverse_mass[i], ti.cast(0, contact.fp)
     for c in range(ti.static(contact.features.num_staged)):
         row = ROWS * (ti.static(contact.features.first_staged) + c)
-        v_obstacle, after = state.stage[row + WALL, i], v
+        v_obstacle, after = state.stage[row + VELOCITY, i], v
         if ti.static(len(contact.features.staged_rough) > 0):
             after = contact.slide(ti.static(contact.features.first_staged) + c, i, v, now.h * inverse, scene, state)
         pushed = now.h * state.stage[row + PUSH, i].x * contact.normal(state.stage[row + PLANE, i])
