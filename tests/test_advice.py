@@ -135,6 +135,12 @@ def fitted(gradients) -> None:
     ds.identify(rollout, data, {"youngs_modulus": 1.1e5}, method="L-BFGS-B")
 
 
+def relaxing(*outputs) -> None:
+    solver = verlet(law=ds.Prony(LAW, [0.5], [0.1]))
+    frames = ds.Rollout(solver, 1, outputs=outputs).forward()
+    ds.Stress().settled(solver.scene).value(frames)
+
+
 # (file, part of the message): (what provokes it, the same as it advises)
 FOLLOWED = {
     ("batch/batch.py", "leave out lanes=True"): (
@@ -170,6 +176,7 @@ FOLLOWED = {
         lambda: ds.ContactForce("a", about=(0, 0, 0), per_vertex=True),
         lambda: (ds.ContactForce("a", about=(0, 0, 0)), ds.ContactForce("a", per_vertex=True)),
     ),
+    ("outputs/output.py", "these frames do not have what {} remembers"): (relaxing, lambda: relaxing(ds.Stress())),
     ("outputs/reaction.py", "give about= or per_vertex=True"): (
         lambda: ds.Reaction(about=(0, 0, 0), per_vertex=True),
         lambda: (ds.Reaction(about=(0, 0, 0)), ds.Reaction(per_vertex=True)),

@@ -495,7 +495,7 @@ class ReadsTime(EnergyLaw):
         ),
         (
             lambda: rollout(shaken(), ds.ImplicitEulerSolver),
-            r"ViscousLaw reads H, H_dot, but ImplicitEulerSolver knows",
+            r"ViscousLaw reads H, H_dot, but ImplicitEulerSolver supports",
         ),
         (lambda: ReadsTime("f64"), r"ReadsTime: reads must be .* got \('t',\)"),
         (lambda: shaken(volume="patches").law, r"averages energies, but ViscousLaw reads H, H_dot; take"),

@@ -242,7 +242,7 @@ def test_steps_one_by_one_and_single_precision():
         ({"shell": np.zeros((1, 16, 3))}, {}, "of the 1 columns of the basis of 'shell' 1 are"),
         ({"skin": "affine"}, {}, "no set 'skin' of tetrahedra or vertices; it has .*'shell'"),
         ({"xmax": "affine"}, {}, "the 4 vertices of 'xmax' lie in a plane"),
-        (SHELL, dict(fixed="xmax"), "vertex .* of 'shell' is also in what is held"),
+        (SHELL, dict(fixed="xmax"), "vertex .* of 'shell' is also in what is fixed"),
         ({"half": "affine", "shell": "affine"}, {}, "of 'shell' is also in 'half'"),
     ],
 )

@@ -84,7 +84,7 @@ def test_a_map_would_show_what_is_wrong_silently():
     assert judge(scene, ds.ImplicitMidpointSolver, 3 * limit, 40).outcome == "raises"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ds.ImplicitMidpointSolver, "may_gain_energy", False)
-        patch.setattr(ObstacleCollisions, "_check_end", lambda *_: None)
+        patch.setattr(ObstacleCollisions, "check_end", lambda *_: None)
         assert judge(scene, ds.ImplicitMidpointSolver, 3 * limit, 40).outcome == "wrong silently"
 
 

@@ -52,7 +52,7 @@ class LineForce(ItemForce):
 
     @traced
     def sizes(self, plan) -> dict:
-        return super().sizes(plan) | dict(line_adjoint=plan.len_ties, line_rest=plan.len_tie_segments)
+        return super().sizes(plan) | dict(line_adjoint=plan.len_lines, line_rest=plan.len_line_segments)
 
     @traced
     def num_single(self, plan):
