@@ -69,9 +69,7 @@ def rollout_of(kind, order=1, precision="f64", **options) -> ds.Rollout:
     return ds.Rollout(kind(scene, **steps, **exact), 3, save_every=1, gradients="all", **options)
 
 
-@pytest.mark.parametrize(
-    "kind, order", [(kind, 1) for kind in SOLVERS] + [(ds.VelocityVerletSolver, 2), (ds.BDF2Solver, 2)]
-)
+@pytest.mark.parametrize("kind, order", [(kind, 1) for kind in SOLVERS] + [(ds.BDF2Solver, 2)])
 def test_every_number(kind, order):
     still = ("drag_rate",) if kind is ds.StaticSolver else ()
     assert_transposed(rollout_of(kind, order), 1e-11 if kind.explicit else 1e-8, still)
@@ -80,7 +78,7 @@ def test_every_number(kind, order):
 NAMES = ["rotor.angular_velocity", "rotor.center", "density", "rest_positions", "initial_positions"]
 
 
-@pytest.mark.parametrize("kind, order", [(ds.VelocityVerletSolver, 1), (ds.BDF2Solver, 2), (ds.StaticSolver, 1)])
+@pytest.mark.parametrize("kind, order", [(ds.VelocityVerletSolver, 1), (ds.BDF2Solver, 1), (ds.StaticSolver, 2)])
 def test_gradients_against_differences(kind, order):
     rollout = rollout_of(kind, order, outputs=ds.Reaction("xmin"))
     table = ds.check_gradients(rollout, inputs=NAMES)
