@@ -355,3 +355,16 @@ def test_what_lacks_a_kernel_is_refused_by_explicit_solvers(tethered, monkeypatc
     monkeypatch.setattr(OnHostAlone, "host", Interaction.host)
     with pytest.raises(ValueError, match="OnHostAlone has no `host`"):
         ds.Rollout(ds.ImplicitEulerSolver(scene), 1).forward()
+
+
+class Well(HostForce):
+    """E = 2 |u|^2 of each vertex."""
+
+    has_energy = True
+
+    def energies(self, u):
+        return 2 * (u**2).sum(1)
+
+
+def test_an_energy_of_ones_own_is_counted_unless_it_is_said_otherwise():
+    assert Well().stored(np.ones((3, 3))) == {"Well": 18.0} and TetherOnHost(slice(0, 5)).stored(np.ones((3, 3))) == {}

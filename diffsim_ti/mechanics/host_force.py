@@ -82,8 +82,8 @@ class HostForce:
     # ---- what it may write -------------------------------------------------------------------------------------------
 
     def stored(self, u: np.ndarray) -> dict[str, float]:
-        """Energies [J] of the body by name."""
-        return {}
+        """Energies [J] of the body by name: all that it has, by the name of its class."""
+        return {type(self).__name__: float(self.energies(u).sum())} if self.has_energy else {}
 
     def loads(self, u: np.ndarray) -> np.ndarray:
         """Those of its forces that are loads [N], whose work comes from outside."""
