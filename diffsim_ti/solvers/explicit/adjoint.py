@@ -118,13 +118,15 @@ class ExplicitAdjoint:
         at = Passes(self.ws, self, self.ws.record, base, 1, num_passes, save_every, **options)
         at.go("adjoint", self.stages, launches)
 
-    def complete(self) -> None:
-        """Add to the adjoint of the state what the last pass handed to the corners of tetrahedra."""
+    def finish(self) -> None:
+        """Add to the adjoint of the start what the last pass handed to the corners of tetrahedra."""
         ws = self.ws
         ws.bound(ws.kernels(self.features).finish_vjp, adjoint=self)(num_vertices=ws.arrays.num_vertices)
-        runtime.clear((self.corner, self.rate_corner))
 
-    finish = complete  # of the start
+    def complete(self) -> None:
+        """The same within a sweep, which goes on without it."""
+        self.finish()
+        runtime.clear((self.corner, self.rate_corner))
 
     def norm(self) -> tuple[float, float]:
         """Euclidean norms of the adjoints of displacement and velocity where the sweep stands.
