@@ -113,7 +113,7 @@ class InnermostKernels(ExplicitKernels):
         arrays = {
             bundle: {x: kind.replace("blocks", "scalars") for x, kind in own.items()} for bundle, own in arrays.items()
         }
-        return super().kernel(f"batch_{name}", body, arrays, SIZES | numbers, *options)  # `times` comes last
+        return super().kernel(f"batch_{name}", body, arrays, numbers | SIZES, *options)
 
 
 @lru_cache(maxsize=None)
