@@ -24,7 +24,12 @@ def result(seed):
 
 
 @pytest.mark.parametrize(
-    "seed", [*EXPLICIT, *IMPLICIT, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in OF_EACH_KIND + LONGER + LONGEST)]
+    "seed",
+    [
+        *EXPLICIT,
+        *IMPLICIT,
+        *(pytest.param(seed, marks=pytest.mark.thorough) for seed in OF_EACH_KIND + LONGER + LONGEST),
+    ],
 )
 def test_configuration(seed):
     found = result(seed)

@@ -584,13 +584,13 @@ def gmsh41(points, cells, tags, names) -> str:
     return "\n".join([*lines, "$EndElements", ""])
 
 
-def test_gmsh41_with_groups_on_some_volumes_only_names_the_remedy(tmp_path):
+def test_gmsh41_with_groups_on_some_volumes_only(tmp_path):
     cube = TetrahedralMesh.create_cube(2)
     cells = [("tetra", cube.tetrahedra[:2]), ("tetra", cube.tetrahedra[2:])]
     path = tmp_path / "a.msh"
     path.write_text(gmsh41(cube.vertices, cells, (3, None), {"hard": (3, 3)}))
-    with pytest.raises(ValueError, match=r"a\.msh: meshio cannot read .*give every volume a physical group or none"):
-        TetrahedralMesh.from_file(path)
+    mesh = TetrahedralMesh.from_file(path)
+    assert mesh.num_tetrahedra == 6 and mesh.tetrahedron_sets["hard"].tolist() == [0, 1]
 
 
 def test_medit_references_become_tag_sets(tmp_path):
@@ -608,7 +608,9 @@ def test_medit_references_become_tag_sets(tmp_path):
 def test_several_blocks_with_lines_and_points_beside_them(tmp_path):
     cube = TetrahedralMesh.create_cube(2)
     cells = [("tetra", cube.tetrahedra[:2]), ("line", [[0, 1]]), ("vertex", [[0]]), ("triangle", [[0, 1, 2]])]
-    mesh = TetrahedralMesh.from_file(write(tmp_path / "a.vtu", [*cells, ("tetra", cube.tetrahedra[2:])], cube.vertices))
+    path = write(tmp_path / "a.vtu", [*cells, ("tetra", cube.tetrahedra[2:])], cube.vertices)
+    with pytest.warns(UserWarning, match=r"a\.vtu: left out: 1 triangles that are no faces of tetrahedra"):
+        mesh = TetrahedralMesh.from_file(path)
     assert mesh.content_hash == cube.content_hash
 
 
@@ -625,7 +627,7 @@ def test_files_that_are_refused(tmp_path):
         ),
         (
             write(tmp_path / "ten.vtu", [("tetra10", [list(range(10))]), ("tetra", TET)], ten),
-            r"of four nodes, or of ten; cell types found: tetra10 \(1\), tetra \(1\); export elements of order 1 or 2",
+            r"of four nodes, or of ten; cell types found: tetra \(1\), tetra10 \(1\); export elements of order 1 or 2",
         ),
         (
             write(tmp_path / "mixed.vtu", both, cube.vertices),
@@ -650,7 +652,7 @@ def test_unreadable_and_missing_files(tmp_path, capfd):
     broken = {"a.msh": b"$MeshFormat\nrubbish", "b.vtu": b"<xml", "c.xyz": b"", "d.msh": b"rubbish"}
     for name, content in broken.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=rf"{name}: meshio cannot read this file .*suffix names its format"):
+        with pytest.raises(ValueError, match=rf"{name}: .*cannot read this file .*suffix names its format"):
             TetrahedralMesh.from_file(tmp_path / name)
     with pytest.raises(FileNotFoundError, match=r"no\.msh does not exist \(looked in"):
         TetrahedralMesh.from_file(tmp_path / "no.msh")

@@ -9,16 +9,17 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance
-from diffsim_ti.mesh.files import KEEPS_SETS, as_meshio, parts_of, read_mesh, write_mesh
+from diffsim_ti.mesh.files import KEEPS_SETS, as_meshio, of_meshio, read_mesh, write_mesh
 from diffsim_ti.mesh.filling import filled
+from diffsim_ti.mesh.readers.file_mesh import FileMesh, parts_of
+from diffsim_ti.mesh.readers.vtk_cells import KINDS, LAGRANGE
+from diffsim_ti.mesh.readers.vtk_cells import grid as vtk_grid
 from diffsim_ti.mesh.sets import without_unused
 
 if TYPE_CHECKING:
     import meshio
     import pyvista
     from typing_extensions import Self
-
-VTK_CELLS = {1: "vertex", 3: "line", 5: "triangle", 10: "tetra", 21: "line3", 22: "triangle6", 24: "tetra10"}
 
 
 class Exchange:
@@ -33,25 +34,39 @@ class Exchange:
         return cls(vertices, tetrahedra, **sets, fix_orientation=fix_orientation)
 
     @classmethod
-    def from_file(cls, path: str | PathLike, fix_orientation: bool = False, drop_orphans: bool = False) -> "Self":
-        """Load tetrahedra from any format that meshio reads: Gmsh .msh (1, 2.2, 4.x), .vtu, .vtk, MEDIT .mesh, .inp ...
-        Surfaces, of .stl, .obj, .ply and .off, are filled (`from_surface`).
+    def from_file(
+        cls,
+        path: str | PathLike,
+        fix_orientation: bool = False,
+        drop_orphans: bool = False,
+        size: float | None = None,
+        cells: int | None = None,
+    ) -> "Self":
+        """Load a body: tetrahedra of four or ten nodes from Gmsh .msh (1 to 4.1), Abaqus .inp, MEDIT .mesh, .vtk, .vtu,
+        .pvtu, TetGen .ele and whatever else meshio reads, or a surface from .stl, .obj, .ply, .off, .gltf or .glb, which is
+        filled (`from_surface`, to which size [m] and cells belong).
 
-        Blocks of tetrahedra are joined. Named groups of tetrahedra become tetrahedron sets, groups of triangles, lines
-        or points the vertex sets of their vertices, and those triangles that lie on the surface a surface set too; integer
-        tags without a name become "tag_<n>", except 0 and a tag that all tetrahedra share. Other triangles, lines and
-        points are ignored. Ten-node tetrahedra keep their mid-edge vertices, and edges that are curved.
+        Blocks of tetrahedra are joined. Named groups of tetrahedra become tetrahedron sets; groups of triangles, lines or
+        points become the vertex sets of their vertices, and triangles on the surface a surface set too. Whole numbers that
+        group cells, of any name (gmsh:physical, MaterialIds, cell_group ...), become "tag_<n>". Parts of a surface file
+        keep their names. Ten-node tetrahedra keep their mid-edge vertices, and edges that are curved.
+        What a file holds and the mesh does not keep is listed in one UserWarning: cells of other kinds, triangles away from
+        the tetrahedra, empty groups, materials and loads of Abaqus.
         drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn.
 
         Raises FileNotFoundError, ImportError where meshio needs a further package (h5py for XDMF, CGNS and MED, netCDF4 for
-        Exodus), and ValueError for an unreadable file, one without tetrahedra or with both kinds, other cells
-        beside tetrahedra (cell types are named), and whatever the constructor refuses.
+        Exodus), and ValueError for an unreadable file, one without tetrahedra or with both kinds, solid cells of other
+        kinds beside tetrahedra, and whatever the constructor refuses.
         """
         instance("from_file", "path", path, str | PathLike, "that of a mesh file")
         try:
-            return cls._of_parts(read_mesh(path), fix_orientation, drop_orphans)
+            parts, left_out = read_mesh(path, size, cells)
+            mesh = cls._of_parts(parts, fix_orientation, drop_orphans)
         except ValueError as error:
             raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+        if left_out:
+            warnings.warn(f"{path}: left out: {'; '.join(left_out)}", stacklevel=2)
+        return mesh
 
     @classmethod
     def load_from_msh(cls, path: str | PathLike, device: str | None = None) -> "Self":
@@ -76,15 +91,21 @@ class Exchange:
             warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)
 
     @classmethod
-    def from_surface(cls, points: ArrayLike, triangles: ArrayLike, size: float | None = None) -> "Self":
-        """The body within a closed surface, filled by TetGen (`pip install "diffsim-ti[surfaces]"`).
+    def from_surface(
+        cls, points: ArrayLike, triangles: ArrayLike, size: float | None = None, cells: int | None = None
+    ) -> "Self":
+        """The body within a surface, filled by TetGen (`pip install "diffsim-ti[surfaces]"`).
 
-        points [m], shape (n, 3), and triangles, shape (k, 3), of the surface, which all stay; points that coincide become
-        one, and closed parts within others bound cavities. size: largest edge of tetrahedra [m], about; default as large as
-        their quality allows. `from_file` does this for .stl, .obj, .ply and .off.
+        points [m], shape (n, 3), and triangles, shape (k, 3), of the surface. A closed one keeps all of them; points that
+        coincide become one, and closed parts within others bound cavities. One that is open or meets itself is filled by
+        fTetWild (`pip install "diffsim-ti[dirty]"`), which moves it by up to a thousandth of its size, with a UserWarning
+        that says what is wrong and where.
+        size: largest edge of tetrahedra [m], about; or cells: edges along the longest side. Default: as large as the
+        quality of tetrahedra allows. `from_file` does this for files of surfaces.
 
-        Raises ValueError for a surface that is open or meets itself, and where TetGen is missing.
+        Raises ValueError for a surface that cannot be filled, and where TetGen or fTetWild is missing.
         Si 2015, TetGen, a Delaunay-Based Quality Tetrahedral Mesh Generator, doi:10.1145/2629697.
+        Hu et al. 2020, Fast Tetrahedral Meshing in the Wild, doi:10.1145/3386569.3392385.
         """
         points, triangles = np.asarray(points, np.float64), np.asarray(triangles)
         for name, given, kind in (("points", points, "f"), ("triangles", triangles, "iu")):
@@ -93,12 +114,19 @@ class Exchange:
                 raise ValueError(f"{name} must be {numbers} of shape (n, 3), got shape {given.shape} of {given.dtype}")
         if triangles.size and not (0 <= triangles.min() and triangles.max() < len(points)):
             raise ValueError(f"triangles must name points from 0 to {len(points) - 1}, got {triangles.max()}")
-        return cls(*filled(points, triangles.astype(np.int64), size))
+        return cls(*filled(points, triangles.astype(np.int64), size=size, cells=cells)[:2])
 
     @classmethod
     def from_meshio(cls, mesh: "meshio.Mesh", fix_orientation: bool = False, drop_orphans: bool = False) -> "Self":
         """Of meshio's mesh, with its sets, as `from_file` has it of a file."""
-        return cls._of_parts(parts_of(mesh, again=True), fix_orientation, drop_orphans)
+        return cls._from(of_meshio(mesh), fix_orientation, drop_orphans)
+
+    @classmethod
+    def _from(cls, mesh: FileMesh, fix_orientation: bool, drop_orphans: bool) -> "Self":
+        parts, left_out = parts_of(mesh, again=True)
+        if left_out:
+            warnings.warn(f"left out: {'; '.join(left_out)}", stacklevel=3)
+        return cls._of_parts(parts, fix_orientation, drop_orphans)
 
     def to_meshio(self) -> "meshio.Mesh":
         """As a mesh of meshio, with the sets as 0/1 arrays, as in .vtu files (`save`); `from_meshio` brings it back."""
@@ -110,19 +138,21 @@ class Exchange:
     ) -> "Self":
         """Of a grid of PyVista (or one that only looks like it: `points`, `cells_dict`, `celltypes`, `point_data`,
         `cell_data`), whose 0/1 arrays named as in .vtu files become sets. PyVista need not be there."""
-        import meshio
-
-        kinds = {number: name for number, name in VTK_CELLS.items() if number in grid.cells_dict}
-        other = sorted(set(grid.cells_dict) - set(kinds))
-        if other:
-            known = ", ".join(VTK_CELLS.values())
-            raise ValueError(f"cells of VTK's types {other} cannot be read; there may be {known}")
-        cells = [(name, np.asarray(grid.cells_dict[number])) for number, name in kinds.items()]
-        rows = [np.nonzero(np.asarray(grid.celltypes) == number)[0] for number in kinds]
-        cell_data = {name: [np.asarray(grid.cell_data[name])[k] for k in rows] for name in grid.cell_data.keys()}
-        point_data = {name: np.asarray(grid.point_data[name]) for name in grid.point_data.keys()}
-        mesh = meshio.Mesh(np.asarray(grid.points), cells, point_data=point_data, cell_data=cell_data)
-        return cls.from_meshio(mesh, fix_orientation, drop_orphans)
+        if other := sorted(set(grid.cells_dict) - set(KINDS) - set(LAGRANGE)):
+            raise ValueError(
+                f"cells of VTK's types {other} cannot be read; there may be tetrahedra, triangles, lines, vertices"
+            )
+        types, cells = np.asarray(grid.celltypes), {int(kind): np.asarray(c) for kind, c in grid.cells_dict.items()}
+        rows = {kind: np.nonzero(types == kind)[0] for kind in cells}
+        sizes = np.zeros(len(types), np.int64)
+        for kind, own in rows.items():
+            sizes[own] = cells[kind].shape[1]
+        offsets = np.concatenate([[0], np.cumsum(sizes)])
+        nodes = np.zeros(offsets[-1], np.int64)
+        for kind, own in rows.items():
+            nodes[offsets[own][:, None] + np.arange(cells[kind].shape[1])] = cells[kind]
+        data = [{name: np.asarray(d[name]) for name in d.keys()} for d in (grid.point_data, grid.cell_data)]
+        return cls._from(vtk_grid(np.asarray(grid.points), nodes, offsets, types, *data), fix_orientation, drop_orphans)
 
     def to_pyvista(self) -> "pyvista.UnstructuredGrid":
         """As a grid of PyVista, which must be installed, with the sets as 0/1 arrays."""

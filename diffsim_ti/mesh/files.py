@@ -1,25 +1,37 @@
-"""Tetrahedral meshes from and to files, through meshio (imported only here, when called)."""
+"""Tetrahedral meshes from and to files: own readers (readers/), meshio for the other formats (imported only when called)."""
 
 import contextlib
 import io
+import tempfile
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.mesh import gmsh1
-from diffsim_ti.mesh.filling import SURFACES, filled, read_surface
+from diffsim_ti.mesh.filling import SURFACES, filled_file
+from diffsim_ti.mesh.readers import abaqus, gmsh, medit, tetgen, vtk_legacy, vtk_xml
+from diffsim_ti.mesh.readers.file_mesh import FileMesh, parts_of
+from diffsim_ti.mesh.readers.vtk_cells import CELL_PREFIXES, VERTEX_PREFIX, groups_of_arrays
+from diffsim_ti.mesh.ten_nodes import MIRRORED
 
-DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle": 2, "triangle6": 2, "tetra": 3, "tetra10": 3}  # in a file
-TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "avsucd:material")  # integer cell data that group cells
-VERTEX_PREFIX = "vertex_set:"  # 0/1 data arrays in VTU and VTK files
-CELL_PREFIXES = {3: "tetrahedron_set:", 2: "surface_set:"}
 KEEPS_SETS = (".msh", ".vtu", ".vtk")
 KEEPS_TEN_NODES = (*KEEPS_SETS, ".inp", ".xdmf")
+READERS: dict[str, Callable[[Path], FileMesh]] = {
+    ".inp": abaqus.read,
+    ".mesh": medit.read,
+    ".ele": tetgen.read,
+    ".node": tetgen.read,
+    ".vtk": vtk_legacy.read,
+    ".vtu": vtk_xml.read,
+    ".pvtu": vtk_xml.read,
+}
+NASTRAN = (".bdf", ".nas", ".fem")
 
 
-def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
-    """Vertices, elements of four or ten nodes, vertex sets, tetrahedron sets and named triangles (by their corners) of a
-    file; see `TetrahedralMesh.from_file`."""
+def read_mesh(path, size: float | None = None, cells: int | None = None) -> tuple[tuple, list[str]]:
+    """((vertices, elements of four or ten nodes, vertex sets, tetrahedron sets, named triangles by their corners), what is
+    left out) of a file; see `TetrahedralMesh.from_file`."""
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"mesh file {path} does not exist (looked in {Path.cwd()})")
@@ -27,127 +39,97 @@ def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
         raise ValueError(f"{path} is a folder: name a mesh file")
     if path.suffix.lower() in SURFACES:
         try:
-            return *filled(*read_surface(path)), {}, {}, {}
+            return filled_file(path, size, cells), []
         except ValueError as error:
             raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    return parts_of(_read(path), again=path.suffix == ".msh")
+    if size is not None or cells is not None:
+        raise ValueError(
+            f"size and cells say how finely a surface is filled ({', '.join(SURFACES)}), and this file holds tetrahedra; "
+            "leave them out, or use mesh.scaled to change the size of the body"
+        )
+    return parts_of(_read(path), again=path.suffix.lower() == ".msh")
 
 
-def parts_of(mesh, again: bool = False) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
-    """The same of meshio's mesh; again: it may list a tetrahedron once for each of its groups."""
-    _check_cell_types(mesh)
-    blocks = [k for k, block in enumerate(mesh.cells) if DIMENSION[block.type] == 3]
-    offset = dict(zip(blocks, np.cumsum([0] + [len(mesh.cells[k].data) for k in blocks])))
-    vertex_sets, tetrahedron_sets, triangles = {}, {}, {}
-
-    def add(name: str, k: int, rows: np.ndarray) -> None:
-        if len(rows) and k in offset:
-            tetrahedron_sets.setdefault(name, []).append(rows + offset[k])
-        elif len(rows):
-            vertex_sets.setdefault(name, []).append(mesh.cells[k].data[rows].ravel())
-            if DIMENSION[mesh.cells[k].type] == 2:
-                triangles.setdefault(name, []).append(mesh.cells[k].data[rows, :3])
-
-    for name, k, rows in _groups(mesh):
-        add(name, k, rows)
-    for name, rows in mesh.point_sets.items():
-        vertex_sets.setdefault(name, []).append(rows)
-    for name, values in mesh.point_data.items():
-        if name.startswith(VERTEX_PREFIX):
-            vertex_sets.setdefault(name.removeprefix(VERTEX_PREFIX), []).append(np.nonzero(values)[0])
-    tetrahedra = np.concatenate([mesh.cells[k].data for k in blocks])
-    join = {name: np.unique(np.concatenate(parts)).astype(np.int64) for name, parts in tetrahedron_sets.items()}
-    if again:
-        tetrahedra, join = _merge_repeated(tetrahedra, join)
-    sets = {name: np.unique(np.concatenate(parts)).astype(np.int64) for name, parts in vertex_sets.items()}
-    triangles = {name: np.concatenate(parts).astype(np.int64) for name, parts in triangles.items()}
-    return mesh.points, tetrahedra, sets, join, triangles
-
-
-def _read(path: Path):
-    """meshio's mesh; its prints and its sys.exit become one ValueError."""
-    import meshio
-
+def _read(path: Path) -> FileMesh:
+    """The mesh of a file; whatever a reader raises becomes one ValueError."""
+    reader, by = READERS.get(path.suffix.lower()), "the reader of its format"
     with open(path, "rb") as file:
-        is_gmsh = path.suffix == ".msh" and b"$" in file.read(1)
-    if is_gmsh and gmsh1.is_gmsh1(path):
-        try:
-            return gmsh1.read(path)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}; export it again") from error
+        if path.suffix.lower() == ".msh" and (file.read(1) == b"$" or not path.stat().st_size):
+            reader = gmsh.read
     said = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            return meshio.read(path, file_format="gmsh" if is_gmsh else None)
+        if reader:
+            return reader(path)
+        by = "meshio"
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return of_meshio(_by_meshio(path))
     except ModuleNotFoundError as error:
         raise _lacking(str(path), error) from error
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{said.getvalue()} {error if str(error) != '1' else ''}".split()) or type(error).__name__
-        hint = "check that it is complete and that its suffix names its format"
-        if "gmsh:physical" in reason:
-            hint = "either give every volume a physical group or none, or save as Gmsh 2.2 (Mesh.MshFileVersion = 2.2)"
-        raise ValueError(f"{path}: meshio cannot read this file ({reason}); {hint}") from error
+        if isinstance(error, (IndexError, KeyError)):
+            reason = f"it ends too early, or counts what is not there ({type(error).__name__}: {reason})"
+        raise ValueError(
+            f"{path}: {by} cannot read this file ({reason}); check that it is complete and that its suffix names its format"
+        ) from error
 
 
-def _check_cell_types(mesh) -> None:
-    found = {}
+def _by_meshio(path: Path):
+    import meshio
+
+    suffix = path.suffix.lower()
+    if suffix not in meshio.extension_to_filetypes:
+        known = ", ".join(sorted({*READERS, ".msh", *SURFACES, *meshio.extension_to_filetypes}))
+        raise ValueError(
+            f"nothing reads {suffix or 'files without a suffix'}; convert it, with Gmsh or ParaView say, to {known}"
+        )
+    text = path.read_bytes() if suffix in NASTRAN else b""
+    if not text or b"BEGIN BULK" in text.upper().replace(b"  ", b" "):
+        mesh = meshio.read(path)
+        return _of_med(mesh) if suffix == ".med" else mesh
+    with tempfile.TemporaryDirectory() as folder:  # bulk data alone, as Gmsh writes them
+        whole = Path(folder) / f"bulk{path.suffix}"
+        whole.write_bytes(b"BEGIN BULK\n" + text)
+        return meshio.read(whole)
+
+
+def _of_med(mesh):
+    """With tetrahedra turned as everybody else has them, and the names of families as groups of cells and points."""
     for block in mesh.cells:
-        found[block.type] = found.get(block.type, 0) + len(block.data)
-    other = sorted(set(found) - set(DIMENSION))
-    listing = ", ".join(f"{kind} ({count})" for kind, count in found.items()) or "none"
-    if any(kind.startswith("tetra") for kind in other) or {"tetra", "tetra10"} <= set(found):
-        raise ValueError(
-            f"a file holds tetrahedra of four nodes, or of ten; cell types found: {listing}; export elements of order 1 or "
-            "2 (in Gmsh: Mesh.ElementOrder = 2)"
-        )
-    if not found.get("tetra", 0) and not found.get("tetra10", 0):
-        raise ValueError(
-            f"the file holds no tetrahedra; cell types found: {listing}; fill the surface with tetrahedra first, "
-            "for example by TetrahedralMesh.from_surface, Gmsh or fTetWild"
-        )
-    if other:
-        raise ValueError(
-            f"tetrahedra beside {', '.join(other)} cells cannot be read, as these would be lost; cell types found: "
-            f"{listing}; mesh the body with tetrahedra alone"
-        )
+        if block.type in ("tetra", "tetra10"):
+            block.data = np.asarray(block.data)[:, list(MIRRORED[: block.data.shape[1]])]
+    for number, names in getattr(mesh, "cell_tags", {}).items():
+        for name in names:
+            rows = [np.nonzero(values == number)[0] for values in mesh.cell_data["cell_tags"]]
+            known = mesh.cell_sets.get(name, [np.zeros(0, np.int64)] * len(rows))
+            mesh.cell_sets[name] = [np.union1d(a, b).astype(np.int64) for a, b in zip(known, rows)]
+    for number, names in getattr(mesh, "point_tags", {}).items():
+        for name in names:
+            rows = np.nonzero(mesh.point_data["point_tags"] == number)[0]
+            mesh.point_sets[name] = np.union1d(mesh.point_sets.get(name, []), rows).astype(np.int64)
+    mesh.cell_data.pop("cell_tags", None)
+    return mesh
 
 
-def _groups(mesh):
-    """(name, block, rows) of every group of cells: named by the file, or tag_<n> for integer tags without a name."""
+def of_meshio(mesh) -> FileMesh:
+    """The same of a mesh of meshio's."""
+    out = FileMesh(np.asarray(mesh.points, np.float64), [(block.type, np.asarray(block.data)) for block in mesh.cells])
+    if out.points.ndim != 2 or out.points.shape[1] != 3:
+        raise ValueError(f"its points have shape {out.points.shape}; a body needs three coordinates")
     names = {(int(dim), int(tag)): name for name, (tag, dim) in mesh.field_data.items()}
     for name, members in mesh.cell_sets.items():
         if name != "gmsh:bounding_entities":
-            yield from ((name, k, np.asarray(rows, np.int64)) for k, rows in enumerate(members) if rows is not None)
-    for key, blocks in mesh.cell_data.items():
-        for dim, prefix in CELL_PREFIXES.items():
-            own = [k for k, block in enumerate(mesh.cells) if DIMENSION[block.type] == dim and key.startswith(prefix)]
-            yield from ((key.removeprefix(prefix), k, np.nonzero(blocks[k])[0]) for k in own)
-        if key not in TAGS:
-            continue
-        blocks = [np.asarray(values).astype(np.int64) for values in blocks]
-        used = {int(tag) for block, v in zip(mesh.cells, blocks) if DIMENSION[block.type] == 3 for tag in np.unique(v)}
-        for k, (block, values) in enumerate(zip(mesh.cells, blocks)):
-            dim = DIMENSION[block.type]
-            for tag in np.unique(values).tolist():
-                name = names.get((dim, tag))
-                if name is None and (tag == 0 or (dim == 3 and len(used) == 1)):
-                    continue  # no group, or a nameless one that tells nothing apart
-                yield name or f"tag_{tag}", k, np.nonzero(values == tag)[0]
-
-
-def _merge_repeated(tetrahedra: np.ndarray, sets: dict) -> tuple[np.ndarray, dict]:
-    """Gmsh 2.2 lists a tetrahedron once per physical group that holds it; keep the first and all its groups."""
-    _, first, inverse = np.unique(tetrahedra, axis=0, return_index=True, return_inverse=True)
-    if len(first) == len(tetrahedra):
-        return tetrahedra, sets
-    groups_of = np.zeros(len(tetrahedra), np.int64)
-    for rows in sets.values():
-        groups_of[rows] += 1
-    if np.any(groups_of[np.setdiff1d(np.arange(len(tetrahedra)), first)] == 0):
-        return tetrahedra, sets  # true repetitions: the mesh's own check reports them
-    keep = np.sort(first)
-    new = np.searchsorted(keep, first[inverse.ravel()])
-    return tetrahedra[keep], {name: np.unique(new[rows]) for name, rows in sets.items()}
+            for k, rows in enumerate(members):
+                if rows is not None:
+                    out.group(name, k, np.asarray(rows, np.int64))
+    groups_of_arrays(out, mesh.cell_data, names)
+    for name, rows in mesh.point_sets.items():
+        out.point_sets[name] = np.unique(rows).astype(np.int64)
+    for name, values in mesh.point_data.items():
+        if name.startswith(VERTEX_PREFIX):
+            out.point_sets[name.removeprefix(VERTEX_PREFIX)] = np.nonzero(values)[0]
+    return out
 
 
 def write_mesh(path, mesh) -> list[str]:

@@ -1,109 +1,212 @@
-"""Closed surfaces filled with tetrahedra, by TetGen (the extra `surfaces`)."""
+"""Surfaces filled with tetrahedra: closed ones by TetGen, others by fTetWild (the extras `surfaces` and `dirty`)."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.mesh.sets import components
+from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces
+from diffsim_ti.mesh.sets import components, places_of_triangles
 
-SURFACES = (".stl", ".obj", ".ply", ".off")  # files that hold surfaces alone
+SURFACES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")  # files that hold surfaces alone
 INSTALL = 'pip install "diffsim-ti[surfaces]"'
+INSTALL_DIRTY = 'pip install "diffsim-ti[dirty]"'
 ELSEWHERE = "or fill it elsewhere, with Gmsh or fTetWild"
+CELLS = 20  # edges along the diagonal that fTetWild takes where no size is given
 MEAN_RATIO = 1.5  # largest circumradius over shortest edge
 
 
-def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(points, triangles) of a file; other cells are left out."""
-    import meshio
-
+def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """(points, triangles, name of each part -> rows of its triangles) of a file, by trimesh; polygons are cut into
+    triangles. A file of one part names none."""
     try:
-        mesh = meshio.read(path)
-    except (Exception, SystemExit) as error:
-        raise ValueError(f"{path}: meshio cannot read this surface ({error}); check that it is complete") from error
-    cells = {block.type: block.data for block in mesh.cells}
-    if "quad" in cells:
-        quads = cells["quad"]
-        cells["cut"] = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    triangles = [cells[kind] for kind in ("triangle", "cut") if kind in cells]
-    if not triangles:
-        raise ValueError(
-            f"{path} holds no triangles, but {', '.join(cells) or 'nothing'}; export a surface of triangles"
-        )
-    return np.asarray(mesh.points, np.float64), np.concatenate(triangles).astype(np.int64)
+        import trimesh
+    except ImportError as error:
+        raise ValueError(f"files of surfaces are read by trimesh, which is missing: {INSTALL}") from error
+    parts = None
+    try:
+        for split in ("split_objects", "split_groups") if path.suffix.lower() == ".obj" else ("",):
+            options = dict(maintain_order=True, skip_materials=True, group_material=False) if split else {}
+            scene = trimesh.load_scene(path, process=False, **options, **({split: True} if split else {}))
+            found = [(str(node), scene.graph[node]) for node in scene.graph.nodes_geometry]
+            if parts is None or len(found) > len(parts):
+                parts = [(name, matrix, scene.geometry[geometry]) for name, (matrix, geometry) in found]
+    except Exception as error:
+        raise ValueError(f"{path}: trimesh cannot read this surface ({error}); check that it is complete") from error
+    parts = [(name, matrix, part) for name, matrix, part in parts if len(getattr(part, "faces", ()))]
+    if not parts:
+        raise ValueError(f"{path} holds no triangles; export a surface of triangles")
+    points = [np.asarray(part.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3] for _, matrix, part in parts]
+    firsts = np.cumsum([0, *map(len, points)])
+    triangles = [np.asarray(part.faces, np.int64) + first for (_, _, part), first in zip(parts, firsts)]
+    ends = np.cumsum([0, *map(len, triangles)])
+    named = {name: np.arange(a, b) for (name, _, _), a, b in zip(parts, ends[:-1], ends[1:])}
+    return np.concatenate(points), np.concatenate(triangles), named if len(named) > 1 else {}
 
 
-def filled(points: np.ndarray, triangles: np.ndarray, size: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(vertices, tetrahedra) within a closed surface, all of whose points and triangles stay; closed parts within others
-    bound cavities.
+def filled_file(path: Path, size: float | None = None, cells: int | None = None) -> tuple:
+    """`filled` of a file's surface, whose parts keep their names."""
+    return filled(*read_surface(path), size=size, cells=cells)
 
-    size: edge length that tetrahedra reach at most, about [m]; default as large as their quality allows.
-    Raises ValueError for a surface that is open, meets itself or is not finite, and where TetGen is missing.
+
+def filled(points: np.ndarray, triangles: np.ndarray, parts: dict | None = None, size=None, cells=None) -> tuple:
+    """(vertices, tetrahedra, vertex sets, tetrahedron sets, triangles by name) of the body within a surface.
+
+    A closed surface keeps all points and triangles, and closed parts within others bound cavities. One that is open or
+    meets itself is filled by fTetWild, which moves it by up to a thousandth of its size, with a UserWarning.
+    parts: name -> rows of triangles; these become sets, and what a part bounds alone a tetrahedron set of its name.
+    size: edge length that tetrahedra reach at most, about [m]; default as large as their quality allows. cells: the same as
+    a number of edges along the longest side.
+    Raises ValueError for a surface that is not finite, for a closed one where TetGen is missing, and for others where
+    fTetWild is, with what is wrong and where.
     Si 2015, TetGen, a Delaunay-Based Quality Tetrahedral Mesh Generator, doi:10.1145/2629697.
+    Hu et al. 2020, Fast Tetrahedral Meshing in the Wild, doi:10.1145/3386569.3392385.
     """
-    points, triangles = welded(points, triangles)
-    check_closed(points, triangles)
+    points, triangles, rows = welded(points, triangles)
+    size = size_of(points, size, cells)
+    fault = fault_of(points, triangles)
+    if fault is None:
+        try:
+            vertices, tetrahedra = by_tetgen(points, triangles, size)
+        except RuntimeError as error:
+            fault = (
+                f"TetGen cannot fill the surface ({' '.join(str(error).split())}): its triangles may meet each other"
+            )
+    if fault:
+        return *by_ftetwild(points, triangles, size, fault, parts), {}, {}, {}
+    where = places(points, vertices)
+    region, walls = regions(tetrahedra, where[triangles])
+    inside = are_inside(vertices, tetrahedra, region, points, triangles)
+    sets = {name: np.isin(rows, members) for name, members in (parts or {}).items()}
+    named = {name: where[triangles[own]] for name, own in sets.items()}
+    bounded = {name: inside & alone for name, alone in _bounded_by(region, walls, sets).items()}
+    chosen = inside[region]
+    solid = {name: np.nonzero(own[region[chosen]])[0] for name, own in bounded.items() if own.any()}
+    used, corners = np.unique(tetrahedra[chosen], return_inverse=True)
+    named = {name: np.searchsorted(used, own) for name, own in named.items()}
+    tetrahedra = corners.reshape(-1, 4).astype(np.int64)
+    return vertices[used], tetrahedra, {name: np.unique(own) for name, own in named.items()}, solid, named
+
+
+def size_of(points: np.ndarray, size: float | None, cells: int | None) -> float | None:
+    """The length that size, or cells along the longest side, stand for [m]; None if neither is given."""
+    if size is not None and cells is not None:
+        raise ValueError(f"size and cells exclude each other, got {size} and {cells}; pass one of them")
+    if cells is not None:
+        if isinstance(cells, bool) or not (isinstance(cells, (int, np.integer)) and cells >= 1):
+            raise ValueError(f"cells must be a whole number of at least 1 along the longest side, got {cells!r}")
+        return float(np.ptp(points, 0).max()) / cells
     if size is not None and not (np.isfinite(size) and size > 0):
         raise ValueError(f"size must be a length above 0 [m], got {size}; None lets tetrahedra grow inwards")
-    volume = {} if size is None else dict(fixedvolume=True, maxvolume=size**3 / 72**0.5)
+    return size
+
+
+def by_tetgen(points: np.ndarray, triangles: np.ndarray, size: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """(vertices, tetrahedra) of all that a closed surface bounds; RuntimeError where triangles meet each other."""
     try:
         import tetgen
     except ImportError as error:
         raise ValueError(f"surfaces are filled by TetGen, which is missing: {INSTALL}, {ELSEWHERE}") from error
+    volume = {} if size is None else dict(fixedvolume=True, maxvolume=size**3 / 72**0.5)
     mesher = tetgen.TetGen(points, triangles.astype(np.int32))
     shape = dict(quality=True, minratio=MEAN_RATIO, mindihedral=10.0)
-    try:  # without nofacewritten, TetGen leaves files of refused triangles in the working folder
-        made = mesher.tetrahedralize(nobisect=True, nofacewritten=True, **shape, **volume)
-    except RuntimeError as error:
+    # without nofacewritten, TetGen leaves files of refused triangles in the working folder
+    made = mesher.tetrahedralize(nobisect=True, nofacewritten=True, **shape, **volume)
+    return np.asarray(made[0], np.float64), np.asarray(made[1], np.int64)
+
+
+def by_ftetwild(points: np.ndarray, triangles: np.ndarray, size: float | None, fault: str, parts) -> tuple:
+    """(vertices, tetrahedra) of what a surface winds around, with a word about it."""
+    try:
+        import pytetwild
+    except ImportError as error:
         raise ValueError(
-            f"TetGen cannot fill the surface ({' '.join(str(error).split())}): its triangles may meet each other; mend it, "
-            f"with MeshLab say, {ELSEWHERE}"
+            f"{fault}; mend it (in Blender: select non-manifold edges, fill; in MeshLab: close holes), or let fTetWild fill "
+            f"it as it is: {INSTALL_DIRTY}"
         ) from error
-    return _without_cavities(np.asarray(made[0], np.float64), np.asarray(made[1], np.int64), points, triangles)
+    length = dict(edge_length_fac=1 / CELLS) if size is None else dict(edge_length_abs=size)
+    vertices, tetrahedra = pytetwild.tetrahedralize(points, triangles.astype(np.int32), quiet=True, **length)
+    vertices, tetrahedra = np.asarray(vertices, np.float64), np.asarray(tetrahedra, np.int64)
+    if not len(tetrahedra):
+        raise ValueError(f"{fault}; and fTetWild finds no inside; close its holes (in MeshLab: close holes)")
+    turned = signed_volumes(edge_matrices(vertices, tetrahedra)) < 0
+    tetrahedra[turned] = tetrahedra[turned][:, [0, 2, 1, 3]]
+    volume = float(np.abs(signed_volumes(edge_matrices(vertices, tetrahedra))).sum())
+    lost = f"; its parts {', '.join(parts)} are no sets then" if parts else ""
+    warnings.warn(
+        f"{fault}: filled by fTetWild, which moves the surface by up to {1e-3 * np.linalg.norm(np.ptp(points, 0)):.2g} m; "
+        f"the body has {volume:.4g} m^3{lost}; mend the surface to keep it exactly",
+        stacklevel=5,
+    )
+    used, corners = np.unique(tetrahedra, return_inverse=True)
+    return vertices[used], corners.reshape(-1, 4).astype(np.int64)
 
 
-def _without_cavities(vertices, tetrahedra, points, triangles) -> tuple[np.ndarray, np.ndarray]:
-    """Without tetrahedra of closed parts of the surface that lie within another: there, a ray leaves by an even number of
-    triangles. A surface in one piece has none."""
-    part = components(triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel(), len(points))
-    if len(np.unique(part[triangles[:, 0]])) == 1:
-        return vertices, tetrahedra
+def regions(tetrahedra: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(for each tetrahedron the number of the region that it lies in, (region, row of walls) for each of the walls that a
+    region has), regions being parted by the triangles `walls`."""
+    count = int(max(tetrahedra.max(initial=0), walls.max(initial=0))) + 1
+    corners, order, same = sorted_faces(tetrahedra, count)
+    wall = places_of_triangles(corners, walls)
+    first, second = order[:-1][same], order[1:][same]
+    through = wall[first] < 0
+    region = components(first[through] // 4, second[through] // 4, len(tetrahedra))
+    at = np.nonzero(wall >= 0)[0]
+    return region, np.stack([region[at // 4], wall[at]], 1)
+
+
+def _bounded_by(region: np.ndarray, walls: np.ndarray, sets: dict) -> dict[str, np.ndarray]:
+    """name -> which regions have walls of that part alone."""
+    total = np.bincount(walls[:, 0], minlength=region.max() + 1)
+    counts = {name: np.bincount(walls[own[walls[:, 1]], 0], minlength=len(total)) for name, own in sets.items()}
+    return {name: (count == total) & (total > 0) for name, count in counts.items()}
+
+
+def are_inside(vertices, tetrahedra, region, points, triangles) -> np.ndarray:
+    """Which regions lie inside the surface: from the middle of one tetrahedron of each, a ray leaves by an odd number of
+    triangles."""
+    volumes = np.abs(signed_volumes(edge_matrices(vertices, tetrahedra)))
+    order = np.lexsort((-volumes, region))
+    largest = order[np.searchsorted(region[order], np.arange(region.max() + 1))]
     turn, _ = np.linalg.qr(np.array([[0.31, 0.77, 0.13], [0.59, 0.23, 0.83], [0.47, 0.91, 0.37]]))  # rays miss edges
     a, b, c = (points @ turn)[triangles].transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    centers, inside = vertices[tetrahedra].mean(1) @ turn, []
-    for center in np.array_split(centers, 1 + len(centers) * len(triangles) // 1_000_000):
-        at = center[:, None]
+    normal, inside = np.cross(b - a, c - a), []
+    for at in vertices[tetrahedra[largest]].mean(1) @ turn:
         ways = [(q - p, at - p) for p, q in ((a, b), (b, c), (c, a))]  # seen along the ray
         sides = [np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]) for u, v in ways]
-        above = np.einsum("ij,kij->ki", normal, at - a) * np.sign(normal[:, 2]) < 0
-        inside.append((((sides[0] == sides[1]) & (sides[1] == sides[2]) & above).sum(1) % 2) == 1)
-    tetrahedra = tetrahedra[np.concatenate(inside)]
-    used, corners = np.unique(tetrahedra, return_inverse=True)
-    return vertices[used], corners.reshape(tetrahedra.shape).astype(np.int64)
+        above = ((at - a) * normal).sum(1) * np.sign(normal[:, 2]) < 0
+        inside.append(((sides[0] == sides[1]) & (sides[1] == sides[2]) & above).sum() % 2 == 1)
+    return np.array(inside)
 
 
-def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """With one point for all that lie within 1e-9 of the size (an .stl has three for each triangle), and without triangles
-    that have no area then."""
-    if not np.all(np.isfinite(points[triangles])):
-        raise ValueError("points of the surface must be finite; export it again")
+def places(points: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """The index of the point that lies where each of the points does."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(among).query(points)[1]
+
+
+def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points, triangles, rows of the triangles that stay): with one point for all that lie within 1e-9 of the size (an .stl
+    has three for each triangle), and without triangles that have no area then."""
+    if not len(triangles) or not np.all(np.isfinite(points[triangles])):
+        raise ValueError("points of the surface must be finite, and there must be triangles; export it again")
     used, corners = np.unique(triangles, return_inverse=True)
     points, corners = points[used], corners.reshape(triangles.shape)
     grid = np.round((points - points.min(0)) / (1e-9 * max(float(np.ptp(points, 0).max()), 1e-300)))
     _, first, place = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     triangles = place.ravel()[corners]
-    whole = (triangles != np.roll(triangles, 1, axis=1)).all(1)
-    return points[first], triangles[whole]
+    rows = np.nonzero((triangles != np.roll(triangles, 1, axis=1)).all(1))[0]
+    return points[first], triangles[rows], rows
 
 
-def check_closed(points: np.ndarray, triangles: np.ndarray) -> None:
-    """Each edge belongs to two triangles, or to four, six ... where parts touch."""
+def fault_of(points: np.ndarray, triangles: np.ndarray) -> str | None:
+    """What is wrong with a surface that is not closed, and where: each edge belongs to two triangles, or to four, six ...
+    where parts touch."""
     edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     known, count = np.unique(edges, axis=0, return_counts=True)
     odd = known[count % 2 == 1]
-    if len(triangles) < 4 or len(odd):
-        at = f"; the first is at {np.array2string(points[odd[0]].mean(0), precision=4)}" if len(odd) else ""
-        raise ValueError(
-            f"the surface is not closed: {len(odd)} of {len(known)} edges belong to an odd number of triangles{at}; close "
-            "it (in Blender: select non-manifold edges, fill; in MeshLab: close holes)"
-        )
+    if len(triangles) >= 4 and not len(odd):
+        return None
+    at = f"; the first is at {np.array2string(points[odd[0]].mean(0), precision=4)}" if len(odd) else ""
+    return f"the surface is not closed: {len(odd)} of {len(known)} edges belong to an odd number of triangles{at}"

@@ -22,12 +22,18 @@ def checked_sets(sets: dict | None, count: int, what: str) -> dict[str, np.ndarr
 
 
 def chosen_indices(chosen, sets: dict, count: int, what: str) -> np.ndarray:
-    """Sorted indices from a set's name, several names, indices, or a Boolean mask; ValueError for an unknown name."""
+    """Sorted indices from a set's name, several names, indices, or a Boolean mask; ValueError for an unknown name, and for a
+    set that is empty."""
     names = [chosen] if isinstance(chosen, str) else chosen
     if isinstance(names, (list, tuple)) and names and all(isinstance(name, str) for name in names):
         for name in names:
             if name not in sets:
                 raise ValueError(f"no {what} set is called {name!r}; there are: {', '.join(sets) or 'none'}")
+            if not len(sets[name]):
+                full = ", ".join(other for other, rows in sets.items() if len(rows)) or "none"
+                raise ValueError(
+                    f"the {what} set {name!r} is empty, so that nothing would be chosen by it; sets that are not: {full}"
+                )
         return np.unique(np.concatenate([sets[name] for name in names]))
     return indices_of(chosen, count, what)
 

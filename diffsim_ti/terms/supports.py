@@ -38,6 +38,12 @@ class Supports:
         else:
             self.vertices = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
             self.held = np.tile(np.eye(3), (len(self.vertices), 1, 1))
+        if isinstance(fixed, np.ndarray) and not len(self.vertices):  # the outcome of a choice, not a plain []
+            sets = ", ".join(name for name, rows in mesh.vertex_sets.items() if len(rows)) or "none"
+            raise ValueError(
+                "fixed holds nothing: no vertex was chosen; choose some, name a set that has some "
+                f"({sets}), or pass None for a body that is free"
+            )
         self.wholly = np.linalg.matrix_rank(self.held, tol=1e-6) == 3 if len(self.vertices) else np.zeros(0, bool)
         self.held[self.wholly] = np.eye(3)
 
