@@ -8,7 +8,7 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 
 # area -> files, without test_ and .py
 AREAS = {
-    "meshes, scenes, materials": "mesh exchange locate scene inputs named_sets loads chambers springs muscles "
+    "meshes, scenes, materials": "mesh exchange files locate scene inputs named_sets loads chambers springs muscles "
     "loads_together held_volumes supports materials tensor_calculus open_laws growth growth_over_time surface_drag "
     "rotating_frame laws_with_state viscosity viscous_stages deprecated",
     "motion against closed forms": "reference_motion step_limit mass_scaling unequal_steps energy_watch hertz torture",

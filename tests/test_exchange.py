@@ -2,7 +2,6 @@
 
 import builtins
 import json
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti.cli import app
+from diffsim_ti.mesh import filling
 from diffsim_ti.writers import Frame, open_writer
 
 BOX = ds.TetrahedralMesh.create_box((4, 3, 3), (0.3, 0.2, 0.2))
@@ -71,7 +71,7 @@ def test_surfaces_that_cannot_be_filled(tmp_path, monkeypatch):
     X, surface = MESH.vertices, MESH.surface_triangles
     crossing = np.concatenate([X, X + 0.05]), np.concatenate([surface, surface + len(X)])
     with monkeypatch.context() as gone:
-        gone.setitem(sys.modules, "pytetwild", None)
+        gone.setattr(filling.importlib.util, "find_spec", lambda name: None)
         with pytest.raises(ValueError, match=r"not closed: 3 of .* edges .*the first is at.*pip install .*dirty"):
             fill(X, surface[1:])
         with pytest.raises(ValueError, match="TetGen cannot fill .*self-intersections.* mend it"):

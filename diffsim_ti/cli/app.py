@@ -12,6 +12,7 @@ import typer
 from diffsim_ti import runtime
 from diffsim_ti.cli import options as opt
 from diffsim_ti.cli import study, view
+from diffsim_ti.cli.check import check
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.sweep import sweep
 from diffsim_ti.common import interrupts
@@ -22,13 +23,23 @@ from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, stable_dt
 from diffsim_ti.terms import Drag, Gravity
-from diffsim_ti.verify import check_gradients as check
+from diffsim_ti.verify import check_gradients as judge
 from diffsim_ti.writers import View, writer_for
 from diffsim_ti.writers.adaptive_run import ForwardRun, Interrupted, file_in, run_and_write
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
-for command in (study.chart, study.stability, study.growth, study.recommend, sweep, view.render, view.view, identify):
+for command in (
+    study.chart,
+    study.stability,
+    study.growth,
+    study.recommend,
+    sweep,
+    view.render,
+    view.view,
+    identify,
+    check,
+):
     app.command()(command)
 
 
@@ -206,7 +217,7 @@ def check_gradients(
     scene = Scene(body, law, density, terms, held, initial_velocities=velocities)
     kind = opt.solver_class(solver, implicit=False)
     dt = 0.5 * stable_dt(scene).dt if dt is None else dt
-    report = check(Rollout(kind(scene, dt=dt), steps, gradients="all"))
+    report = judge(Rollout(kind(scene, dt=dt), steps, gradients="all"))
     if not report.passed:
         raise typer.Exit(1)
 

@@ -96,10 +96,10 @@ class Exchange:
     ) -> "Self":
         """The body within a surface, filled by TetGen (`pip install "diffsim-ti[surfaces]"`).
 
-        points [m], shape (n, 3), and triangles, shape (k, 3), of the surface. A closed one keeps all of them; points that
-        coincide become one, and closed parts within others bound cavities. One that is open or meets itself is filled by
-        fTetWild (`pip install "diffsim-ti[dirty]"`), which moves it by up to a thousandth of its size, with a UserWarning
-        that says what is wrong and where.
+        points [m], shape (n, 3), and triangles, shape (k, 3), of the surface. A closed one keeps all of them (cut into
+        parts where size asks for it); points that coincide become one, and closed parts within others bound cavities. One
+        that is open or meets itself is filled by fTetWild (`pip install "diffsim-ti[dirty]"`), which moves it by up to a
+        thousandth of its size, with a UserWarning that says what is wrong and where.
         size: largest edge of tetrahedra [m], about; or cells: edges along the longest side. Default: as large as the
         quality of tetrahedra allows. `from_file` does this for files of surfaces.
 

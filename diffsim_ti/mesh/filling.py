@@ -1,5 +1,10 @@
 """Surfaces filled with tetrahedra: closed ones by TetGen, others by fTetWild (the extras `surfaces` and `dirty`)."""
 
+import importlib.util
+import logging
+import subprocess
+import sys
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -12,6 +17,8 @@ SURFACES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")  # files that hold 
 INSTALL = 'pip install "diffsim-ti[surfaces]"'
 INSTALL_DIRTY = 'pip install "diffsim-ti[dirty]"'
 ELSEWHERE = "or fill it elsewhere, with Gmsh or fTetWild"
+MOST = 2_000_000  # triangles of a surface that is cut
+LONGEST = 600.0  # seconds that fTetWild may take
 CELLS = 20  # edges along the diagonal that fTetWild takes where no size is given
 MEAN_RATIO = 1.5  # largest circumradius over shortest edge
 
@@ -23,7 +30,8 @@ def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarr
         import trimesh
     except ImportError as error:
         raise ValueError(f"files of surfaces are read by trimesh, which is missing: {INSTALL}") from error
-    parts = None
+    parts, log = None, logging.getLogger("trimesh")
+    loud, log.disabled = log.disabled, True  # it writes tracebacks of what it then raises
     try:
         for split in ("split_objects", "split_groups") if path.suffix.lower() == ".obj" else ("",):
             options = dict(maintain_order=True, skip_materials=True, group_material=False) if split else {}
@@ -33,6 +41,8 @@ def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarr
                 parts = [(name, matrix, scene.geometry[geometry]) for name, (matrix, geometry) in found]
     except Exception as error:
         raise ValueError(f"{path}: trimesh cannot read this surface ({error}); check that it is complete") from error
+    finally:
+        log.disabled = loud
     parts = [(name, matrix, part) for name, matrix, part in parts if len(getattr(part, "faces", ()))]
     if not parts:
         raise ValueError(f"{path} holds no triangles; export a surface of triangles")
@@ -52,7 +62,8 @@ def filled_file(path: Path, size: float | None = None, cells: int | None = None)
 def filled(points: np.ndarray, triangles: np.ndarray, parts: dict | None = None, size=None, cells=None) -> tuple:
     """(vertices, tetrahedra, vertex sets, tetrahedron sets, triangles by name) of the body within a surface.
 
-    A closed surface keeps all points and triangles, and closed parts within others bound cavities. One that is open or
+    A closed surface keeps all points and triangles (cut into parts where size asks for it), and closed parts within others
+    bound cavities. One that is open or
     meets itself is filled by fTetWild, which moves it by up to a thousandth of its size, with a UserWarning.
     parts: name -> rows of triangles; these become sets, and what a part bounds alone a tetrahedron set of its name.
     size: edge length that tetrahedra reach at most, about [m]; default as large as their quality allows. cells: the same as
@@ -66,6 +77,9 @@ def filled(points: np.ndarray, triangles: np.ndarray, parts: dict | None = None,
     size = size_of(points, size, cells)
     fault = fault_of(points, triangles)
     if fault is None:
+        if size is not None:
+            points, triangles, of = split_to(points, triangles, size)
+            rows = rows[of]
         try:
             vertices, tetrahedra = by_tetgen(points, triangles, size)
         except RuntimeError as error:
@@ -101,6 +115,43 @@ def size_of(points: np.ndarray, size: float | None, cells: int | None) -> float 
     return size
 
 
+def split_to(points: np.ndarray, triangles: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points, triangles, the triangle that each is a part of) with every edge that is longer than 1.5 sizes cut in two,
+    again and again; neighbours share the cuts."""
+    of = np.arange(len(triangles))
+    while True:
+        edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+        known, place = np.unique(edges, axis=0, return_inverse=True)
+        long = np.linalg.norm(points[known[:, 1]] - points[known[:, 0]], axis=1) > 1.5 * size
+        if not long.any():
+            return points, triangles, of
+        if len(triangles) > MOST:
+            raise ValueError(f"size {size:.3g} m cuts the surface into more than {MOST} triangles; take a larger one")
+        middle = np.full(len(known), -1)
+        middle[long] = len(points) + np.arange(long.sum())
+        points = np.concatenate([points, points[known[long]].mean(1)])
+        cuts, parts, parents = middle[place.ravel()].reshape(-1, 3), [], []
+        for pattern, pieces in CUTS.items():  # which of the edges 01, 12, 20 are cut; a, b, c: their middles
+            own = np.nonzero(((cuts >= 0) == pattern).all(1))[0]
+            nodes = np.concatenate([triangles[own], cuts[own]], 1)
+            for piece in pieces:
+                parts.append(nodes[:, piece])
+                parents.append(of[own])
+        triangles, of = np.concatenate(parts), np.concatenate(parents)
+
+
+CUTS = {  # of corners 0, 1, 2 and middles 3 (of edge 01), 4 (12), 5 (20)
+    (False, False, False): ([0, 1, 2],),
+    (True, False, False): ([0, 3, 2], [3, 1, 2]),
+    (False, True, False): ([0, 1, 4], [0, 4, 2]),
+    (False, False, True): ([0, 1, 5], [1, 2, 5]),
+    (True, True, False): ([3, 1, 4], [0, 3, 4], [0, 4, 2]),
+    (False, True, True): ([4, 2, 5], [0, 1, 4], [0, 4, 5]),
+    (True, False, True): ([0, 3, 5], [3, 1, 2], [3, 2, 5]),
+    (True, True, True): ([0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]),
+}
+
+
 def by_tetgen(points: np.ndarray, triangles: np.ndarray, size: float | None) -> tuple[np.ndarray, np.ndarray]:
     """(vertices, tetrahedra) of all that a closed surface bounds; RuntimeError where triangles meet each other."""
     try:
@@ -117,16 +168,14 @@ def by_tetgen(points: np.ndarray, triangles: np.ndarray, size: float | None) -> 
 
 def by_ftetwild(points: np.ndarray, triangles: np.ndarray, size: float | None, fault: str, parts) -> tuple:
     """(vertices, tetrahedra) of what a surface winds around, with a word about it."""
-    try:
-        import pytetwild
-    except ImportError as error:
+    if importlib.util.find_spec("pytetwild") is None:
         raise ValueError(
             f"{fault}; mend it (in Blender: select non-manifold edges, fill; in MeshLab: close holes), or let fTetWild fill "
             f"it as it is: {INSTALL_DIRTY}"
-        ) from error
+        )
     length = dict(edge_length_fac=1 / CELLS) if size is None else dict(edge_length_abs=size)
-    vertices, tetrahedra = pytetwild.tetrahedralize(points, triangles.astype(np.int32), quiet=True, **length)
-    vertices, tetrahedra = np.asarray(vertices, np.float64), np.asarray(tetrahedra, np.int64)
+    found = in_a_process(FTETWILD, dict(points=points, triangles=triangles.astype(np.int32), **length), fault)
+    vertices, tetrahedra = found["vertices"].astype(np.float64), found["tetrahedra"].astype(np.int64)
     if not len(tetrahedra):
         raise ValueError(f"{fault}; and fTetWild finds no inside; close its holes (in MeshLab: close holes)")
     turned = signed_volumes(edge_matrices(vertices, tetrahedra)) < 0
@@ -140,6 +189,35 @@ def by_ftetwild(points: np.ndarray, triangles: np.ndarray, size: float | None, f
     )
     used, corners = np.unique(tetrahedra, return_inverse=True)
     return vertices[used], corners.reshape(-1, 4).astype(np.int64)
+
+
+FTETWILD = """
+import sys, numpy, pytetwild
+given = dict(numpy.load(sys.argv[1]))
+points, triangles = given.pop("points"), given.pop("triangles")
+vertices, tetrahedra = pytetwild.tetrahedralize(points, triangles, quiet=True, **{k: float(v) for k, v in given.items()})
+numpy.savez(sys.argv[2], vertices=vertices, tetrahedra=tetrahedra)
+"""
+
+
+def in_a_process(script: str, arrays: dict, fault: str) -> dict[str, np.ndarray]:
+    """What a script in a process of its own makes of arrays: fTetWild may end a process on surfaces that are far from
+    closed, or not end at all."""
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = Path(folder) / "given.npz", Path(folder) / "found.npz"
+        np.savez(given, **arrays)
+        command = [sys.executable, "-c", script, str(given), str(found)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST, cwd=folder)
+        except subprocess.TimeoutExpired as error:
+            raise ValueError(
+                f"{fault}; and fTetWild did not fill it within {LONGEST:g} s; mend it, {ELSEWHERE}, or pass a larger size"
+            ) from error
+        if done.returncode or not found.exists():
+            said = (done.stderr.strip().splitlines() or [f"it ended with {done.returncode}"])[-1]
+            raise ValueError(f"{fault}; and fTetWild cannot fill it ({said}); mend it, {ELSEWHERE}")
+        with np.load(found) as data:
+            return dict(data)
 
 
 def regions(tetrahedra: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import warnings
 from collections.abc import Iterable
 from functools import cached_property
 
@@ -13,6 +14,7 @@ from diffsim_ti.common.checked import instance, listed
 from diffsim_ti.common.origin import warn_of_rounding
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
+from diffsim_ti.mesh.doctor import COINCIDING, Findings, coinciding, coinciding_of_pieces, counted, findings
 from diffsim_ti.mesh.elements import Elements
 from diffsim_ti.mesh.exchange import Exchange
 from diffsim_ti.mesh.grid import box
@@ -76,6 +78,13 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         self._surface_sets = checked_sets(on_surface, len(self._surface_triangles), "surface")
         checks.warn_of_orphans(self.unused_vertices)
         checks.warn_of_slivers(self)
+        if twice := coinciding_of_pieces(self.vertices, self.elements):
+            warnings.warn(
+                f"{counted(twice, 'vertex coincides', 'vertices coincide')} with others of another piece "
+                f"({self.num_pieces} pieces): if these are one body, take mesh.merged(); where they are meant to touch, "
+                "TetrahedralMesh.joined says so",
+                stacklevel=2,
+            )
         warn_of_rounding("vertices", given, self, "give them in float64")
 
     @classmethod
@@ -122,7 +131,9 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         if not meshes:
             raise ValueError("joined needs at least one mesh, got none")
         vertices, tetrahedra, sets = join(meshes)
-        return cls(vertices, tetrahedra, **sets)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "[0-9]+ (vertex coincides|vertices coincide)")
+            return cls(vertices, tetrahedra, **sets)
 
     # What it consists of
 
@@ -224,6 +235,23 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         """
         return locate(self, points, nearest)
 
+    # Joining what coincides
+
+    def merged(self, tolerance: float | None = None) -> "TetrahedralMesh":
+        """With one vertex for all that lie within tolerance [m] of each other, by default 1e-9 of the size: parts whose
+        faces have the same nodes become one body. Sets are kept. ValueError where a tetrahedron would lose a vertex."""
+        size = float(np.ptp(self.bounding_box, 0).max())
+        if tolerance is None:
+            tolerance = COINCIDING * size
+        if not (np.isfinite(tolerance) and tolerance > 0):
+            raise ValueError(f"tolerance must be a length above 0 [m], got {tolerance!r}")
+        first = coinciding(self.vertices, tolerance)
+        kept, place = np.unique(first, return_inverse=True)
+        triangles = {name: place[self.surface_triangles[rows]] for name, rows in self.surface_sets.items()}
+        sets = {name: np.unique(place[rows]) for name, rows in self.vertex_sets.items()}
+        sets = dict(vertex_sets=sets, tetrahedron_sets=dict(self.tetrahedron_sets), surface_sets=triangles)
+        return type(self)(self.vertices[kept], place[self.elements], **sets)
+
     # Moving
 
     def translated(self, offset: ArrayLike) -> "TetrahedralMesh":
@@ -251,6 +279,14 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         return self._moved((self.vertices - center) @ R.T + center)
 
     # Describing
+
+    def check(self) -> Findings:
+        """What may be wrong with it, with a remedy for each: nodes that coincide, faces that touch without common nodes,
+        hinges, slivers and what they cost, vertices in no tetrahedron, sets that are empty or overlap, lengths that look
+        like millimetres, and float32 far from the origin. `print(mesh.check())` lists them; the command
+        `diffsim-ti check body.msh` does so of files, those that are refused too."""
+        sets = {name: self.surface_triangles[rows] for name, rows in self.surface_sets.items()}
+        return findings((self.vertices, self.elements, self.vertex_sets, self.tetrahedron_sets, sets))
 
     def describe(self) -> str:
         """Counts, size, edge lengths, worst tetrahedron, sets; a few lines."""
