@@ -76,6 +76,10 @@ def filled(points: np.ndarray, triangles: np.ndarray, parts: dict | None = None,
     points, triangles, rows = welded(points, triangles)
     size = size_of(points, size, cells)
     fault = fault_of(points, triangles)
+    if fault is not None:  # some may stand there twice
+        _, once = np.unique(np.sort(triangles, 1), axis=0, return_index=True)
+        if fault_of(points, triangles[np.sort(once)]) is None:
+            triangles, rows, fault = triangles[np.sort(once)], rows[np.sort(once)], None
     if fault is None:
         if size is not None:
             points, triangles, of = split_to(points, triangles, size)
