@@ -14,10 +14,12 @@ import typer
 from diffsim_ti.cli.app import app
 
 ROOT = Path(__file__).parent.parent
-PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "examples/README.md", "tests/README.md")}
+GUIDES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "examples/guides").glob("*.md"))
+PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "examples/README.md", "tests/README.md", *GUIDES)}
 BLOCKS = [
     pytest.param(*block, id=f"{page.removesuffix('README.md')}block{k}")
     for page, text in PAGES.items()
+    if page not in GUIDES
     for k, block in enumerate(re.findall(r"```python\n(.*?)```(?:\s*```text\n(.*?)```)?", text, re.DOTALL))
 ]
 
@@ -53,6 +55,14 @@ def test_code_block_runs_and_prints_what_is_shown(code, printed, tmp_path, monke
             a, b = a[:2], b[:2]
         assert a == pytest.approx(b, rel=2e-5), (line, expected)
     assert len(got.splitlines()) >= len(printed.splitlines())
+
+
+@pytest.mark.parametrize("page", GUIDES)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_guide_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert len(PAGES[page].splitlines()) <= 150
+    run("\n".join(re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL)))
 
 
 def without_blocks(text: str) -> str:
