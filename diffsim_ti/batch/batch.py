@@ -15,6 +15,7 @@ from diffsim_ti.batch.taped import BatchTapeAdapter
 from diffsim_ti.common.checked import as_numbers, instance, whole
 from diffsim_ti.common.copies import made_again
 from diffsim_ti.common.origin import positions_of
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh.collision_surface import BOWED
 from diffsim_ti.mesh.face_points import bow, bows
@@ -27,7 +28,7 @@ from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
 
 
-class Batch:
+class Batch(metaclass=Public):
     """`scenes` runs of a solver's scene simultaneously, with numbers of their own where they are given with a leading axis.
 
     solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import as_numbers
+from diffsim_ti.common.public import Public
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.watch import ContactResolution
@@ -36,7 +37,7 @@ class LazyFrames(Sequence):
         return list, (list(self),)
 
 
-class BatchFrames(Sequence):
+class BatchFrames(Sequence, metaclass=Public):
     """Saved states of many scenes: positions [m], velocities [m/s], displacements [m], (scenes, frames, n, 3).
 
     `frames[b]` are those of scene b (`Frames`), `frames["name"]` any output of all scenes, (scenes, ...). alive: (scenes,),

@@ -7,10 +7,11 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers, wholes
 from diffsim_ti.common.origin import rounding_of
+from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Frames, Rollout
 
 
-class Measurement:
+class Measurement(metaclass=Public):
     """Values d of an output y of a rollout, with independent normal noise of standard deviation `noise`.
 
     output: "positions", "velocities", "displacements" or the name of one of the rollout's outputs. values: NaN where a

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.common.checked import instance, whole
+from diffsim_ti.common.public import Public
 from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.scene import Scene
 
@@ -19,7 +20,7 @@ class _Frequencies:
         return (self.k,)
 
 
-class ModalTest:
+class ModalTest(metaclass=Public):
     """An experiment for `identify` whose data are the k lowest frequencies [Hz] of small vibrations about the rest shape.
 
         r_i = (f_i(x) - d_i) / noise,        df = phi . (dK - lambda dM) phi / (8 pi^2 f)    (`modes`, in float64)

@@ -1,9 +1,10 @@
 """A material: a law with its numbers."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 
 import numpy as np
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.materials import moduli
 from diffsim_ti.mesh import TetrahedralMesh
@@ -11,7 +12,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
 
 
-class Material(ABC):
+class Material(metaclass=Public):
     """A law and its numbers, in one of these spellings, never two at once:
 
     (E, nu) or youngs_modulus= or E= [Pa], > 0, and poissons_ratio= or nu= [-], in (-1, 0.5): those of small strains,

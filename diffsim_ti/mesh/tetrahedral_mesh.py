@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance, listed
 from diffsim_ti.common.origin import warn_of_rounding
+from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.elements import Elements
@@ -26,7 +27,7 @@ CONNECTIVITY = (  # what stays when vertices move
 )
 
 
-class TetrahedralMesh(Exchange, NamedSets, Elements):
+class TetrahedralMesh(Exchange, NamedSets, Elements, metaclass=Public):
     """Tetrahedra of four or ten nodes at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
 
     vertices: positions [m], shape (num_vertices, 3).

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import shown
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
@@ -16,7 +17,7 @@ SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to whic
 
 
 @dataclass(eq=False)
-class Modes:
+class Modes(metaclass=Public):
     """frequencies [Hz], ascending, shape (k,), negative where the state is unstable (lambda < 0: -sqrt(-lambda) / 2 pi);
     eigenvalues lambda = (2 pi f)^2 [1/s^2]; shapes [1/sqrt(kg)], (k, num_vertices, 3), with shapes_i . M shapes_j = 1 where
     i = j, else 0; groups: lists of modes whose frequencies coincide, whose mean alone has a gradient;

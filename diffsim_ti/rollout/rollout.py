@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.common.checked import as_numbers, instance, listed, shape_of, shown
 from diffsim_ti.common.copies import made_again
 from diffsim_ti.common.origin import positions_of
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
@@ -23,7 +24,7 @@ from diffsim_ti.state.schedule import UnequalSteps
 from diffsim_ti.state.solve_report import SolveReport
 
 
-class Rollout:
+class Rollout(metaclass=Public):
     """n steps of a solver from given inputs, with saved frames and gradients of everything that went in.
 
     solver: any solver; its scene names the inputs (`rollout.inputs`): initial_positions, initial_velocities,

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance, numbers, whole
 from diffsim_ti.common.origin import positions_of
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
@@ -21,7 +22,7 @@ from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import ExternalForce
 
 
-class Simulator:
+class Simulator(metaclass=Public):
     """Advances a scene step by step and shows its state.
 
     `Simulator(solver)`, or, for a solver made without a scene, `Simulator(mesh, material, solver)`. contact_forces: note in

@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from abc import ABC
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import number, shown, whole
+from diffsim_ti.common.public import Public
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.monitor import stability
 from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-class Solver(ABC):
+class Solver(metaclass=Public):
     """Advances a scene by steps of dt [s], each divided into `substeps` equal substeps.
 
     parallel: each substep on all threads, or many of them in a row on one; None chooses by size.

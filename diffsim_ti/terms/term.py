@@ -9,6 +9,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.runtime import number_type
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-class Term(ABC):
+class Term(metaclass=Public):
     """A load, contact or damping: its inputs, in SI units and float64, and how kernels come to read them.
 
     name: a word that its inputs' names begin with, "floor.stiffness"; without one they have plain names,
