@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import numbers, present
 from diffsim_ti.common.public import Public
@@ -42,7 +43,7 @@ class Anchor(metaclass=Public):
         return f"Anchor({self.position.tolist()})"
 
 
-Point = int | str | ArrayLike | Anchor  # vertices, material points as places at rest, anchors
+Point = TypeAliasType("Point", int | str | ArrayLike | Anchor)  # vertices, material points as places at rest, anchors
 
 
 class LineTerm(OnMesh, Term):

@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
@@ -43,10 +45,21 @@ class Ground(Obstacle):
 
     counterpart = GroundForce
 
-    def __init__(self, height: float = 0.0, stiffness: float | None = None, width: float = 0.01, **options):
-        super().__init__(
-            [Input("height", height, ((),), "m", plain="ground_height", axes="y")], stiffness, width, **options
-        )
+    def __init__(
+        self,
+        height: float = 0.0,
+        stiffness: float | None = None,
+        width: float = 0.01,
+        friction: float = 0.0,
+        friction_speed: float = 1e-3,
+        path: Motion | None = None,
+        name: str | None = None,
+        stiffness_per_area: float | None = None,
+        about: ArrayLike | None = None,
+    ):
+        shape = [Input("height", height, ((),), "m", plain="ground_height", axes="y")]
+        contact = stiffness, width, friction, friction_speed, path, name, stiffness_per_area, about
+        super().__init__(shape, *contact)
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         return positions[:, 1] - float(self.values["ground_height"])
