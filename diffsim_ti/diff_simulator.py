@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.origin import middle_far_part, warn_of_rounding
+from diffsim_ti.common.public import Public
 from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial, refuse_state
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import stability
@@ -28,7 +29,7 @@ from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
 __all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "rollout_frames"]
 
 
-class DifferentiableSolver:
+class DifferentiableSolver(metaclass=Public):
     """How a DifferentiableSimulator steps: any solver with inertia, symplectic Euler unless said otherwise.
 
     dt [s]; gravity [m/s^2]: a number along y, 3 numbers, or a tensor of either (with gradient); damping: the share of
@@ -75,7 +76,7 @@ class DifferentiableSolver:
         return g
 
 
-class DifferentiableSimulator:
+class DifferentiableSimulator(metaclass=Public):
     """Steps a soft body through torch's graph: positions and velocities are tensors with gradients to all that went in.
 
     material: DifferentiableMaterial, SpatiallyVaryingMaterial or another TorchMaterial (diff_physics); density [kg/m^3]:

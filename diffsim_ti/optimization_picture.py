@@ -93,7 +93,7 @@ def save_optimization(
     plane: str = "xy",
     size: tuple[int, int] = (960, 320),
 ) -> None:
-    """Write `optimization_figure` of the arguments in the format of the suffix (PNG, SVG, PDF ...)."""
+    """Write `optimization_figure` of the arguments, positions in [m], in the format of the suffix (PNG, SVG, PDF ...)."""
     figure = optimization_figure(losses, parameters, mesh, found, target, start, truth, loss_label, plane, size)
     figure.savefig(path)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.common.public import public
 from diffsim_ti.rollout import Rollout
 
 
@@ -33,6 +34,7 @@ class Identifiability:
         return "\n".join(lines)
 
 
+@public
 def identifiability(
     rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values
 ) -> Identifiability:

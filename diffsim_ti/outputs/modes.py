@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import shown
-from diffsim_ti.common.public import Public
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
@@ -134,6 +134,7 @@ def free_directions(scene: Scene):
     return out
 
 
+@public
 def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values) -> Modes:
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.copies import made_again
+from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 
@@ -51,7 +52,7 @@ class FrameLoss:
 
 
 @dataclass(frozen=True)
-class Problem:
+class Problem(metaclass=Public):
     """What is computed, over how long, and against what it is measured.
 
     scene(cells, pattern, precision, **element) -> Scene, on a mesh of so many cells across.

@@ -1,6 +1,5 @@
 """What a term is: a load, a contact or a damping that a scene lists, inlined into the step at compile time."""
 
-from abc import ABC
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -162,7 +161,7 @@ class OnSurface:
 
 
 @dataclass(frozen=True)
-class VertexForce(ABC):
+class VertexForce(metaclass=Public):
     """Device counterpart of a term: Taichi functions of one vertex, at rest position X, displacement u, velocity v.
 
     Vectors have four components, the last zero. Equal counterparts share compiled kernels, and those of one scene a loop.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
@@ -22,7 +23,7 @@ from diffsim_ti.visual.scene_marks import marks_of
 
 
 @dataclass
-class Setting:
+class Setting(metaclass=Public):
     """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand.
 
     held: of fixed vertices the projectors onto the directions in which each is fixed, shape (len(fixed), 3, 3), where some
@@ -43,7 +44,7 @@ class Setting:
 
 
 @dataclass
-class Frame:
+class Frame(metaclass=Public):
     """A moment of a run.
 
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
