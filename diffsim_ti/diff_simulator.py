@@ -9,16 +9,18 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
 from diffsim_ti.common.origin import middle_far_part, warn_of_rounding
-from diffsim_ti.common.public import Public
+from diffsim_ti.common.public import Public, check_options
 from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial, refuse_state
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
+from diffsim_ti.solvers.solver import SolverOptions
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
@@ -50,7 +52,7 @@ class DifferentiableSolver(metaclass=Public):
         damping: float = 1.0,
         substeps: int = 1,
         method: type[Solver] = SemiImplicitSolver,
-        **options,
+        **options: Unpack[SolverOptions],
     ):
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
@@ -62,6 +64,7 @@ class DifferentiableSolver(metaclass=Public):
             raise ValueError(
                 "method: StaticSolver has no steps; use rollout_frames(Rollout(StaticSolver(scene), 1), ...)"
             )
+        check_options(type(self).__name__, method, options)
         self.method, self.options = method, options
         self.dt, self.gravity, self.damping, self.substeps = float(dt), gravity, float(damping), int(substeps)
 

@@ -13,6 +13,7 @@ from diffsim_ti.common.differences import CentralDifferences, TaylorResult, cent
 from diffsim_ti.common.public import public
 from diffsim_ti.identification import Identifiability, identifiability
 from diffsim_ti.inputs import RunSize
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.solvers import NotConverged
 
@@ -69,7 +70,9 @@ def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
 
 
 @public
-def dot_product_test(rollout: Rollout, inputs: Iterable[str] | None = None, seed: int = 0, **values) -> float:
+def dot_product_test(
+    rollout: Rollout, inputs: Iterable[str] | None = None, seed: int = 0, **values: InputValue
+) -> float:
     """Relative difference of <w, J v> and <J^T w, v> for random v in all inputs and random w in all frames.
 
     Further outputs of the rollout are tried each by itself, since they have other units; the largest difference counts.
@@ -445,7 +448,7 @@ def gradient_health(rollout: Rollout, limit: float = 1e10) -> GradientHealth:
 
 
 @public
-def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: float = 1e-5, **values) -> dict:
+def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: float = 1e-5, **values: InputValue) -> dict:
     """Hessian of the loss times a direction over some inputs, by central differences of exact gradients.
 
     direction: input name -> change of that input. Error O(epsilon^2) of the direction as given; use f64.

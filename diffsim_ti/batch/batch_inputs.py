@@ -7,6 +7,7 @@ import numpy as np
 from diffsim_ti.batch.set_values import spread_scenes
 from diffsim_ti.batch.sweep import BatchValues, Own, value_of
 from diffsim_ti.common.checked import as_numbers
+from diffsim_ti.common.names import no_such
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.set_values import change_like
 from diffsim_ti.scene import Scene
@@ -26,7 +27,7 @@ def checked_values(one: Rollout, given: dict, scenes: int) -> dict:
     inputs, out = one.scene.inputs, BatchValues(one.values)
     unknown = [name for name in given if name not in one.inputs]
     if unknown:
-        raise ValueError(f"no input named {unknown[0]!r}; this batch has {', '.join(one.inputs)}")
+        raise ValueError(no_such("input", unknown[0], one.inputs, "this batch"))
     for name, value in given.items():
         inputs.warn_if_coarse(name, value)
         if isinstance(value, Own) or _is_own(one, name, value := as_numbers(name, value), scenes):

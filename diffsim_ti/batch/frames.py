@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import as_numbers
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.public import Public
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.run import Run
@@ -75,7 +76,7 @@ class BatchFrames(Sequence, metaclass=Public):
             known = dict(positions=self.positions, velocities=self.velocities, displacements=self.displacements)
             known |= self.outputs
             if key not in known:
-                raise KeyError(f"no output named {key!r}; there are {', '.join(known)}")
+                raise KeyError(no_such("output", key, known, "this run"))
             return known[key]
         return self._frames[key]
 

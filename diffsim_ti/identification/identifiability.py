@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.public import public
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Rollout
 
 
@@ -36,7 +38,7 @@ class Identifiability:
 
 @public
 def identifiability(
-    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values
+    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values: InputValue
 ) -> Identifiability:
     """Which inputs can be recovered from the frames' positions: eigenvalues and directions of the Fisher matrix J^T J.
 
@@ -52,7 +54,7 @@ def identifiability(
     columns, labels = [], []
     for name in names:
         if name not in frames.inputs:
-            raise ValueError(f"identifiability: no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
+            raise ValueError("identifiability: " + no_such("input", name, rollout.inputs, "this rollout"))
         value = np.asarray(frames.inputs[name])
         if not np.any(value):
             raise ValueError(f"identifiability: {name} is zero, so that relative changes of it mean nothing")

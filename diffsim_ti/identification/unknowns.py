@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers, shape_of, shown
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
 
@@ -78,8 +79,7 @@ class Free:
         if self.input == TIME_OFFSET:
             return np.zeros((), int)
         if self.input not in rollout.inputs:
-            known = ", ".join(rollout.inputs)
-            raise ValueError(f"{self.label}: no input named {self.input!r}; this rollout has {known}")
+            raise ValueError(f"{self.label}: {no_such('input', self.input, rollout.inputs, 'this rollout')}")
         if regions is None:
             shape = rollout.values[self.input].shape
             each = self.unknown.start.ndim > 0 and self.unknown.start.shape == shape

@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import as_numbers, numbers
 from diffsim_ti.common.public import Public
 
 # lengths: numbers, or "vertices", "tetrahedra" of the mesh, "steps", "steps + 1" of a run
 Shape = tuple[int | str, ...]
+# of an input in the place of the scene's own: numbers of its shape, or {named set: number}
+InputValue = TypeAliasType("InputValue", ArrayLike | Mapping[str, ArrayLike])
 
 
 @dataclass(frozen=True)

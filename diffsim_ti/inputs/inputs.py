@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import FAR, ROUNDING, far_part, warn_of_rounding
 from diffsim_ti.common.rows import Rows
 from diffsim_ti.inputs import links
@@ -245,7 +246,7 @@ class Inputs:
         """Float64 arrays of the right shapes, or ValueError naming expected and got."""
         unknown = [name for name in values if name not in self.described]
         if unknown:
-            raise ValueError(f"no input named {unknown[0]!r}; this scene has {', '.join(self.described)}")
+            raise ValueError(no_such("input", unknown[0], self.described, "this scene"))
         return {name: self.described[name].checked(name, value, self.sizes) for name, value in values.items()}
 
     def warn_if_coarse(self, name: str, given) -> None:

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import shown
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.inputs import StressPoints
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.outputs.body_forces import BodyForces
@@ -135,7 +136,7 @@ def free_directions(scene: Scene):
 
 
 @public
-def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values) -> Modes:
+def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values: InputValue) -> Modes:
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
 
     K: `scene.stiffness_matrix(displacements)`, of the body's stress, springs, cables and foundations at displacements [m]

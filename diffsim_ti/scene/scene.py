@@ -2,9 +2,11 @@
 
 from collections.abc import Iterable, Mapping
 from copy import copy
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import as_numbers, instance, listed, numbers
@@ -34,6 +36,23 @@ __all__ = ["LOCKING_RATIO", "Scene"]
 def _kind(term) -> tuple:
     """What kernels go through terms by: obstacles last, each kind's together, so that the order of a list means nothing."""
     return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
+
+
+class SceneArguments(TypedDict, total=False):
+    """What `Scene` takes, by name: what `Scene.replace` and `Rollout.with_scene` replace."""
+
+    mesh: TetrahedralMesh
+    material: Material
+    density: ArrayLike
+    terms: Term | Iterable[Term]
+    fixed: Fixed | None
+    motion: Motion | Pose | Mapping[str, Motion | Pose] | None
+    initial_positions: ArrayLike | None
+    initial_velocities: ArrayLike | None
+    precision: str | None
+    volume: str
+    mass_scaling: float | None
+    reduced: Mapping[str, str | ArrayLike] | None
 
 
 class Scene(MadeAgain):
@@ -176,7 +195,7 @@ class Scene(MadeAgain):
         count = next(iter(lengths.values()))
         return [self.with_values({name: x[b] for name, x in own.items()}) for b in range(count)]
 
-    def replace(self, **changes) -> "Scene":
+    def replace(self, **changes: Unpack[SceneArguments]) -> "Scene":
         """A scene with some arguments replaced."""
         return Scene(**self.arguments | changes)
 

@@ -3,10 +3,11 @@
 import math
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import number, shown, whole
@@ -18,6 +19,23 @@ from diffsim_ti.state.schedule import EqualSteps, Schedule, UnequalSteps
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
+
+
+class SolverOptions(TypedDict, total=False):
+    """What solvers take besides the scene; each takes those that its constructor names."""
+
+    dt: float
+    substeps: int
+    load_steps: int
+    parallel: bool | None
+    allow_unstable: bool
+    check_start: bool
+    contact: str
+    contact_damping: float
+    viscous_stages: int
+    tolerance: float
+    max_iterations: int
+    preconditioner: str
 
 
 class Solver(metaclass=Public):
@@ -86,7 +104,7 @@ class Solver(metaclass=Public):
         own = dict(scene=self.scene) | {name: getattr(self, name) for name in self.arguments}
         return _on_schedule, (type(self), own, self._schedule)
 
-    def for_scene(self, scene: "Scene", **changes) -> "Solver":
+    def for_scene(self, scene: "Scene", **changes: Unpack[SolverOptions]) -> "Solver":
         """The same solver for another scene, with some arguments replaced."""
         return type(self)(scene, **{name: getattr(self, name) for name in self.arguments} | changes)
 

@@ -93,8 +93,8 @@ class Frame(metaclass=Public):
         return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
 
     @classmethod
-    def of(cls, simulator: Simulator, outputs: Iterable[Output] = (), last: Simulator | None = None, **more) -> "Frame":
-        """The present state of a simulator, in its scene's precision. more: further arguments of the class.
+    def of(cls, simulator: Simulator, outputs: Iterable[Output] = (), last: Simulator | None = None) -> "Frame":
+        """The present state of a simulator, in its scene's precision.
 
         outputs: become fields as in `of_run`; last: the simulator that took the last step to this state, if another did.
         """
@@ -107,7 +107,7 @@ class Frame(metaclass=Public):
         by = last or simulator
         shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)
         shown |= _loads(scene, x, simulator.step_count, simulator.values_of_step)
-        return cls(simulator.time, x, u, v, fields | shown, moved, **dict(marks=drawn, units=units) | more)
+        return cls(simulator.time, x, u, v, fields | shown, moved, marks=drawn, units=units)
 
 
 def _strained(scene: Scene, frames: Frames, k: int) -> dict[str, np.ndarray]:
