@@ -1,6 +1,6 @@
 """The inputs of a scene: names, values, and what kernels read of them, with derivatives both ways."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,7 +81,18 @@ class Inputs:
 
     `values`: dict of float64 arrays, read-only. Names: initial_positions, initial_velocities, the material's own inputs,
     density, rest_positions, and those of the terms. prescribed_motion and paths of obstacles join per run, sampled at its
-    steps. `described`: {name: Input}, those too.
+    steps. `described`: {name: Input}, those too. Going through it gives the names; printed it is a table of names, shapes,
+    units and, of single numbers, values.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3)).inputs
+    initial_positions   (8, 3)  m
+    initial_velocities  (8, 3)  m/s
+    youngs_modulus      ()      Pa      100000
+    poissons_ratio      ()      -       0.3
+    density             ()      kg/m^3  1000
+    rest_positions      (8, 3)  m
     """
 
     def __init__(
@@ -116,6 +127,19 @@ class Inputs:
         self.away = self._away()
         self.keyed = [(named[term][term.plain], term) for term in scene.ordered_terms if term.keyed]
         self.chain = Chain(self._links(named), self.described)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.described)
+
+    def __repr__(self) -> str:
+        rows = []
+        for name, i in self.described.items():
+            value = self.values.get(name)
+            shape = value.shape if value is not None else i.shapes[0]
+            words = f"({', '.join(map(str, shape))})"
+            rows.append((name, words, i.unit or "-", f"{float(value):g}" if value is not None and value.size == 1 else ""))
+        wide = [max(len(row[k]) for row in rows) for k in range(3)]
+        return "\n".join("  ".join([*(x.ljust(n) for x, n in zip(row, wide)), row[3]]).rstrip() for row in rows)
 
     def _of_body(self, density, positions, velocities) -> list[Input]:
         """What every scene has: its start, its material's numbers, its density."""

@@ -37,7 +37,6 @@ class TaichiOptions(TypedDict, total=False):
     """Options of `ti.init` that are of use here; it takes its others, too."""
 
     advanced_optimization: bool
-    cpu_max_num_threads: int
     debug: bool
     device_memory_fraction: float
     device_memory_GB: float
@@ -94,7 +93,7 @@ def init(
             raise ValueError(f"{name} cannot be chosen: diffsim_ti needs default_fp=f64 and fast_math=False")
         if name not in _OF_TAICHI and not hasattr(impl.default_cfg(), name):
             near = nearest(name, ["arch", "precision", "threads", *TaichiOptions.__annotations__])
-            meant = f"; did you mean {near!r}?" if near else ""
+            meant = f" (did you mean {near!r}?)" if near else ""
             raise TypeError(
                 f"init has no argument {name!r}, and neither has ti.init{meant}: pass "
                 f"arch={', '.join(map(repr, _ARCHS))}, precision, threads, or an option of ti.init such as debug=True"
