@@ -15,7 +15,7 @@ from abc import ABCMeta
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from inspect import Parameter, Signature
-from typing import TYPE_CHECKING, ForwardRef, ParamSpec, TypeVar, Union, get_args, get_origin, is_typeddict
+from typing import TYPE_CHECKING, ForwardRef, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, is_typeddict
 
 from numpy.typing import ArrayLike
 from typing_extensions import TypeAliasType
@@ -182,6 +182,8 @@ def _words(kind: object) -> str:
     if isinstance(kind, TypeAliasType):
         return kind.__name__
     origin, parts = get_origin(kind), list(get_args(kind))
+    if origin is Literal:
+        return " | ".join(map(repr, parts))
     if isinstance(kind, list):
         return f"[{', '.join(map(_words, kind))}]"
     if origin in (Union, types.UnionType):

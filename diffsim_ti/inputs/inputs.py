@@ -137,7 +137,9 @@ class Inputs:
             value = self.values.get(name)
             shape = value.shape if value is not None else i.shapes[0]
             words = f"({', '.join(map(str, shape))})"
-            rows.append((name, words, i.unit or "-", f"{float(value):g}" if value is not None and value.size == 1 else ""))
+            rows.append(
+                (name, words, i.unit or "-", f"{float(value):g}" if value is not None and value.size == 1 else "")
+            )
         wide = [max(len(row[k]) for row in rows) for k in range(3)]
         return "\n".join("  ".join([*(x.ljust(n) for x, n in zip(row, wide)), row[3]]).rstrip() for row in rows)
 

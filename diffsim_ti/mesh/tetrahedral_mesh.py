@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Iterable
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -81,7 +82,11 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, metaclass=Public):
 
     @classmethod
     def create_cube(
-        cls, resolution: int = 5, size: float = 1.0, pattern: str = "kuhn", device: str | None = None
+        cls,
+        resolution: int = 5,
+        size: float = 1.0,
+        pattern: Literal["kuhn", "five"] = "kuhn",
+        device: str | None = None,
     ) -> "TetrahedralMesh":
         """The cube [0, size]^3 [m], all of it filled; `resolution` counts vertices a side. See `create_box`.
 
@@ -92,7 +97,11 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, metaclass=Public):
 
     @classmethod
     def create_box(
-        cls, resolution: ArrayLike = 5, size: ArrayLike = 1.0, pattern: str = "kuhn", origin: ArrayLike = (0, 0, 0)
+        cls,
+        resolution: ArrayLike = 5,
+        size: ArrayLike = 1.0,
+        pattern: Literal["kuhn", "five"] = "kuhn",
+        origin: ArrayLike = (0, 0, 0),
     ) -> "TetrahedralMesh":
         """A box on a regular grid, with vertex sets and surface sets xmin, xmax, ymin, ymax, zmin, zmax.
 

@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import warnings
 import weakref
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 import taichi as ti
@@ -62,7 +62,10 @@ def _has_arch(name: str) -> bool:
 
 
 def init(
-    arch: str = "cpu", precision: str = "f32", threads: int | None = None, **options: Unpack[TaichiOptions]
+    arch: Literal["cpu", "cuda", "vulkan"] = "cpu",
+    precision: Literal["f32", "f64"] = "f32",
+    threads: int | None = None,
+    **options: Unpack[TaichiOptions],
 ) -> None:
     """Start Taichi for this process: a thin front of `ti.init`, and the only place that calls it.
 

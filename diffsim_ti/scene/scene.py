@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from copy import copy
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,8 +49,8 @@ class SceneArguments(TypedDict, total=False):
     motion: Motion | Pose | Mapping[str, Motion | Pose] | None
     initial_positions: ArrayLike | None
     initial_velocities: ArrayLike | None
-    precision: str | None
-    volume: str
+    precision: Literal["f32", "f64"] | None
+    volume: Literal["tetrahedra", "patches"]
     mass_scaling: float | None
     reduced: Mapping[str, str | ArrayLike] | None
 
@@ -110,8 +110,8 @@ class Scene(MadeAgain):
         motion: Motion | Pose | Mapping[str, Motion | Pose] | None = None,
         initial_positions: ArrayLike | None = None,
         initial_velocities: ArrayLike | None = None,
-        precision: str | None = None,
-        volume: str = "tetrahedra",
+        precision: Literal["f32", "f64"] | None = None,
+        volume: Literal["tetrahedra", "patches"] = "tetrahedra",
         mass_scaling: float | None = None,
         reduced: Mapping[str, str | ArrayLike] | None = None,
     ):

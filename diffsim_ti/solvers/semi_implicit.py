@@ -1,6 +1,6 @@
 """Symplectic Euler, the seeds' semi-implicit solver."""
 
-from typing import TypedDict, overload
+from typing import Literal, TypedDict, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +30,7 @@ class SemiImplicitOptions(TypedDict, total=False):
     parallel: bool | None
     allow_unstable: bool
     check_start: bool
-    contact: str
+    contact: Literal["stage", "force"]
     contact_damping: float
 
 
@@ -67,7 +67,7 @@ class SemiImplicitSolver(ExplicitSolver):
         allow_unstable: bool = False,
         check_start: bool = True,
         *,
-        contact: str = "stage",
+        contact: Literal["stage", "force"] = "stage",
         contact_damping: float = CONTACT_DAMPING,
         viscous_stages: int = 1,
     ): ...
@@ -84,7 +84,7 @@ class SemiImplicitSolver(ExplicitSolver):
         parallel: bool | None = None,
         allow_unstable: bool = False,
         *,
-        contact: str = "stage",
+        contact: Literal["stage", "force"] = "stage",
         contact_damping: float = CONTACT_DAMPING,
         viscous_stages: int = 1,
     ): ...

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,12 +30,12 @@ class SolverOptions(TypedDict, total=False):
     parallel: bool | None
     allow_unstable: bool
     check_start: bool
-    contact: str
+    contact: Literal["stage", "force"]
     contact_damping: float
     viscous_stages: int
     tolerance: float
     max_iterations: int
-    preconditioner: str
+    preconditioner: Literal["auto", "block_jacobi", "multigrid"]
 
 
 class Solver(metaclass=Public):

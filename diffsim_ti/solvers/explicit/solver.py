@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -88,7 +88,7 @@ class ExplicitSolver(Solver):
         allow_unstable: bool = False,
         check_start: bool = True,
         *,
-        contact: str = "stage",
+        contact: Literal["stage", "force"] = "stage",
         contact_damping: float = CONTACT_DAMPING,
     ):
         if contact not in ("stage", "force"):
