@@ -45,6 +45,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import (
+    CenterOfMass,
     ChamberPressure,
     ContactForce,
     ContactTraction,
@@ -119,6 +120,7 @@ __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", 
 __all__ += ["ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Rollout", "Frames", "Batch"]
 __all__ += ["BatchFrames", "Ensemble", "UnequalSteps", "adaptive_steps", "SolveReport", "Divergence", "Crossing"]
 __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPoints", "ContactForce"]
+__all__ += ["CenterOfMass"]
 __all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 
 import numpy as np
@@ -108,20 +108,30 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         return mesh._changed(_surface_sets=checked_sets(rows, len(corners), "surface"))
 
     @classmethod
-    def joined(cls, meshes: Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":
+    def joined(cls, meshes: Mapping[str, "TetrahedralMesh"] | Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":
         """Several bodies as one mesh of several pieces, one after the other.
 
-        Sets of the same name become one, and what each body has of them is "body_0_xmin", "body_1_xmin" ... too; each body's
-        vertices, tetrahedra and surface are sets "body_0", "body_1", ... A scene warns where the whole of such a set is a
-        support. ValueError for an empty list, and for meshes that have a set of such a name already.
+        meshes: {"ball": ball, "left": finger}, which names them, or a list: "body_0", "body_1", ... Each body's vertices,
+            tetrahedra and surface are sets of its name, which densities, laws, supports, friction and results take:
+            `Scene(mesh, law, density={"ball": 900, "left": 1100})`, `CenterOfMass("ball")`.
+        Sets of the same name become one, and what each body has of them is "ball_xmin", "left_xmin" ... too. A scene warns
+        where the whole of such a set is a support. ValueError for no meshes, for a name that is no word, and for meshes
+        that have a set of such a name already.
+
+        >>> import diffsim_ti as ds
+        >>> cube = ds.TetrahedralMesh.create_cube(resolution=2)
+        >>> mesh = ds.TetrahedralMesh.joined({"ball": cube, "left": cube.translated((2, 0, 0))})
+        >>> len(mesh.vertex_sets["left"]), mesh.vertex_indices("left_xmin").tolist()
+        (8, [8, 9, 10, 11])
         """
-        meshes = [
+        named = isinstance(meshes, Mapping)
+        parts = [
             instance("joined", "each of the meshes", mesh, TetrahedralMesh, "a TetrahedralMesh")
-            for mesh in listed("meshes", meshes, "TetrahedralMesh")
+            for mesh in (meshes.values() if named else listed("meshes", meshes, "TetrahedralMesh"))
         ]
-        if not meshes:
+        if not parts:
             raise ValueError("joined needs at least one mesh, got none")
-        vertices, tetrahedra, sets = join(meshes)
+        vertices, tetrahedra, sets = join(parts, list(meshes) if named else [f"body_{k}" for k in range(len(parts))])
         return cls(vertices, tetrahedra, **sets)
 
     # What it consists of
