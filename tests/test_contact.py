@@ -143,8 +143,8 @@ def test_a_body_in_an_obstacle_is_refused(name):
 
 def test_touching_exactly_is_refused_and_a_path_counts():
     with pytest.raises(ValueError, match="starts below or on the ground"):
-        points(tetrahedron(0.0), ds.Ground(stiffness=1e4))
-    rising = ds.Ground(stiffness=1e4, path=lambda t: [0, 0.3, 0])
+        points(tetrahedron(0.0), ds.Ground(stiffness=1e4, width=0.01))
+    rising = ds.Ground(stiffness=1e4, width=0.01, path=lambda t: [0, 0.3, 0])
     with pytest.raises(ValueError, match="starts below or on the ground"):
         points(tetrahedron(0.15), rising)
     points(tetrahedron(0.35), rising)
@@ -153,8 +153,8 @@ def test_touching_exactly_is_refused_and_a_path_counts():
 def test_stiffness_is_chosen_and_said():
     """From the speed of the fall: at rest on the floor the weight still leaves a gap."""
     mesh, material = tetrahedron(0.1), ds.StableNeoHookean(1e5, 0.3)
-    scene = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace()])
-    faster = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace()], initial_velocities=[0, -5, 0])
+    scene = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace(width=0.01)])
+    faster = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace(width=0.01)], initial_velocities=[0, -5, 0])
     k, more = (float(s.inputs.values["barrier_stiffness_per_area"]) for s in (scene, faster))
     assert more > 3 * k > 0 and f"stiffness per area {k:.4g} N/m^3 of HalfSpace" in scene.describe()
     assert "barrier_stiffness_per_area [N/m^3]" in scene.describe()
@@ -163,7 +163,7 @@ def test_stiffness_is_chosen_and_said():
     simulator.run(2000)
     assert simulator.contact_resolution.smallest_gap > 0.02 * 0.01
     with pytest.raises(ValueError, match="nothing says how stiff"):
-        ds.Scene(mesh, material, terms=[ds.HalfSpace()])
+        ds.Scene(mesh, material, terms=[ds.HalfSpace(width=0.01)])
 
 
 @pytest.mark.parametrize("solver", FORCE + RESTING)
@@ -173,7 +173,7 @@ def test_weight_at_rest_on_a_slope(solver, mass, gap):
     angle = 0.3
     n = np.array([np.sin(angle), np.cos(angle), 0])
     mesh = tetrahedron(0.3)
-    plane = ds.HalfSpace(BASE[0] + [0, 0.3, 0] - resting_gap(mass * G) * n, n, stiffness=1e4, friction=1.0)
+    plane = ds.HalfSpace(BASE[0] + [0, 0.3, 0] - resting_gap(mass * G) * n, n, stiffness=1e4, width=0.01, friction=1.0)
     scene = points(mesh, plane, mass, fixed=[1, 2, 3], terms=[ds.Gravity(-G / np.cos(angle))])
     end = ds.Rollout(solver(scene, dt=1e-3), 500).forward()
     reached = (end.positions[-1, 0] - plane.values["half_space_point"]) @ n
@@ -187,7 +187,7 @@ def test_absent_obstacles_compile_nothing():
     arrays = bare.workspace.arrays
     assert arrays.features().groups == () and np.prod(bare.workspace.watch.seen.shape) == 1
     assert np.prod(arrays.path.shape) == 1 and str(bare.contact_resolution) == "contact: none"
-    plain = ds.Simulator(ds.SemiImplicitSolver(points(tetrahedron(0.5), ds.Ground(stiffness=1e4)), dt=1e-4))
+    plain = ds.Simulator(ds.SemiImplicitSolver(points(tetrahedron(0.5), ds.Ground(stiffness=1e4, width=0.01)), dt=1e-4))
     (group,) = plain.workspace.arrays.features().groups
     assert not group.force.friction and group.path < 0 and group.size == 3
 
@@ -224,7 +224,9 @@ def test_symmetric_contact_stays_symmetric(solver):
     x = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0], [0, 0, 0]]) * 0.2
     tets = [[0, 2, 4, 5], [2, 1, 4, 5], [1, 3, 4, 5], [3, 0, 4, 5]]
     mesh = ds.TetrahedralMesh(x + [0, 0.01, 0], tets, fix_orientation=True)
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), ds.Ground(stiffness=1e4, friction=0.3)])
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), ds.Ground(stiffness=1e4, width=0.01, friction=0.3)]
+    )
     end = ds.Rollout(solver(scene, dt=2e-4), 2000).forward()
     p = end.positions[-1]
     mirrored, turned = p[[1, 0, 2, 3, 4, 5]] * [-1, 1, 1], p[[2, 3, 0, 1, 4, 5]][:, [2, 1, 0]]

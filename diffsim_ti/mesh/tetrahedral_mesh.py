@@ -225,6 +225,18 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         """Lowest and highest corner [m], shape (2, 3)."""
         return frozen(np.stack([self.vertices.min(0), self.vertices.max(0)]))
 
+    @cached_property
+    def body_size(self) -> float:
+        """Longest side of the box around a body [m]; of several pieces, of the smallest."""
+        used = np.delete(np.arange(self.num_vertices), self.unused_vertices)
+        if self.num_pieces == 1:
+            return float(np.ptp(self.vertices[used], 0).max())
+        piece = pieces(self)[used]
+        order = np.argsort(piece, kind="stable")
+        first = np.flatnonzero(np.diff(piece[order], prepend=-1))
+        x = self.vertices[used[order]]
+        return float((np.maximum.reduceat(x, first) - np.minimum.reduceat(x, first)).max(1).min())
+
     # Points
 
     def locate(self, points: ArrayLike, nearest: bool = False) -> LocatedPoints:

@@ -26,8 +26,8 @@ class GroundForce(ObstacleForce):
 class Ground(Obstacle):
     """Floor y = height [m], which acts on surface vertices through the barrier of their distance d = y - height.
 
-    Stiffness per area [N/m^3] (default: the scene chooses it) or stiffness of every vertex [N/m], width [m], friction and
-    path as for every `Obstacle`.
+    Stiffness per area [N/m^3] (default: the scene chooses it) or stiffness of every vertex [N/m], width [m] (default: 1 % of
+    the body), friction and path as for every `Obstacle`.
     Inputs with gradient: "ground_height", and those of every `Obstacle`.
     Raises ValueError for numbers out of range, or a body that starts on or below the floor.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
@@ -43,7 +43,7 @@ class Ground(Obstacle):
 
     counterpart = GroundForce
 
-    def __init__(self, height: float = 0.0, stiffness: float | None = None, width: float = 0.01, **options):
+    def __init__(self, height: float = 0.0, stiffness: float | None = None, width: float | None = None, **options):
         super().__init__(
             [Input("height", height, ((),), "m", plain="ground_height", axes="y")], stiffness, width, **options
         )
