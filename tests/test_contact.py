@@ -261,3 +261,38 @@ def test_momentum_balance(solver):
 def slope_of(s):
     with np.errstate(all="ignore"):
         return np.where(s < 1, -(s - 1) * (2 * np.log(np.minimum(s, 1)) + (s - 1) / s), 0)
+
+
+@pytest.mark.parametrize("up", ["x", "-z"])
+def test_any_axis_may_point_up(up):
+    """A fall that is turned with its gravity and its floor is the fall, turned, and so are its gradients."""
+    axis, sign = "xyz".index(up[-1]), -1 if up[0] == "-" else 1
+    turn = (np.diag([1, sign, sign]) @ np.eye(3)[[(axis + 2) % 3, axis, (axis + 1) % 3]]).T
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (0.3, 0.2, 0.1), origin=(0, 0.06, 0))
+    results = []
+    for direction, R in (("y", np.eye(3)), (up, turn)):
+        terms = [ds.Gravity(-9.81, up=direction), ds.Ground(0.05, width=0.02, friction=0.3, up=direction)]
+        options = dict(terms=terms, initial_velocities=R @ [0.5, 0, 0.1], precision="f64")
+        scene = ds.Scene(mesh.rotated(R), ds.StableNeoHookean(5e4, 0.3), **options)
+        rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 50, gradients=["ground_height", "gravity"])
+        frames, seed = rollout.forward(), np.zeros((2, mesh.num_vertices, 3))
+        seed[-1] = np.cos(np.arange(3 * mesh.num_vertices)).reshape(-1, 3) @ R.T
+        by = rollout.vjp(frames, positions=seed)
+        results.append((frames.positions[-1] @ R, by["ground_height"], by["gravity"] @ R))
+    for own, turned in zip(*results):
+        np.testing.assert_allclose(turned, own, rtol=1e-8, atol=1e-12)
+    assert f"Ground(up={up!r}" in scene.describe() and abs(by["ground_height"]) > 0
+    origin = 1e6 * np.eye(3)[axis]  # what is measured from far away has the height above it
+    floor = scene.terms[1]
+    assert floor.shift(origin)[0] == sign * 1e6
+    drawn, _ = floor.surface(1.0)
+    assert np.allclose(floor.distance(drawn), 0)
+    with pytest.raises(ValueError, match=f"at -0.14 m above {up} = 0.2"):
+        scene.replace(terms=[ds.Ground(0.2, stiffness=1.0, up=up)])
+
+
+def test_what_points_up_is_refused_otherwise():
+    with pytest.raises(ValueError, match="Ground: up must be one of 'x', 'y', 'z', '-x', '-y', '-z', got 'w'"):
+        ds.Ground(up="w")
+    with pytest.raises(ValueError, match="leave up='z' out"):
+        ds.Gravity((0, 0, -9.81), up="z")

@@ -85,6 +85,16 @@ def as_numbers(name: str, value) -> np.ndarray:
         raise ValueError(f"{name} must be numbers, got {shown(value)}") from None
 
 
+UPWARDS = ("x", "y", "z", "-x", "-y", "-z")
+
+
+def upwards(owner: str, up) -> tuple[int, int]:
+    """(axis, sign) of the direction that points up, one of UPWARDS."""
+    if not isinstance(up, str) or up not in UPWARDS:
+        raise ValueError(f"{owner}: up must be one of {', '.join(map(repr, UPWARDS))}, got {shown(up)}")
+    return "xyz".index(up[-1]), -1 if up[0] == "-" else 1
+
+
 def wholes(name: str, value) -> np.ndarray:
     """A new int64 array of whole numbers."""
     out = numbers(name, value)

@@ -17,6 +17,7 @@ from taichi.lang import impl
 from taichi.lang.misc import _SpecialConfig
 
 from diffsim_ti.common import ranks
+from diffsim_ti.common.deprecated import renamed_arguments
 from diffsim_ti.runtime.current_program import current_program
 from diffsim_ti.runtime.device import count_cards
 from diffsim_ti.runtime.threads import LOCK, materialize
@@ -40,10 +41,12 @@ def _has_arch(name: str) -> bool:
     return {"cpu": lambda: True, "cuda": lambda: count_cards() > 0, "vulkan": _core.with_vulkan}[name]()
 
 
-def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, **options) -> None:
+@renamed_arguments(arch="backend")
+def init(backend: str = "cpu", precision: str = "f32", threads: int | None = None, **options) -> None:
     """Start Taichi for this process: a thin front of `ti.init`, and the only place that calls it.
 
-    arch: "cpu", "cuda" or "vulkan"; a backend that is not there is an error, never a fall-back.
+    backend: "cpu", "cuda" or "vulkan", as --backend of the command line; one that is not there is an error, never a
+    fall-back.
     precision: "f32" or "f64", what a Scene uses unless it says otherwise.
     threads: CPU threads, default all; of several ranks on one machine each takes its share.
     options: handed to `ti.init`. `fast_math` stays False because it erases NaNs before anyone can see them, and
@@ -53,24 +56,24 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
     Calling it again drops every array of earlier scenes; they say so when used.
     Raises ValueError for an unknown name, TypeError for an unknown option, RuntimeError for a backend that is not available.
     """
-    if arch not in _ARCHS:
-        raise ValueError(f"arch must be one of {', '.join(_ARCHS)}, got {arch!r}")
+    if backend not in _ARCHS:
+        raise ValueError(f"backend must be one of {', '.join(_ARCHS)}, got {backend!r}")
     check_precision(precision)
     ti.set_logging_level(ti.ERROR)
-    if not _has_arch(arch):
-        cardless = arch == "cuda" and _core.with_cuda()
+    if not _has_arch(backend):
+        cardless = backend == "cuda" and _core.with_cuda()
         raise RuntimeError(
-            f"the {arch} backend is not available here (available: {', '.join(available_archs())}"
+            f"the {backend} backend is not available here (available: {', '.join(available_archs())}"
             + ("; CUDA's driver is installed, but sees no card" if cardless else "")
             + "); pass one of those to diffsim_ti.init"
-            + ("" if cardless else f", or install the driver that {arch} needs")
+            + ("" if cardless else f", or install the driver that {backend} needs")
         )
     for name in options:
         if name in ("default_fp", "fast_math"):
             raise ValueError(f"{name} cannot be chosen: diffsim_ti needs default_fp=f64 and fast_math=False")
         if name not in _OF_TAICHI and not hasattr(impl.default_cfg(), name):
             raise TypeError(
-                f"init has no argument {name!r}, and neither has ti.init: pass arch={', '.join(map(repr, _ARCHS))}, "
+                f"init has no argument {name!r}, and neither has ti.init: pass backend={', '.join(map(repr, _ARCHS))}, "
                 "precision, threads, or an option of ti.init such as debug=True"
             )
     options.setdefault("log_level", ti.ERROR)
@@ -85,7 +88,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
         options["cpu_max_num_threads"] = int(threads)
     set_precision(precision)
     with LOCK, contextlib.redirect_stdout(io.StringIO()):
-        ti.init(arch=_ARCHS[arch], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
+        ti.init(arch=_ARCHS[backend], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
         materialize()  # in this thread, so that others can compile
 
 

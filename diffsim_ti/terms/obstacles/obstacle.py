@@ -156,7 +156,8 @@ class Obstacle(Term):
         if not self.chooses_stiffness:
             return out
         gravity = scene.term(Gravity)
-        g = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
+        pull = gravity.values["gravity"] if gravity else np.zeros(3)
+        g, axis = float(np.linalg.norm(pull)), int(np.argmax(np.abs(pull) + [0, 1e-300, 0]))
         positions = scene.mesh.vertices if initial_positions is None else np.asarray(initial_positions, np.float64)
         start = np.zeros(3) if self.path is None else sampled_path(self.path_name, self.path, [0.0])[0]
         fall = max(float(self.gap(positions, start).min()), 0.0)
@@ -171,7 +172,7 @@ class Obstacle(Term):
         speed, width = float(np.sqrt(first**2 + 2 * g * fall)) + led + own, float(out.values["barrier_width"])
         mean, mesh = float(np.mean(density)), scene.mesh
         pressed = pressed_by(scene.terms, mesh, mean)
-        stiffness = stiffness_of_impact(mesh, scene.material, mean, g, speed, width, pressed)
+        stiffness = stiffness_of_impact(mesh, scene.material, mean, g, speed, width, pressed, axis)
         if not stiffness > 0:
             raise ValueError(
                 f"{type(self).__name__}: without gravity, velocity, motion and loads nothing says how stiff the barrier "
