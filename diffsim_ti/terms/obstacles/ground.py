@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import upwards
 from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
@@ -53,11 +55,22 @@ class Ground(Obstacle):
     counterpart = GroundForce
 
     def __init__(
-        self, height: float = 0.0, stiffness: float | None = None, width: float | None = None, up: str = "y", **options
+        self,
+        height: float = 0.0,
+        stiffness: float | None = None,
+        width: float | None = None,
+        friction: float = 0.0,
+        friction_speed: float = 1e-3,
+        path: Motion | None = None,
+        name: str | None = None,
+        stiffness_per_area: float | None = None,
+        about: ArrayLike | None = None,
+        up: str = "y",
     ):
         self.up, (self.axis, self.sign) = up, upwards("Ground", up)
-        level = Input("height", height, ((),), "m", plain="ground_height", axes="xyz"[self.axis])
-        super().__init__([level], stiffness, width, **options)
+        shape = [Input("height", height, ((),), "m", plain="ground_height", axes="xyz"[self.axis])]
+        contact = stiffness, width, friction, friction_speed, path, name, stiffness_per_area, about
+        super().__init__(shape, *contact)
 
     def __repr__(self) -> str:
         return super().__repr__() if self.up == "y" else super().__repr__().replace("(", f"(up={self.up!r}, ", 1)
