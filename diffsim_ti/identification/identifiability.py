@@ -50,7 +50,8 @@ def identifiability(
     columns, labels = [], []
     for name in names:
         if name not in frames.inputs:
-            raise ValueError(f"identifiability: no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
+            said = rollout.scene.inputs.no_input(name, "this rollout", rollout.inputs)
+            raise ValueError(f"identifiability: {said}")
         value = np.asarray(frames.inputs[name])
         if not np.any(value):
             raise ValueError(f"identifiability: {name} is zero, so that relative changes of it mean nothing")

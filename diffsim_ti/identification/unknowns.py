@@ -77,8 +77,8 @@ class Free:
         if self.input == TIME_OFFSET:
             return np.zeros((), int)
         if self.input not in rollout.inputs:
-            known = ", ".join(rollout.inputs)
-            raise ValueError(f"{self.label}: no input named {self.input!r}; this rollout has {known}")
+            said = rollout.scene.inputs.no_input(self.input, "this rollout", rollout.inputs)
+            raise ValueError(f"{self.label}: {said}")
         if regions is None:
             shape = rollout.values[self.input].shape
             each = self.unknown.start.ndim > 0 and self.unknown.start.shape == shape
