@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.answers import answered
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import Mark
 from diffsim_ti.visual.backdrop import Backdrop
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from taichi.ui import Window
 
 
+@answered
 class SimulationVisualizer:
     """Shows a mesh whose positions change: `update(positions)` while it runs, `show()` at the end.
 

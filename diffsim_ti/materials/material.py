@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from diffsim_ti.common.answers import answered
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.materials import moduli
 from diffsim_ti.mesh import TetrahedralMesh
@@ -12,6 +13,7 @@ from diffsim_ti.mesh.sets import values_of_sets
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
 
 
+@answered
 class Material(ABC):
     """A law and its numbers, in one of these spellings, never two at once:
 

@@ -18,6 +18,7 @@ from diffsim_ti.mesh.exchange import Exchange
 from diffsim_ti.mesh.grid import box
 from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
+from diffsim_ti.mesh.seed_names import SeedNames
 from diffsim_ti.mesh.sets import checked_sets, frozen, join, pieces, rows_on_surface
 from diffsim_ti.mesh.ten_nodes import edges_of
 
@@ -26,7 +27,7 @@ CONNECTIVITY = (  # what stays when vertices move
 )
 
 
-class TetrahedralMesh(Exchange, NamedSets, Elements):
+class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames):
     """Tetrahedra of four or ten nodes at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
 
     vertices: positions [m], shape (num_vertices, 3).
@@ -157,11 +158,6 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         return len(self._tetrahedra)
 
     @property
-    def num_elements(self) -> int:
-        """Another name of num_tetrahedra, used by the seeds."""
-        return self.num_tetrahedra
-
-    @property
     def surface_triangles(self) -> np.ndarray:
         """Faces of one tetrahedron only, normals pointing outwards, shape (k, 3); of a face of six nodes four triangles."""
         return self._surface_triangles
@@ -286,9 +282,6 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
     def content_hash(self) -> str:
         """SHA-256 of vertices and tetrahedra, 64 hexadecimal digits; sets do not count. The same on every machine."""
         return content_hash(self)
-
-    def _compute_rest_state(self) -> None:
-        """Does nothing: the rest state is always ready. The seeds call it."""
 
     def _changed(self, **parts) -> "TetrahedralMesh":
         new = copy.copy(self)
