@@ -10,17 +10,20 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
 from diffsim_ti.common import deprecated
-from diffsim_ti.common.answers import answered, refuse_argument
+from diffsim_ti.common.answers import answered
 from diffsim_ti.common.origin import middle_far_part, warn_of_rounding
+from diffsim_ti.common.public import Public, check_options
 from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial, refuse_state
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
+from diffsim_ti.solvers.solver import SolverOptions
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
@@ -32,7 +35,7 @@ __all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "ro
 
 
 @answered
-class DifferentiableSolver:
+class DifferentiableSolver(metaclass=Public):
     """How a DifferentiableSimulator steps: any solver with inertia, symplectic Euler unless said otherwise.
 
     dt [s]; gravity [m/s^2]: a number along y, 3 numbers, or a tensor of either (with gradient); damping: the share of
@@ -53,9 +56,8 @@ class DifferentiableSolver:
         damping: float = 1.0,
         substeps: int = 1,
         method: type[Solver] = SemiImplicitSolver,
-        **options,
+        **options: Unpack[SolverOptions],
     ):
-        refuse_argument(type(self), options)
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
         if not 0 < damping <= 1:
@@ -66,6 +68,7 @@ class DifferentiableSolver:
             raise ValueError(
                 "method: StaticSolver has no steps; use rollout_frames(Rollout(StaticSolver(scene), 1), ...)"
             )
+        check_options(type(self).__name__, method, options)
         self.method, self.options = method, options
         self.dt, self.gravity, self.damping, self.substeps = float(dt), gravity, float(damping), int(substeps)
 
@@ -81,7 +84,7 @@ class DifferentiableSolver:
 
 
 @answered
-class DifferentiableSimulator:
+class DifferentiableSimulator(metaclass=Public):
     """Steps a soft body through torch's graph: positions and velocities are tensors with gradients to all that went in.
 
     material: DifferentiableMaterial, SpatiallyVaryingMaterial or another TorchMaterial (diff_physics); density [kg/m^3]:

@@ -161,7 +161,11 @@ OWNERS = {  # of a table of answers: an object that it is for
     "DifferentiableSolver": "solver",
     "SimulationVisualizer": "visualizer",
 }
-ARGUMENTS = ("enable_self_collision", "collision_method", "use_implicit_diff")
+ARGUMENTS = {  # that those pages teach and that are answered
+    ds.SemiImplicitSolver: "enable_self_collision collision_method",
+    ds.Simulator: "density device use_compile",
+    DifferentiableSolver: "use_implicit_diff",
+}
 
 
 @pytest.fixture(scope="module")
@@ -201,10 +205,10 @@ def test_every_name_is_there_or_is_answered(taught):
         for name, said in answers.ANSWERS[table].items():
             with pytest.raises(AttributeError, match=re.escape(f"has no {name!r}: {said}")):
                 getattr(ds if owner is None else taught[owner], name)
-    for name in ARGUMENTS:
-        kind = DifferentiableSolver if name == "use_implicit_diff" else ds.SemiImplicitSolver
-        with pytest.raises(TypeError, match=f"{kind.__name__} has no argument '{name}': "):
-            kind(dt=0.01, **{name: True})
+    for kind, names in ARGUMENTS.items():
+        for name in names.split():
+            with pytest.raises(TypeError, match=f"{kind.__name__} has no argument '{name}': "):
+                kind(**{name: True})
     with pytest.raises(AttributeError, match="'Simulator' object has no attribute 'nothing'"):
         taught["simulator"].nothing  # noqa: B018
 

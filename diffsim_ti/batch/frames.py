@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import as_numbers
+from diffsim_ti.common.names import no_such
+from diffsim_ti.common.public import Public
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.watch import ContactResolution
@@ -36,7 +38,7 @@ class LazyFrames(Sequence):
         return list, (list(self),)
 
 
-class BatchFrames(Sequence):
+class BatchFrames(Sequence, metaclass=Public):
     """Saved states of many scenes: positions [m], velocities [m/s], displacements [m], (scenes, frames, n, 3).
 
     `frames[b]` are those of scene b (`Frames`), `frames["name"]` any output of all scenes, (scenes, ...). alive: (scenes,),
@@ -74,7 +76,7 @@ class BatchFrames(Sequence):
             known = dict(positions=self.positions, velocities=self.velocities, displacements=self.displacements)
             known |= self.outputs
             if key not in known:
-                raise KeyError(f"no output named {key!r}; there are {', '.join(known)}")
+                raise KeyError(no_such("output", key, known, "this run"))
             return known[key]
         return self._frames[key]
 

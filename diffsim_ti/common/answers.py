@@ -106,10 +106,3 @@ def answered(cls: C) -> C:
 
     cls.__getattr__ = __getattr__
     return cls
-
-
-def refuse_argument(owner: type, named: dict) -> None:
-    """Raise TypeError, with what to use, for an argument that those documents teach."""
-    for name in named:
-        if said := answer(owner, name):
-            raise TypeError(f"{owner.__name__} has no argument {name!r}: {said}")

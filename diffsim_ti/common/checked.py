@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -85,13 +86,13 @@ def as_numbers(name: str, value) -> np.ndarray:
         raise ValueError(f"{name} must be numbers, got {shown(value)}") from None
 
 
-UPWARDS = ("x", "y", "z", "-x", "-y", "-z")
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
-def upwards(owner: str, up) -> tuple[int, int]:
-    """(axis, sign) of the direction that points up, one of UPWARDS."""
-    if not isinstance(up, str) or up not in UPWARDS:
-        raise ValueError(f"{owner}: up must be one of {', '.join(map(repr, UPWARDS))}, got {shown(up)}")
+def upwards(owner: str, up: Up) -> tuple[int, int]:
+    """(axis, sign) of the direction that points up."""
+    if not isinstance(up, str) or up not in get_args(Up):
+        raise ValueError(f"{owner}: up must be one of {', '.join(map(repr, get_args(Up)))}, got {shown(up)}")
     return "xyz".index(up[-1]), -1 if up[0] == "-" else 1
 
 

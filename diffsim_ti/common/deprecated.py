@@ -62,6 +62,7 @@ def renamed_arguments(**new: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 named[new[old]] = named.pop(old)
             return function(*arguments, **named)
 
+        call.old_names = frozenset(new)  # type: ignore[attr-defined]
         return call
 
     return decorate

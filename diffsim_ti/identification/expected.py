@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.public import public
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Experiment, Problem, is_experiment
@@ -34,6 +35,7 @@ class Expectation:
         return 0.5 * float(np.linalg.slogdet(self.information.covariance)[1])
 
 
+@public
 def expected(
     rollout: Experiment | Iterable[Experiment],
     data: Any,
@@ -66,6 +68,7 @@ def _complete(data, rollout: Experiment):
     return data
 
 
+@public
 def compare(
     rollout: Experiment, choices: dict, unknowns: dict, noise: ArrayLike | None = None, prior: dict | None = None
 ) -> dict[str, Expectation]:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.common.public import public
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Rollout
 
 
@@ -33,8 +35,9 @@ class Identifiability:
         return "\n".join(lines)
 
 
+@public
 def identifiability(
-    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values
+    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values: InputValue
 ) -> Identifiability:
     """Which inputs can be recovered from the frames' positions: eigenvalues and directions of the Fisher matrix J^T J.
 

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers, shape_of, shown
+from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
 
 TIME_OFFSET = "time_offset"  # of measurements with times of their own [s]
 
 
-class Unknown:
+class Unknown(metaclass=Public):
     """Numbers x of an input, found through free variables t in which no bound exists:
 
         logarithm  x = start exp(t)                      (default where start > 0)

@@ -1,20 +1,27 @@
 """A material: a law with its numbers."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.answers import answered
+from diffsim_ti.common.names import nearest
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.materials import moduli
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.sets import values_of_sets
 
+# one number, an array with one per tetrahedron, or {tetrahedron set: number}
+PerTetrahedron = TypeAliasType("PerTetrahedron", ArrayLike | Mapping[str, ArrayLike])
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
 
 
 @answered
-class Material(ABC):
+class Material(metaclass=Public):
     """A law and its numbers, in one of these spellings, never two at once:
 
     (E, nu) or youngs_modulus= or E= [Pa], > 0, and poissons_ratio= or nu= [-], in (-1, 0.5): those of small strains,
@@ -43,13 +50,13 @@ class Material(ABC):
     to_lame: np.ndarray | None = None
     from_own: np.ndarray | None = None  # None: the coefficients are the numbers themselves
 
-    def __init__(self, *numbers, J_floor: float | None = None, **named):
+    def __init__(self, *numbers: PerTetrahedron | None, J_floor: float | None = None, **named: PerTetrahedron | None):
         if J_floor is not None and not 0 < J_floor < 1:
             raise ValueError(
                 f"J_floor must lie in (0, 1), got {J_floor}: 0.01 continues the energy below 1 % of the volume"
             )
         self.J_floor = None if J_floor is None else float(J_floor)
-        self._numbers = self._spell(numbers, named)
+        self._numbers = self._spell(numbers, {key: number for key, number in named.items() if number is not None})
         self._extra = ""
         self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
 
@@ -60,11 +67,13 @@ class Material(ABC):
         if len(numbers) > most:
             count = "two numbers go without a name (E, nu)" if most == 2 else f"{most} numbers go without a name"
             raise ValueError(f"{self.name}: at most {count}, got {len(numbers)}; use {usage}")
-        given = dict(zip(self.spellings[0], numbers))
+        given = {name: number for name, number in zip(self.spellings[0], numbers) if number is not None}
         for key, number in named.items():
             name = _ALIASES.get(key, key)
             if not any(name in names for names in self.spellings):
-                raise ValueError(f"{self.name}: no parameter is called {key!r}; use {usage}")
+                near = nearest(key, [*(x for names in self.spellings for x in names), *_ALIASES])
+                meant = f" or did you mean {near!r}?" if near else ""
+                raise ValueError(f"{self.name}: no parameter is called {key!r}; use {usage}{meant}")
             if name in given:
                 raise ValueError(f"{self.name}: {name} is given twice; keep one")
             given[name] = number

@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Iterable, Mapping
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance, listed
 from diffsim_ti.common.origin import warn_of_rounding
+from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.elements import Elements
@@ -27,7 +29,7 @@ CONNECTIVITY = (  # what stays when vertices move
 )
 
 
-class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames):
+class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public):
     """Tetrahedra of four or ten nodes at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
 
     vertices: positions [m], shape (num_vertices, 3).
@@ -81,7 +83,11 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames):
 
     @classmethod
     def create_cube(
-        cls, resolution: int = 5, size: float = 1.0, pattern: str = "kuhn", device: str | None = None
+        cls,
+        resolution: int = 5,
+        size: float = 1.0,
+        pattern: Literal["kuhn", "five"] = "kuhn",
+        device: str | None = None,
     ) -> "TetrahedralMesh":
         """The cube [0, size]^3 [m], all of it filled; `resolution` counts vertices a side. See `create_box`.
 
@@ -92,7 +98,11 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames):
 
     @classmethod
     def create_box(
-        cls, resolution: ArrayLike = 5, size: ArrayLike = 1.0, pattern: str = "kuhn", origin: ArrayLike = (0, 0, 0)
+        cls,
+        resolution: ArrayLike = 5,
+        size: ArrayLike = 1.0,
+        pattern: Literal["kuhn", "five"] = "kuhn",
+        origin: ArrayLike = (0, 0, 0),
     ) -> "TetrahedralMesh":
         """A box on a regular grid, with vertex sets and surface sets xmin, xmax, ymin, ymax, zmin, zmax.
 

@@ -1,7 +1,7 @@
 """Forces and moments of obstacles on the body."""
 
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,7 +46,7 @@ class ContactForce(Output):
     def __init__(
         self,
         obstacle: Term | str,
-        part: str = "total",
+        part: Literal["total", "normal", "friction"] = "total",
         name: str = "contact_force",
         per_vertex: bool = False,
         about: ArrayLike | None = None,

@@ -2,11 +2,12 @@
 
 from abc import abstractmethod
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointInterpolation, PointMeans
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
@@ -155,7 +156,7 @@ class Strain(_Tensors):
         at: str | ArrayLike = "tetrahedra",
         principal: bool = False,
         stretches: bool = False,
-        of: str | ArrayLike | None = None,
+        of: SetOrIndices | None = None,
     ):
         super().__init__(name, at, of, principal=principal, stretches=stretches)
 
@@ -214,9 +215,9 @@ class Stress(_Tensors):
         name: str = "stress",
         at: str | ArrayLike = "tetrahedra",
         principal: bool = False,
-        kind: str = "cauchy",
+        kind: Literal["cauchy", "first_piola"] = "cauchy",
         von_mises: bool = False,
-        of: str | ArrayLike | None = None,
+        of: SetOrIndices | None = None,
     ):
         if kind not in ("cauchy", "first_piola"):
             raise ValueError(f'Stress: kind must be "cauchy" or "first_piola", got {kind!r}')

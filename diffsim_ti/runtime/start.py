@@ -9,15 +9,18 @@ import shutil
 import tempfile
 import warnings
 import weakref
+from typing import Literal, TypedDict
 
 import numpy as np
 import taichi as ti
 from taichi._lib import core as _core
 from taichi.lang import impl
 from taichi.lang.misc import _SpecialConfig
+from typing_extensions import Unpack
 
 from diffsim_ti.common import ranks
 from diffsim_ti.common.deprecated import renamed_arguments
+from diffsim_ti.common.names import nearest
 from diffsim_ti.runtime.current_program import current_program
 from diffsim_ti.runtime.device import count_cards
 from diffsim_ti.runtime.threads import LOCK, materialize
@@ -31,6 +34,24 @@ _OF_TAICHI = "default_ip", "require_version", *vars(_SpecialConfig())  # options
 _settings = {"precision": "f32"}
 
 
+class TaichiOptions(TypedDict, total=False):
+    """Options of `ti.init` that are of use here; it takes its others, too."""
+
+    advanced_optimization: bool
+    debug: bool
+    device_memory_fraction: float
+    device_memory_GB: float
+    gdb_trigger: bool
+    kernel_profiler: bool
+    log_level: str
+    num_compile_threads: int
+    offline_cache: bool
+    offline_cache_file_path: str
+    print_ir: bool
+    random_seed: int
+    verbose: bool
+
+
 def available_archs() -> list[str]:
     """Names of the backends this machine and this Taichi build can run, always with "cpu"."""
     ti.set_logging_level(ti.ERROR)  # a missing driver is an answer here, not a warning
@@ -42,7 +63,12 @@ def _has_arch(name: str) -> bool:
 
 
 @renamed_arguments(arch="backend")
-def init(backend: str = "cpu", precision: str = "f32", threads: int | None = None, **options) -> None:
+def init(
+    backend: Literal["cpu", "cuda", "vulkan"] = "cpu",
+    precision: Literal["f32", "f64"] = "f32",
+    threads: int | None = None,
+    **options: Unpack[TaichiOptions],
+) -> None:
     """Start Taichi for this process: a thin front of `ti.init`, and the only place that calls it.
 
     backend: "cpu", "cuda" or "vulkan", as --backend of the command line; one that is not there is an error, never a
@@ -72,9 +98,11 @@ def init(backend: str = "cpu", precision: str = "f32", threads: int | None = Non
         if name in ("default_fp", "fast_math"):
             raise ValueError(f"{name} cannot be chosen: diffsim_ti needs default_fp=f64 and fast_math=False")
         if name not in _OF_TAICHI and not hasattr(impl.default_cfg(), name):
+            near = nearest(name, ["arch", "precision", "threads", *TaichiOptions.__annotations__])
+            meant = f" (did you mean {near!r}?)" if near else ""
             raise TypeError(
-                f"init has no argument {name!r}, and neither has ti.init: pass backend={', '.join(map(repr, _ARCHS))}, "
-                "precision, threads, or an option of ti.init such as debug=True"
+                f"init has no argument {name!r}, and neither has ti.init{meant}: pass "
+                f"backend={', '.join(map(repr, _ARCHS))}, precision, threads, or an option of ti.init such as debug=True"
             )
     options.setdefault("log_level", ti.ERROR)
     if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):

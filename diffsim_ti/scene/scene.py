@@ -2,9 +2,11 @@
 
 from collections.abc import Iterable, Mapping
 from copy import copy
+from typing import Literal, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import as_numbers, instance, listed, number, numbers
@@ -46,6 +48,23 @@ def _density(given: ArrayLike | Mapping[str, float], mesh: TetrahedralMesh) -> A
     for name, value in given.items():
         number(f"density[{name!r}]", value, unit="kg/m^3")
     return values_of_sets("density", given, mesh)
+
+
+class SceneArguments(TypedDict, total=False):
+    """What `Scene` takes, by name: what `Scene.replace` and `Rollout.with_scene` replace."""
+
+    mesh: TetrahedralMesh
+    material: Material
+    density: ArrayLike | Mapping[str, float]
+    terms: Term | Iterable[Term]
+    fixed: Fixed | None
+    motion: Motion | Pose | Mapping[str, Motion | Pose] | None
+    initial_positions: ArrayLike | None
+    initial_velocities: ArrayLike | None
+    precision: Literal["f32", "f64"] | None
+    volume: Literal["tetrahedra", "patches"]
+    mass_scaling: float | None
+    reduced: Mapping[str, str | ArrayLike] | None
 
 
 class Scene(MadeAgain):
@@ -104,8 +123,8 @@ class Scene(MadeAgain):
         motion: Motion | Pose | Mapping[str, Motion | Pose] | None = None,
         initial_positions: ArrayLike | None = None,
         initial_velocities: ArrayLike | None = None,
-        precision: str | None = None,
-        volume: str = "tetrahedra",
+        precision: Literal["f32", "f64"] | None = None,
+        volume: Literal["tetrahedra", "patches"] = "tetrahedra",
         mass_scaling: float | None = None,
         reduced: Mapping[str, str | ArrayLike] | None = None,
     ):
@@ -191,7 +210,7 @@ class Scene(MadeAgain):
         count = next(iter(lengths.values()))
         return [self.with_values({name: x[b] for name, x in own.items()}) for b in range(count)]
 
-    def replace(self, **changes) -> "Scene":
+    def replace(self, **changes: Unpack[SceneArguments]) -> "Scene":
         """A scene with some arguments replaced."""
         return Scene(**self.arguments | changes)
 

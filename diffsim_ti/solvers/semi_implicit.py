@@ -1,20 +1,39 @@
 """Symplectic Euler, the seeds' semi-implicit solver."""
 
-from typing import overload
+from typing import Literal, TypedDict, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
-from diffsim_ti.common.answers import answered, refuse_argument
+from diffsim_ti.common.answers import answered
 from diffsim_ti.common.checked import between, whole
 from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers.explicit.solver import ExplicitSolver, Weights
+from diffsim_ti.solvers.explicit.solver import CONTACT_DAMPING, ExplicitSolver, Weights
 from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.state.staged_steps import StagedSteps
 from diffsim_ti.state.viscous_stages import MOST, ViscousStages
 from diffsim_ti.terms import Drag, Gravity
+
+
+class SemiImplicitOptions(TypedDict, total=False):
+    """What SemiImplicitSolver takes by name, of a scene or of a mesh and a material."""
+
+    scene: Scene
+    mesh: TetrahedralMesh | None
+    material: Material | None
+    dt: float
+    substeps: int
+    density: ArrayLike
+    gravity: ArrayLike
+    damping: float
+    parallel: bool | None
+    allow_unstable: bool
+    check_start: bool
+    contact: Literal["stage", "force"]
+    contact_damping: float
 
 
 @answered
@@ -51,6 +70,9 @@ class SemiImplicitSolver(ExplicitSolver):
         parallel: bool | None = None,
         allow_unstable: bool = False,
         check_start: bool = True,
+        *,
+        contact: Literal["stage", "force"] = "stage",
+        contact_damping: float = CONTACT_DAMPING,
         viscous_stages: int = 1,
     ): ...
 
@@ -61,23 +83,26 @@ class SemiImplicitSolver(ExplicitSolver):
         material: Material | None = None,
         dt: float = 0.01,
         substeps: int = 1,
-        density=1000.0,
-        gravity=-9.8,
+        density: ArrayLike = 1000.0,
+        gravity: ArrayLike = -9.8,
+        damping: float = 1.0,
+        *,
         parallel: bool | None = None,
         allow_unstable: bool = False,
-        damping: float = 1.0,
+        contact: Literal["stage", "force"] = "stage",
+        contact_damping: float = CONTACT_DAMPING,
+        viscous_stages: int = 1,
     ): ...
 
-    def __init__(self, *arguments, viscous_stages: int = 1, **options):
-        refuse_argument(type(self), options)
+    def __init__(self, *arguments, viscous_stages: int = 1, **options: Unpack[SemiImplicitOptions]):
         self.simulator = lambda: None
         self.viscous_stages = whole("viscous_stages", viscous_stages, 1)
         if self.viscous_stages > MOST:
             raise ValueError(f"viscous_stages must be at most {MOST}, got {viscous_stages}; take more substeps")
         self.kicks = ViscousStages(self.viscous_stages)
         if isinstance(arguments[0] if arguments else options.get("scene"), Scene):
-            if "damping" in options:
-                raise TypeError(f"{type(self).__name__}: a scene has its own damping; give it Drag(rate)")
+            if known := [name for name in ("mesh", "material", "density", "gravity", "damping") if name in options]:
+                raise TypeError(f"{type(self).__name__}: a scene has its own {' and '.join(known)}; give them to Scene")
             super().__init__(*arguments, **options)
             return
         self.scene = None

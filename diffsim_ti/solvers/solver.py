@@ -2,15 +2,16 @@
 
 import math
 import warnings
-from abc import ABC
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import number, shown, whole
+from diffsim_ti.common.public import Public
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.monitor import stability
 from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
@@ -20,7 +21,24 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-class Solver(ABC):
+class SolverOptions(TypedDict, total=False):
+    """What solvers take besides the scene; each takes those that its constructor names."""
+
+    dt: float
+    substeps: int
+    load_steps: int
+    parallel: bool | None
+    allow_unstable: bool
+    check_start: bool
+    contact: Literal["stage", "force"]
+    contact_damping: float
+    viscous_stages: int
+    tolerance: float
+    max_iterations: int
+    preconditioner: Literal["auto", "block_jacobi", "multigrid"]
+
+
+class Solver(metaclass=Public):
     """Advances a scene by steps of dt [s], each divided into `substeps` equal substeps.
 
     parallel: each substep on all threads, or many of them in a row on one; None chooses by size.
@@ -86,7 +104,7 @@ class Solver(ABC):
         own = dict(scene=self.scene) | {name: getattr(self, name) for name in self.arguments}
         return _on_schedule, (type(self), own, self._schedule)
 
-    def for_scene(self, scene: "Scene", **changes) -> "Solver":
+    def for_scene(self, scene: "Scene", **changes: Unpack[SolverOptions]) -> "Solver":
         """The same solver for another scene, with some arguments replaced."""
         return type(self)(scene, **{name: getattr(self, name) for name in self.arguments} | changes)
 

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from diffsim_ti.common.copies import CarriesMore
+from diffsim_ti.common.public import Public
 
 
 class Buckled(CarriesMore, UserWarning):
@@ -52,7 +53,7 @@ class StepReport:
         self.residuals = (self.residuals or []) + [list(solve.residuals)]
 
 
-class SolveReport:
+class SolveReport(metaclass=Public):
     """`steps`: a StepReport for each of the last 10 000 steps, empty for explicit solvers, which solve nothing; `seconds`
     and `substeps`, of all. Totals: `iterations`, `products`, `energies`, `cuts`, `blocked`, `indefinite`, `saddles`;
     `residual`: the largest with which a step ended. Of a Rollout's last forward run, or of a Simulator since its reset;

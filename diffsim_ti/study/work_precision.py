@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from diffsim_ti.common.progress import progress
+from diffsim_ti.common.public import public
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver, stable_dt
@@ -264,6 +265,7 @@ class Runs:
                 )
 
 
+@public
 def chart(
     problem: Problem,
     solvers: Sequence[type[Solver]] | None = None,

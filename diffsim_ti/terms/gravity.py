@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.common.checked import numbers, upwards
+from diffsim_ti.common.checked import Up, numbers, upwards
 from diffsim_ti.inputs import Input
 from diffsim_ti.terms.term import Term
 
@@ -21,7 +21,7 @@ class Gravity(Term):
     array([ 0.  ,  0.  , -1.62])
     """
 
-    def __init__(self, acceleration: ArrayLike = -9.81, name: str | None = None, up: str = "y"):
+    def __init__(self, acceleration: ArrayLike = -9.81, name: str | None = None, up: Up = "y"):
         g, (axis, sign) = numbers("Gravity: acceleration", acceleration), upwards("Gravity", up)
         if g.shape == ():
             g = np.where(np.arange(3) == axis, sign * float(g), 0.0)

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import numbers, shown
 from diffsim_ti.inputs.posed_supports import PosedSupport
@@ -15,7 +16,7 @@ from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.pose import Pose
 
 # a vertex set's name, several, indices or a mask: fixed wholly; or {name of a set: in which directions it is fixed}
-Fixed = str | ArrayLike | Mapping[str, str | ArrayLike]
+Fixed = TypeAliasType("Fixed", str | ArrayLike | Mapping[str, str | ArrayLike])
 AXES = {"x": 0, "y": 1, "z": 2}
 
 

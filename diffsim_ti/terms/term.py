@@ -1,6 +1,5 @@
 """What a term is: a load, a contact or a damping that a scene lists, inlined into the step at compile time."""
 
-from abc import ABC
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -9,6 +8,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.runtime import number_type
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-class Term(ABC):
+class Term(metaclass=Public):
     """A load, contact or damping: its inputs, in SI units and float64, and how kernels come to read them.
 
     name: a word that its inputs' names begin with, "floor.stiffness"; without one they have plain names,
@@ -164,7 +164,7 @@ class OnSurface:
 
 
 @dataclass(frozen=True)
-class VertexForce(ABC):
+class VertexForce(metaclass=Public):
     """Device counterpart of a term: Taichi functions of one vertex, at rest position X, displacement u, velocity v.
 
     Vectors have four components, the last zero. Equal counterparts share compiled kernels, and those of one scene a loop.

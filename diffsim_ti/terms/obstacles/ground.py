@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.common.checked import upwards
+from diffsim_ti.common.checked import Up, upwards
 from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.motion import Motion
@@ -65,7 +65,7 @@ class Ground(Obstacle):
         name: str | None = None,
         stiffness_per_area: float | None = None,
         about: ArrayLike | None = None,
-        up: str = "y",
+        up: Up = "y",
     ):
         self.up, (self.axis, self.sign) = up, upwards("Ground", up)
         shape = [Input("height", height, ((),), "m", plain="ground_height", axes="xyz"[self.axis])]

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti.common.checked import numbers, whole, wholes
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
-from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
 
 
 class MeshObstacle(Obstacle):
@@ -33,7 +34,7 @@ class MeshObstacle(Obstacle):
         triangles: ArrayLike,
         position: ArrayLike = (0.0, 0.0, 0.0),
         resolution: int = 48,
-        **options,
+        **options: Unpack[ObstacleOptions],
     ):
         super().__init__([place("position", position, "mesh_position")], **options)
         given = vertices

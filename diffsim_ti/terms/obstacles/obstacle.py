@@ -1,6 +1,7 @@
 """What all obstacles share: a barrier of the distance, friction, a path, and every derivative of these."""
 
 from collections.abc import Sequence
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,19 @@ from diffsim_ti.terms.term import Term
 
 PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
 SHARE = 0.01  # of the body, the width of a barrier whose width is left to the scene
+
+
+class ObstacleOptions(TypedDict, total=False):
+    """What every obstacle takes besides its shape; `Obstacle` says what it means and what it is where it is left out."""
+
+    stiffness: float | None
+    width: float | None
+    friction: float
+    friction_speed: float
+    path: Motion | None
+    name: str | None
+    stiffness_per_area: float | None
+    about: ArrayLike | None
 
 
 class Obstacle(Term):
