@@ -1,7 +1,7 @@
 """Saved states of many scenes."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -70,6 +70,15 @@ class BatchFrames(Sequence, metaclass=Public):
 
     def __len__(self) -> int:
         return len(self._frames)
+
+    @overload
+    def __getitem__(self, key: str) -> np.ndarray: ...
+
+    @overload
+    def __getitem__(self, key: int) -> Frames: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> Sequence[Frames]: ...
 
     def __getitem__(self, key):
         if isinstance(key, str):

@@ -39,7 +39,8 @@ MODULES = {
 # names of the package -> their new names there
 NAMES = {"TieLength": "Length", "TieTension": "Tension"}
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")  # one by one: mypy reads no others
+R = TypeVar("R")
 
 
 def warn(old: str, new: str, stacklevel: int = 3) -> None:

@@ -22,7 +22,8 @@ from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.names import check_arguments, edits, nearest
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")  # one by one: mypy reads no others
+R = TypeVar("R")
 OWN_DOC = type.__dict__["__doc__"]
 ROOM = 116  # columns of docstrings
 UNNAMED = Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD
