@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
+from diffsim_ti.common.answers import answered
 from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import Mark
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from taichi.ui import Window
 
 
+@answered
 class SimulationVisualizer(metaclass=Public):
     """Shows a mesh whose positions change: `update(positions)` while it runs, `show()` at the end.
 

@@ -300,7 +300,7 @@ class Batch(metaclass=Public):
         tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
-            raise ValueError("tangents: " + no_such("input", unknown[0], self.inputs, "this batch"))
+            raise ValueError(f"tangents: {self.scene.inputs.no_input(unknown[0], 'this batch', self.inputs)}")
         instance("Batch.tangents", "frames", frames, BatchFrames, "what forward returned")
         zero = {name: np.zeros_like(value_of(frames.values[name], 0)) for name in tangents}
         tangents, _ = spread_given(self.scene, tangents, zero, self.num_scenes)

@@ -7,7 +7,6 @@ import numpy as np
 from diffsim_ti.batch.set_values import spread_scenes
 from diffsim_ti.batch.sweep import BatchValues, Own, value_of
 from diffsim_ti.common.checked import as_numbers
-from diffsim_ti.common.names import no_such
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.set_values import change_like
 from diffsim_ti.scene import Scene
@@ -27,7 +26,7 @@ def checked_values(one: Rollout, given: dict, scenes: int) -> dict:
     inputs, out = one.scene.inputs, BatchValues(one.values)
     unknown = [name for name in given if name not in one.inputs]
     if unknown:
-        raise ValueError(no_such("input", unknown[0], one.inputs, "this batch"))
+        raise ValueError(one.scene.inputs.no_input(unknown[0], "this batch", one.inputs))
     for name, value in given.items():
         inputs.warn_if_coarse(name, value)
         if isinstance(value, Own) or _is_own(one, name, value := as_numbers(name, value), scenes):

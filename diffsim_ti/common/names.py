@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 
+from diffsim_ti.common.answers import answer
+
 # words of other programs and of other ears, and what they may be called here
 ELSEWHERE = {
+    "arch": ("backend",),
     "axis": ("normal", "direction"),
-    "backend": ("arch",),
     "body": ("mesh",),
     "boundary_conditions": ("fixed",),
     "bulk": ("bulk_modulus",),
@@ -14,7 +16,7 @@ ELSEWHERE = {
     "color": ("colour",),
     "colors": ("colours",),
     "delta_t": ("dt",),
-    "device": ("arch",),
+    "device": ("backend",),
     "dhat": ("width",),
     "dirichlet": ("fixed",),
     "dtype": ("precision",),
@@ -106,6 +108,8 @@ def check_arguments(owner: str, given: Iterable[str], names: Iterable[str]) -> N
     names = list(names)
     for name in given:
         if name not in names:
+            if said := answer(owner, name):
+                raise TypeError(f"{owner} has no argument {name!r}: {said}")
             near = nearest(name, names)
             meant = f"; did you mean {near!r}?" if near else "."
             raise TypeError(f"{owner} has no argument {name!r}{meant} It takes {', '.join(names) or 'none'}")

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.common.names import no_such
 from diffsim_ti.common.public import public
 from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Rollout
@@ -54,7 +53,8 @@ def identifiability(
     columns, labels = [], []
     for name in names:
         if name not in frames.inputs:
-            raise ValueError("identifiability: " + no_such("input", name, rollout.inputs, "this rollout"))
+            said = rollout.scene.inputs.no_input(name, "this rollout", rollout.inputs)
+            raise ValueError(f"identifiability: {said}")
         value = np.asarray(frames.inputs[name])
         if not np.any(value):
             raise ValueError(f"identifiability: {name} is zero, so that relative changes of it mean nothing")

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers, shape_of, shown
-from diffsim_ti.common.names import no_such
 from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
 
@@ -79,7 +78,8 @@ class Free:
         if self.input == TIME_OFFSET:
             return np.zeros((), int)
         if self.input not in rollout.inputs:
-            raise ValueError(f"{self.label}: {no_such('input', self.input, rollout.inputs, 'this rollout')}")
+            said = rollout.scene.inputs.no_input(self.input, "this rollout", rollout.inputs)
+            raise ValueError(f"{self.label}: {said}")
         if regions is None:
             shape = rollout.values[self.input].shape
             each = self.unknown.start.ndim > 0 and self.unknown.start.shape == shape

@@ -248,6 +248,14 @@ class Inputs:
         """{own name: name here} of the inputs of term k of the scene's list."""
         return dict(self._names[k])
 
+    def no_input(self, name: str, owner: str, names: Iterable[str]) -> str:
+        """What to say of a name that no input of `owner` has; a term that has a name gives its inputs others."""
+        own = [(of[name], term.name) for of, term in zip(self._names, self.scene.terms) if term.name and name in of]
+        if not own:
+            return no_such("input", name, names, owner)
+        others = " or ".join(f"{new!r}, for a term has the name {word!r}" for new, word in own)
+        return f"no input named {name!r}; {owner} has {', '.join(names)}: {name!r} is here called {others}"
+
     def at_times(self, times: ArrayLike) -> dict[str, np.ndarray]:
         """The values of a run, with those that are sampled at its times [s]."""
         scene = self.scene
@@ -272,7 +280,7 @@ class Inputs:
         """Float64 arrays of the right shapes, or ValueError naming expected and got."""
         unknown = [name for name in values if name not in self.described]
         if unknown:
-            raise ValueError(no_such("input", unknown[0], self.described, "this scene"))
+            raise ValueError(self.no_input(unknown[0], "this scene", self.described))
         return {name: self.described[name].checked(name, value, self.sizes) for name, value in values.items()}
 
     def warn_if_coarse(self, name: str, given) -> None:

@@ -302,7 +302,7 @@ class Rollout(metaclass=Public):
         tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
-            raise ValueError("jvp: " + no_such("input", unknown[0], self.inputs, "this rollout"))
+            raise ValueError(f"jvp: {self.scene.inputs.no_input(unknown[0], 'this rollout', self.inputs)}")
         values = instance("Rollout.tangents", "frames", frames, Frames, "what forward returned").inputs
         zero = {name: np.zeros_like(values[name]) for name in tangents}
         tangents, _ = spread_all(self.scene, zero, tangents, frames.sets)

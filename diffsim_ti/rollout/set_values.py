@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from diffsim_ti.common.checked import as_numbers, instance, shown
-from diffsim_ti.common.names import no_such
 from diffsim_ti.scene import Scene
 
 Rows = dict[str, np.ndarray]  # tetrahedra of each set
@@ -20,7 +19,7 @@ def rows_of_sets(scene: Scene, name: str, sets: Iterable[str]) -> Rows:
     unknown sets, and for sets that share tetrahedra."""
     mesh, described = scene.mesh, scene.inputs.described.get(name)
     if described is None:
-        raise ValueError(no_such("input", name, scene.inputs.described, "this scene"))
+        raise ValueError(scene.inputs.no_input(name, "this scene", scene.inputs.described))
     _rule(scene, name)
     out, owner = {}, np.full(mesh.num_tetrahedra, -1)
     named = [key for key in sets if key != "default"]

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.common.answers import answered
 from diffsim_ti.common.checked import instance, numbers, whole
 from diffsim_ti.common.origin import positions_of
 from diffsim_ti.common.public import Public
@@ -26,6 +27,7 @@ from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import ExternalForce
 
 
+@answered
 class Simulator(metaclass=Public):
     """Advances a scene step by step and shows its state.
 

@@ -7,7 +7,6 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import as_numbers, listed, number, whole
-from diffsim_ti.common.names import no_such
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.outputs.output import NOTED
@@ -96,7 +95,7 @@ class Sweep:
             names = tuple(dict.fromkeys((*(name for name in names if name != "shape"), *MOVED)))
         unknown = [name for name in names if name not in self.inputs]
         if unknown:
-            raise ValueError("gradients: " + no_such("input", unknown[0], self.inputs, "this rollout"))
+            raise ValueError(f"gradients: {self.scene.inputs.no_input(unknown[0], 'this rollout', self.inputs)}")
         return names
 
     @property
@@ -178,7 +177,7 @@ class Sweep:
         """All values of a run: copies of those given, for callers may change theirs, or what is loaded if it is the same."""
         unknown = [name for name in values if name not in self.inputs]
         if unknown:
-            raise ValueError(no_such("input", unknown[0], self.inputs, "this rollout"))
+            raise ValueError(self.scene.inputs.no_input(unknown[0], "this rollout", self.inputs))
         known, kept, given = self._loaded or self.values, {}, {}
         for name, value in values.items():
             self.scene.inputs.warn_if_coarse(name, value)

@@ -8,7 +8,6 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import whole
-from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import warn_of_rounding
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.outputs import Change
@@ -76,7 +75,7 @@ class TapeAdapter:
                 self._fields[name] = self._filled(name, self._loaded(name))
                 self._warn_if_coarse(name, name)
             else:
-                raise ValueError(no_such("input", name, rollout.inputs, f"this {self.word}"))
+                raise ValueError(rollout.scene.inputs.no_input(name, f"this {self.word}", rollout.inputs))
         return self._fields[name]
 
     def _warn_if_coarse(self, name: str, of: str | None) -> None:

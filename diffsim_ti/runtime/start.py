@@ -19,6 +19,7 @@ from taichi.lang.misc import _SpecialConfig
 from typing_extensions import Unpack
 
 from diffsim_ti.common import ranks
+from diffsim_ti.common.deprecated import renamed_arguments
 from diffsim_ti.common.names import nearest
 from diffsim_ti.runtime.current_program import current_program
 from diffsim_ti.runtime.device import count_cards
@@ -61,15 +62,17 @@ def _has_arch(name: str) -> bool:
     return {"cpu": lambda: True, "cuda": lambda: count_cards() > 0, "vulkan": _core.with_vulkan}[name]()
 
 
+@renamed_arguments(arch="backend")
 def init(
-    arch: Literal["cpu", "cuda", "vulkan"] = "cpu",
+    backend: Literal["cpu", "cuda", "vulkan"] = "cpu",
     precision: Literal["f32", "f64"] = "f32",
     threads: int | None = None,
     **options: Unpack[TaichiOptions],
 ) -> None:
     """Start Taichi for this process: a thin front of `ti.init`, and the only place that calls it.
 
-    arch: "cpu", "cuda" or "vulkan"; a backend that is not there is an error, never a fall-back.
+    backend: "cpu", "cuda" or "vulkan", as --backend of the command line; one that is not there is an error, never a
+    fall-back.
     precision: "f32" or "f64", what a Scene uses unless it says otherwise.
     threads: CPU threads, default all; of several ranks on one machine each takes its share.
     options: handed to `ti.init`. `fast_math` stays False because it erases NaNs before anyone can see them, and
@@ -79,17 +82,17 @@ def init(
     Calling it again drops every array of earlier scenes; they say so when used.
     Raises ValueError for an unknown name, TypeError for an unknown option, RuntimeError for a backend that is not available.
     """
-    if arch not in _ARCHS:
-        raise ValueError(f"arch must be one of {', '.join(_ARCHS)}, got {arch!r}")
+    if backend not in _ARCHS:
+        raise ValueError(f"backend must be one of {', '.join(_ARCHS)}, got {backend!r}")
     check_precision(precision)
     ti.set_logging_level(ti.ERROR)
-    if not _has_arch(arch):
-        cardless = arch == "cuda" and _core.with_cuda()
+    if not _has_arch(backend):
+        cardless = backend == "cuda" and _core.with_cuda()
         raise RuntimeError(
-            f"the {arch} backend is not available here (available: {', '.join(available_archs())}"
+            f"the {backend} backend is not available here (available: {', '.join(available_archs())}"
             + ("; CUDA's driver is installed, but sees no card" if cardless else "")
             + "); pass one of those to diffsim_ti.init"
-            + ("" if cardless else f", or install the driver that {arch} needs")
+            + ("" if cardless else f", or install the driver that {backend} needs")
         )
     for name in options:
         if name in ("default_fp", "fast_math"):
@@ -99,7 +102,7 @@ def init(
             meant = f" (did you mean {near!r}?)" if near else ""
             raise TypeError(
                 f"init has no argument {name!r}, and neither has ti.init{meant}: pass "
-                f"arch={', '.join(map(repr, _ARCHS))}, precision, threads, or an option of ti.init such as debug=True"
+                f"backend={', '.join(map(repr, _ARCHS))}, precision, threads, or an option of ti.init such as debug=True"
             )
     options.setdefault("log_level", ti.ERROR)
     if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):
@@ -113,7 +116,7 @@ def init(
         options["cpu_max_num_threads"] = int(threads)
     set_precision(precision)
     with LOCK, contextlib.redirect_stdout(io.StringIO()):
-        ti.init(arch=_ARCHS[arch], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
+        ti.init(arch=_ARCHS[backend], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
         materialize()  # in this thread, so that others can compile
 
 

@@ -147,7 +147,7 @@ def _warn_of_several_bodies(mesh: TetrahedralMesh, fixed: Fixed | None) -> None:
     """Say which sets hold several bodies because these had sets of one name before they were joined."""
     given = [fixed] if isinstance(fixed, str) else fixed if isinstance(fixed, Mapping | list | tuple) else ()
     for name in (name for name in given if isinstance(name, str)):
-        if parts := parts_of_joined(mesh.vertex_sets, name):
+        if parts := parts_of_joined(mesh, name):
             warnings.warn(
                 f"fixed: {name!r} contains {len(parts)} bodies, whose sets of this name were joined; name those that are "
                 f"meant: {', '.join(map(repr, parts))}",

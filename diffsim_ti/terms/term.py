@@ -35,6 +35,7 @@ class Term(metaclass=Public):
     path = None  # displacement over time, of an obstacle that moves
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
     variant: tuple = ()  # what else than its class decides about the kernels of a term
+    left_to_scene: tuple[str, ...] = ()  # plain names of the numbers that the scene chooses (`settled`)
     keyed = False  # whether its input is sampled at the ends of each run's steps (`rows`)
     stiffest = None  # np.max or np.min: which of what it is given over time asks for the shortest steps
 
@@ -62,6 +63,7 @@ class Term(metaclass=Public):
         """A copy in which the input of a plain name has another value, shapes ..., fields of `Input`."""
         out = copy(self)
         out.described = tuple(replace(i, **changes) if i.plain == plain else i for i in self.described)
+        out.left_to_scene = tuple(name for name in self.left_to_scene if name != plain)
         return out
 
     @property
@@ -127,7 +129,8 @@ class Term(metaclass=Public):
     def __repr__(self) -> str:
         named = [] if self.name is None else [f"name={self.name!r}"]
         short = lambda x: f"array{x.shape}" if x.size > 3 else np.array2string(x, separator=", ", precision=6)  # noqa: E731
-        numbers = [f"{name}={short(value)}" for name, value in self.values.items()]
+        left = {name: "chosen by the scene" for name in self.left_to_scene}
+        numbers = [f"{name}={left.get(name) or short(value)}" for name, value in self.values.items()]
         return f"{type(self).__name__}({', '.join(named + numbers)})"
 
 
