@@ -6,13 +6,13 @@ import io
 import math
 import os
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
 from diffsim_ti.common import ranks
 from diffsim_ti.common.progress import progress
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.torch_bridge.autograd import torch
 
@@ -59,7 +59,7 @@ def load_state(path: str | Path, mesh: TetrahedralMesh) -> dict | None:
                 reasons.append(f"{candidate}: {error}")
                 continue
             if reasons:
-                warnings.warn(f"{reasons[0]}; using {candidate}", stacklevel=2)
+                warn(f"{reasons[0]}; using {candidate}")
             return state
     if reasons:
         raise ValueError("no usable state: " + "; ".join(reasons) + "; delete the file to start again")

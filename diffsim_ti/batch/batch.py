@@ -1,6 +1,5 @@
 """Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents together."""
 
-import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -15,6 +14,7 @@ from diffsim_ti.batch.taped import BatchTapeAdapter
 from diffsim_ti.common.checked import as_numbers, instance, whole
 from diffsim_ti.common.copies import made_again
 from diffsim_ti.common.origin import positions_of
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh.collision_surface import BOWED
 from diffsim_ti.mesh.face_points import bow, bows
@@ -229,7 +229,7 @@ class Batch:
     def _warn_of_dead(frames: BatchFrames, what: str) -> None:
         dead = np.flatnonzero(~frames.alive)
         if dead.size:
-            warnings.warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero", stacklevel=3)
+            warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero")
 
     def _vjp_side_by_side(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
         shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive

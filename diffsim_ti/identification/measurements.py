@@ -1,12 +1,11 @@
 """What was measured: values of an output of a rollout, some of them missing, at the frames or at times of their own."""
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers, wholes
 from diffsim_ti.common.origin import rounding_of
+from diffsim_ti.common.warn import warn
 from diffsim_ti.rollout import Frames, Rollout
 
 
@@ -37,7 +36,7 @@ class Measurement:
         self.seen = np.isfinite(self.values)
         if rounding_of(values) > self.noise.min(initial=np.inf):
             coarse = f"float32 rounds values by {rounding_of(values):.2g}, more than the noise"
-            warnings.warn(f"{output}: {coarse}: give them in float64", stacklevel=2)
+            warn(f"{output}: {coarse}: give them in float64")
         if np.any(np.isinf(self.values)):
             raise ValueError(f"{output}: values must be finite, or NaN where a sample is missing")
         if self.noise.ndim > self.values.ndim or any(

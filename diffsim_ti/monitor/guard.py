@@ -1,12 +1,12 @@
 """Noticing that a run goes wrong, and saying where, when and why."""
 
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.copies import CarriesMore
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.chatter import Chatter
@@ -146,11 +146,10 @@ class Guard:
         for what, omega_dt, limit, enough in looks:
             if omega_dt > limit and not self._warned:
                 self._warned, step, h = True, self.ws.step_of(now - 1, num_passes), self.ws.substep
-                warnings.warn(
+                warn(
                     f"{self.ws.when(step)}: a contact {what}was stiffer than the substep {h:.3g} s "
                     f"can follow (omega dt = {omega_dt:.3g} > {limit}), so that energy may be gained in it: take substeps "
-                    f"of {enough * h / omega_dt:.3g} s, or a softer or wider barrier",
-                    stacklevel=5,
+                    f"of {enough * h / omega_dt:.3g} s, or a softer or wider barrier"
                 )
 
     def _warn_of_gained_energy(self, now: int, num_passes: int) -> None:
@@ -168,7 +167,7 @@ class Guard:
             f"{self.ws.substep:.3g} s: take substeps of {enough:.3g} s, or {others}"
         )
         about = watch.gained, watch.share, step, float(solver.schedule.time(step)), enough
-        warnings.warn(EnergyGained(said, *about), stacklevel=5)
+        warn(EnergyGained(said, *about))
 
     def _check_step(self, now: int, num_passes: int) -> None:
         solver = self.ws.solver

@@ -1,6 +1,5 @@
 """A closed triangle mesh as an obstacle: its signed distance on a grid, between whose points cubic B-splines are C2."""
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers, whole, wholes
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
+from diffsim_ti.common.warn import warn
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
@@ -38,7 +38,7 @@ class MeshObstacle(Obstacle):
         super().__init__([place("position", position, "mesh_position")], **options)
         if rounding_of(vertices) > OF_WIDTHS * self.values["barrier_width"]:
             coarse = f"float32 resolves vertices to {rounding_of(vertices):.2g} m, too little for the barrier's width"
-            warnings.warn(f"MeshObstacle: {coarse}: give them in float64", stacklevel=2)
+            warn(f"MeshObstacle: {coarse}: give them in float64")
         vertices, triangles = numbers("MeshObstacle: vertices", vertices), wholes("MeshObstacle: triangles", triangles)
         check_closed(vertices, triangles)
         resolution = whole("MeshObstacle: resolution", resolution, 4)
