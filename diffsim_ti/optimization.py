@@ -7,7 +7,6 @@ import math
 import os
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 from diffsim_ti.common import ranks
@@ -145,7 +144,8 @@ class Optimization:
     ) -> "Optimization":
         """Go on until `iterations` iterations are done in all; loss() makes the graph anew each time.
 
-        after(value): called after each iteration with the loss before it, for instance to draw. title: of a bar on stderr.
+        after(value): called after each iteration with the loss before it, for instance to draw. title: of a bar in a
+        terminal.
 
         Raises FloatingPointError if the loss is not finite, and lets the simulator's errors through; the parameters are
         then the best ones so far.
@@ -162,7 +162,7 @@ class Optimization:
                 torch.nn.utils.clip_grad_norm_([p for group in groups for p in group["params"]], self.clip)
             return value
 
-        with nullcontext(lambda *_: None) if title is None else progress(title, iterations) as show:
+        with progress(title or "optimisation", iterations, bar=title is not None) as show:
             while self.iteration < iterations and not self.is_stuck():
                 value = self._iterate(closure)
                 show(self.iteration, f"loss {value:.4g}")

@@ -11,7 +11,7 @@ from diffsim_ti.common.warn import warn
 PACKAGE = Path(__file__).parent.parent / "diffsim_ti"
 
 # each line of a user that is warned of, and what it says
-SCRIPT = '''
+SCRIPT = """
 import numpy as np
 import torch
 
@@ -34,7 +34,8 @@ two = ds.TetrahedralMesh.joined([mesh, mesh.translated([3, 0, 0])])
 ds.Scene(two, soft, fixed="held")  # contains 2 bodies
 ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.49))  # tetrahedra lock
 ds.Scene(mesh, soft, precision="f32", initial_positions=mesh.vertices + 1e6)  # float32 resolves
-ds.Scene(mesh, soft, terms=ds.Ground(1e5, stiffness_per_area=1e6), precision="f32", initial_positions=mesh.vertices + [0, 100001, 0])  # float32
+floor, above = ds.Ground(1e5, stiffness_per_area=1e6), mesh.vertices + [0, 100001, 0]
+ds.Scene(mesh, soft, terms=floor, precision="f32", initial_positions=above)  # float32
 ds.Measurement("positions", np.float32([[1e6]]), noise=1e-3)  # float32 rounds
 ds.MeshObstacle(np.float32(corners + 1e6), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # float32 resolves vertices
 solver = ds.SemiImplicitSolver(mesh, soft, dt=0.1)  # is divided into
@@ -54,11 +55,11 @@ rollout.vjp(frames, positions=np.random.default_rng(0).normal(size=frames.positi
 velocities = torch.zeros(mesh.vertices.shape, requires_grad=True)
 loss = (rollout_frames(rollout, initial_velocities=velocities).positions[-1] * torch.arange(1.0, 13.0).reshape(4, 3)).sum()
 loss.backward()  # the adjoint grew
-'''
+"""
 
 
 def test_warnings_point_at_the_line_of_the_user(tmp_path):
-    """Of a script of theirs, through constructors, functions, scipy and torch; test_layout: no other way leads to a warning."""
+    """Of a script of theirs, through constructors, functions and torch; test_layout.py: no other way leads to a warning."""
     path = tmp_path / "users_script.py"
     path.write_text(SCRIPT)
     expected = [(k, line.split("  # ")[1]) for k, line in enumerate(SCRIPT.split("\n"), 1) if "  # " in line]

@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.copies import CarriesMore
+from diffsim_ti.common.progress import Steady
 from diffsim_ti.common.warn import warn
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities, stability
@@ -70,7 +71,7 @@ class Guard:
             self.ws.energy_watch.clear()
         pulled = self.ws.arrays.features().pulled  # which squeezes a calm start
         soon = solver.explicit and (solver.starts_deformed() or pulled)
-        self._passes, self.every = 0, self.first if soon else self.usual
+        self._passes, self.every, self.steady = 0, self.first if soon else self.usual, Steady()
 
     def mark(self, now: int) -> None:
         """The current state, before pass `now`, is good: keep it."""
@@ -134,6 +135,8 @@ class Guard:
                     self.chatter.check(stop, num_passes)
                 self._check_step(stop, num_passes)
             first = stop
+            if first < last:
+                self.steady.log("substep %s of %s", first, num_passes)
 
     def _warn_of_stiff_contact(self, now: int, num_passes: int) -> None:
         """Once, where a barrier was stiffer than a step can follow: energy may then come from nowhere."""

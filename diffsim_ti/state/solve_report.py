@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from diffsim_ti.common.copies import CarriesMore
+from diffsim_ti.common.progress import Steady
 
 
 class Buckled(CarriesMore, UserWarning):
@@ -61,12 +62,13 @@ class SolveReport:
 
     def __init__(self):
         self.steps: deque[StepReport] = deque(maxlen=10_000)
-        self.seconds, self.substeps, self._noting = 0.0, 0, False
+        self._noting = False
+        self.clear()
 
     def clear(self) -> None:
         """Forget all."""
         self.steps.clear()
-        self.seconds, self.substeps = 0.0, 0
+        self.seconds, self.substeps, self._steady = 0.0, 0, Steady()
 
     @contextmanager
     def of_passes(self, count: int):
@@ -87,6 +89,8 @@ class SolveReport:
             self.steps[-1].seconds += seconds
             for solve in solves:
                 self.steps[-1].add(solve)
+            last = self.steps[-1]
+            self._steady.log("step %s: %s Newton iterations, residual %.2g", step, last.iterations, last.residual)
 
     def _total(self, name: str):
         return sum(getattr(step, name) for step in self.steps)
