@@ -123,6 +123,10 @@ class Optimization:
         else:
             self.best_loss, self._best = math.inf, copy.deepcopy(module.state_dict())
 
+    def __repr__(self) -> str:
+        lowest = f", the lowest loss {self.best_loss:.6g}" if self.losses else ""
+        return f"Optimization({self.iteration} iterations in {self.seconds:.3g} s{lowest}, state in {self.path})"
+
     def _found(self) -> tuple[dict, ValueError | None]:
         """(the state of the file, or that of a new run; what is wrong with it)"""
         try:

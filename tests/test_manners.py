@@ -1,12 +1,28 @@
 """Warnings, log records, and what objects say of themselves where a user meets them: on a line, in a notebook."""
 
+import base64
+import io
+import logging
+import pickle
+import re
 import runpy
 import warnings
 from pathlib import Path
+from xml.etree import ElementTree
 
+import numpy as np
+import PIL.Image
 import pytest
+import torch
 
+import diffsim_ti as ds
+from diffsim_ti import notebook
+from diffsim_ti.common import progress
 from diffsim_ti.common.warn import warn
+from diffsim_ti.monitor.quantities import TetrahedronFields
+from diffsim_ti.torch_bridge.rollout_node import rollout_frames
+from diffsim_ti.verify import GradientCheck, GradientReport
+from diffsim_ti.writers import WRITERS, Frame, Setting, View, open_writer
 
 PACKAGE = Path(__file__).parent.parent / "diffsim_ti"
 
@@ -16,8 +32,7 @@ import numpy as np
 import torch
 
 import diffsim_ti as ds
-from diffsim_ti.diff_physics import DifferentiableMaterial, conjugate_gradient
-from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+from diffsim_ti.diff_physics import conjugate_gradient
 from diffsim_ti.optimization import load_state, save_state
 from diffsim_ti.torch_bridge.step_sizes import bounded
 from diffsim_ti.torch_bridge.rollout_node import rollout_frames
@@ -96,3 +111,101 @@ def test_users_may_silence_a_warning_by_its_words():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", "vertex")
         warn("vertex 1 is loose")
+
+
+# ---- logging ----------------------------------------------------------------------------------------------------------
+
+
+def test_long_work_says_how_far_it_is(caplog, capfd, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    scene = ds.Scene(ds.TetrahedralMesh.create_cube(2), ds.StableNeoHookean(1e5, 0.3), terms=ds.Gravity(), fixed="ymin")
+    with caplog.at_level(logging.INFO, "diffsim_ti"):
+        seen = ds.Rollout(ds.StaticSolver(scene), 1).forward(youngs_modulus=8e4)
+        rollout = ds.Rollout(ds.StaticSolver(scene), 1)
+        ds.identify(rollout, {"positions": seen.positions}, {"youngs_modulus": 1e5}, noise=1e-4, check_mesh=False)
+    said = [record.getMessage() for record in caplog.records if record.name == "diffsim_ti"]
+    assert any(re.fullmatch(r"step 0: \d+ Newton iterations, residual \S+", line) for line in said)
+    assert any(re.match(r"identify: 1 of 50, chi\^2 .* youngs_modulus", line) for line in said)
+    monkeypatch.setattr(progress, "EVERY", 3600.0)
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "diffsim_ti"):
+        rollout.forward()
+    assert not caplog.records and capfd.readouterr() == ("", "")
+
+
+# ---- what objects say of themselves -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def objects() -> dict:
+    """One of each kind, with more numbers than anyone reads."""
+    mesh = ds.TetrahedralMesh.create_cube(4, 0.2)
+    each = np.linspace(1e5, 2e5, mesh.num_tetrahedra)
+    terms = [ds.Gravity(), ds.ExternalForce(np.full((mesh.num_vertices, 3), 1e-3))]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(each, 0.3), terms=terms, fixed="ymin")
+    solver = ds.StaticSolver(scene)
+    rollout, batch = ds.Rollout(solver, 2, save_every=1, outputs=ds.Stress()), ds.Batch(solver, 1, 2)
+    frames, modes, test = rollout.forward(), ds.modes(scene, 12), ds.ModalTest(scene, 12)
+    found = ds.identify(test, {"frequencies": modes.frequencies}, {"density": 900.0}, noise=1e-3, check_mesh=False)
+    return dict(
+        mesh=mesh,
+        scene=scene,
+        solver=solver,
+        rollout=rollout,
+        frames=frames,
+        end=ds.Rollout(solver, 1).forward(),
+        run=frames.run,
+        unpickled=pickle.loads(pickle.dumps(frames)),
+        simulator=ds.Simulator(solver),
+        fields=TetrahedronFields(each, each, each),
+        batch=batch,
+        of_batch=batch.forward(density=np.array([900.0, 1000.0])),
+        tensors=rollout_frames(rollout, density=torch.tensor(900.0)),
+        batch_tensors=rollout_frames(batch, density=torch.tensor([900.0, 1000.0])),
+        modes=modes,
+        modal_test=test,
+        found=found,
+        information=found.information,
+        expected=ds.expected(test, "frequencies", {"density": 900.0}, noise=1e-3),
+        measurement=ds.Measurement("positions", frames.positions, 1e-3),
+        unknown=ds.Unknown(each),
+        report=rollout.report,
+        gradients=GradientReport([GradientCheck("density", 1.0, 1.0, 1e-9, 1e-8, 2.0, "right", "")]),
+        frame=Frame.of_run(scene, frames),
+        setting=Setting.of(scene),
+    )
+
+
+def test_reprs_are_one_screen_without_arrays(objects):
+    for name, x in objects.items():
+        said = repr(x)
+        assert len(said) < 1200 and said.count("\n") < 20, name
+        assert " object at 0x" not in said and "array([" not in said and "tensor([" not in said, (name, said)
+    assert repr(objects["frames"]).startswith("Frames(positions=(3, 64, 3) from -")
+    assert "velocities=(3, 64, 3) all 0, " in repr(objects["frames"])
+    assert "scene" not in repr(objects["simulator"]) and "step 0, t = 0 s" in repr(objects["simulator"])
+    assert repr(objects["unknown"]) == "Unknown(start=(162,) from 1e+05 to 2e+05)"
+
+
+def test_a_notebook_shows_tables_pictures_and_films(objects):
+    shown = {name: x._repr_html_() for name, x in objects.items() if type(x) in notebook.FORMS}
+    assert {type(objects[name]) for name in shown} == set(notebook.FORMS)
+    for name, html in shown.items():
+        ElementTree.fromstring(f"<div>{html}</div>")
+        assert len(html) < 4e5 and "<table" in html, name
+    kinds = {name: re.findall(r"data:image/(\w+);base64,([^\"]+)", html) for name, html in shown.items()}
+    assert {name for name, found in kinds.items() if found} == {"mesh", "scene", "simulator", "frames", "end"}
+    for name, found in kinds.items():
+        for kind, data in found:
+            image = PIL.Image.open(io.BytesIO(base64.b64decode(data)))
+            assert image.format.lower() == kind and image.size == notebook.SIZE
+            assert getattr(image, "n_frames", 1) == (3 if name == "frames" else 1)
+    assert "Poisson" not in shown["found"] and "density" in shown["found"] and "95 %" in shown["found"]
+
+
+@pytest.mark.parametrize("suffix", sorted({kind.suffixes[0] for kind in WRITERS.values()}))
+def test_writers_work_with_their_defaults(objects, tmp_path, suffix):
+    """`View()` and the last frame."""
+    with open_writer(tmp_path / f"run{suffix}", objects["scene"], View()) as out:
+        out.write(Frame.of_run(objects["scene"], objects["frames"]))
+    assert out.count == 1 and (tmp_path / f"run{suffix}").stat().st_size > 100

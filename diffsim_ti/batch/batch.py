@@ -105,6 +105,10 @@ class Batch:
         own["runs"] = self.tape_face.runs
         return made_again, (Batch, own)
 
+    def __repr__(self) -> str:
+        how = "side by side" if self.lanes else "one after another"
+        return f"Batch({self.num_scenes} scenes {how} of {self.one!r})"
+
     @property
     def outputs(self) -> dict[str, Output]:
         """The outputs of one scene."""
@@ -170,6 +174,7 @@ class Batch:
         own = self.sweep.values_of(values, b)
         frames = Frames(*(x[b] for x in states), times, own, resolution, run=Run(own))
         frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
+        frames.scene = self.scene
         for name, output in self.one.computed.items():
             frames.outputs[name] = np.asarray(output.value(frames))
         return frames

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import as_numbers
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.run import Run
@@ -68,6 +69,12 @@ class BatchFrames(Sequence):
 
     def __len__(self) -> int:
         return len(self._frames)
+
+    def __repr__(self) -> str:
+        dead = len(self) - int(self.alive.sum())
+        own = [f"{len(self)} scenes", f"times={brief(self.times)}", f"positions={brief(self.positions)}"]
+        own += [f"outputs={brief(self.outputs)}"] * bool(self.outputs) + [f"{dead} stopped before the end"] * bool(dead)
+        return f"BatchFrames({', '.join(own)})"
 
     def __getitem__(self, key):
         if isinstance(key, str):

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import numbers, wholes
 from diffsim_ti.common.origin import rounding_of
 from diffsim_ti.common.warn import warn
@@ -46,6 +47,10 @@ class Measurement:
                 f"{output}: noise of shape {self.noise.shape} does not fit values of shape {self.values.shape}"
             )
         self.deviation = np.broadcast_to(self.noise, self.values.shape)[self.seen]
+
+    def __repr__(self) -> str:
+        at = "" if self.at is None else f", at {len(self.at)} items"
+        return f"Measurement({self.output!r}, {brief(self.values)}, noise={brief(self.noise)}{at})"
 
     def check(self, rollout: Rollout) -> None:
         """Raise ValueError unless this is a measurement of that rollout."""

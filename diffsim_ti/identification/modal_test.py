@@ -52,6 +52,9 @@ class ModalTest:
         self.outputs = {"frequencies": _Frequencies(self.k)}
         self._rows: tuple[Modes, dict[int, dict]] | None = None
 
+    def __repr__(self) -> str:
+        return f"ModalTest({self.scene!r}, {self.k})"
+
     def forward(self, **values) -> Modes:
         """The modes with some of the scene's numbers replaced."""
         return modes(self.scene, self.k, **values)

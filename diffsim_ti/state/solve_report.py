@@ -5,6 +5,7 @@ from collections import deque
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.copies import CarriesMore
 from diffsim_ti.common.progress import Steady
 
@@ -21,7 +22,7 @@ class Buckled(CarriesMore, UserWarning):
         self.step, self.saddles, self.unstable = step, saddles, unstable
 
 
-@dataclass
+@dataclass(repr=False)
 class StepReport:
     """Solves of one step of an implicit or static solver, all of its substeps together.
 
@@ -42,6 +43,8 @@ class StepReport:
     saddles: int = 0
     seconds: float = 0.0
     residuals: list | None = None
+
+    __repr__ = brief_fields
 
     def add(self, solve) -> None:
         """Add what a solve took (NewtonReport)."""

@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.progress import progress
 from diffsim_ti.monitor.stability import element_limit
 from diffsim_ti.rollout import Frames, Rollout
@@ -44,7 +45,7 @@ class Settings:
         return Rollout(solver, self.frames, save_every=1)
 
 
-@dataclass
+@dataclass(repr=False)
 class Sweep:
     """Rows of a sweep, one for each point of the grid, in its order; the first axis varies slowest.
 
@@ -53,6 +54,8 @@ class Sweep:
 
     over: dict[str, list[float]]
     rows: list[dict]
+
+    __repr__ = brief_fields
 
     @property
     def results(self) -> list[str]:
