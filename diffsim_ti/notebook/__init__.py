@@ -204,5 +204,6 @@ FORMS: dict[type, Callable] = {
     SolveReport: of_report,
     GradientReport: of_gradient_report,
 }
+METHOD = "_repr_html_"  # what IPython asks an object for
 for kind, form in FORMS.items():
-    setattr(kind, "_repr_html_", form)
+    setattr(kind, METHOD, form)
