@@ -12,6 +12,7 @@ from diffsim_ti.common import answers, deprecated, interrupts
 interrupts.guard_import()
 
 import diffsim_ti.runtime  # noqa: F401  before anything imports taichi: it chooses which
+from diffsim_ti import notebook  # noqa: F401  gives classes their form there
 from diffsim_ti.batch import Batch, BatchFrames
 from diffsim_ti.identification import (
     Identification,

@@ -4,7 +4,6 @@ No physics lives here: forward is a run of a Rollout's sweep, backward pulls bac
 """
 
 import math
-import warnings
 from collections.abc import Iterable
 from typing import Literal
 
@@ -17,6 +16,7 @@ from diffsim_ti.common import deprecated
 from diffsim_ti.common.answers import answered
 from diffsim_ti.common.origin import middle_far_part, warn_of_rounding
 from diffsim_ti.common.public import Public, check_options
+from diffsim_ti.common.warn import warn
 from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial, refuse_state
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import stability
@@ -343,9 +343,8 @@ class DifferentiableSimulator(metaclass=Public):
         omega2 += self._contact_rigidity(scene, values) * barrier.REFERENCE_CURVATURE
         needed = math.ceil(self.solver.dt * math.sqrt(omega2) / 2 / 0.8)
         if needed > self._substeps:
-            warnings.warn(
+            warn(
                 f"dt = {self.solver.dt:g} s is divided into {needed} substeps (asked for at least {self.solver.substeps}), "
-                "which stability and contact ask for",
-                stacklevel=4,
+                "which stability and contact ask for"
             )
             self._substeps, self._rollouts = needed, {}

@@ -132,7 +132,7 @@ class GradientCheck:
         return self.verdict == RIGHT
 
 
-@dataclass
+@dataclass(repr=False)
 class GradientReport:
     """The rows of `check_gradients` and notes on how they were found; `passed` if all are right; `str()` is the table."""
 
@@ -158,6 +158,8 @@ class GradientReport:
             )
         lines += [f"{r.input}: {r.advice}" for r in self.rows if r.advice]
         return "\n".join(lines + self.notes)
+
+    __repr__ = __str__
 
 
 class _Pulled:
@@ -414,7 +416,7 @@ class Judgement:
         return f"{changes}: {hides}{fewer}"
 
 
-@dataclass
+@dataclass(repr=False)
 class GradientHealth:
     """How an adjoint grows through a reverse sweep: norms per step (last step first), growth rate [1/s] and horizon."""
 
@@ -427,6 +429,8 @@ class GradientHealth:
         where = "never" if self.exceeded_at is None else f"going back past step {self.exceeded_at}"
         norms = f"{self.norms[0]:.3g} to {self.norms[-1]:.3g}"
         return f"adjoint norm {norms}, growth {self.growth_rate:.3g} 1/s, limit exceeded {where}"
+
+    __repr__ = __str__
 
 
 @public

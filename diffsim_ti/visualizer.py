@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
 from diffsim_ti.common.answers import answered
+from diffsim_ti.common.progress import LOG
 from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import Mark
@@ -26,8 +27,8 @@ class SimulationVisualizer(metaclass=Public):
     """Shows a mesh whose positions change: `update(positions)` while it runs, `show()` at the end.
 
     With a display and a Vulkan driver: a Taichi window (the right button turns, Escape closes). Otherwise
-    `show()` writes a PNG to `path` and prints where. `has_window` says which. ground, obstacles and look are as in
-    `save_picture`; `update(positions, marks)` shows arrows and lines, as `save_picture` takes them.
+    `show()` writes a PNG to `path` and says where, by the logger "diffsim_ti". `has_window` says which. ground, obstacles
+    and look are as in `save_picture`; `update(positions, marks)` shows arrows and lines, as `save_picture` takes them.
     """
 
     def __init__(
@@ -60,12 +61,12 @@ class SimulationVisualizer(metaclass=Public):
             self._scene.draw(self.positions, marks)
 
     def show(self) -> None:
-        """Keep the window open until it is closed; without one, write the picture and print its path."""
+        """Keep the window open until it is closed; without one, write the picture and log its path."""
         if not self.has_window:
             from diffsim_ti.picture import save_picture
 
             save_picture(self.path, self.mesh, self.positions, ground=self.ground, marks=self.marks, **self.look)
-            print(f"no display: picture written to {self.path}")
+            LOG.warning("no display: picture written to %s", self.path)
             return
         while self.window.running:
             self._scene.draw(self.positions, self.marks)

@@ -355,8 +355,9 @@ def test_a_scene_by_turns_fails_alone_whatever_is_given_over_time(given, solver)
     seed = rng.normal(size=frames.positions.shape)
     with pytest.warns(UserWarning, match=r"scenes \[0, 3\] did not come to their end: their gradients are zero"):
         gradients = batch.vjp(frames, seed)
-    with pytest.warns(UserWarning, match="their changes are zero"):
+    with pytest.warns(UserWarning, match="their changes are zero") as said:
         changes = batch.tangents(frames, initial_velocities=speed)
+    assert said[0].filename == __file__
     total = {}
     for b in (1, 2):
         alone = batch.one.forward(**{name: x[b] for name, x in own.items()})

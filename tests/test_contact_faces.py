@@ -266,8 +266,9 @@ def test_obstacles_larger_than_triangles_cost_nothing(obstacle):
 def test_a_pass_that_cannot_follow_says_so(monkeypatch):
     monkeypatch.setattr(FaceContactPoints, "most_parts", 1)
     simulator = ds.Simulator(ds.VelocityVerletSolver(pressed("capsule", 2000.0), dt=2e-3))
-    with pytest.warns(UserWarning, match=r"of faces was stiffer than the substep 0.002 s .*take substeps of"):
+    with pytest.warns(UserWarning, match=r"of faces was stiffer than the substep 0.002 s .*take substeps of") as said:
         simulator.run(3)
+    assert said[0].filename == __file__
     resolution = simulator.contact_resolution
     assert not resolution.resolved and len(resolution.vertex) == 3 and "of face (" in str(resolution)
 

@@ -159,6 +159,7 @@ def test_a_block_that_shakes_while_it_slides_says_so_and_viscosity_helps(solver)
     block = ds.StableNeoHookean(1e6, 0.3)
     with pytest.warns(UserWarning, match="slides on Ground.*vibrates at") as warned:
         assert way(block) > 1.02
+    assert warned[0].filename == __file__
     time = float(re.search(r"KelvinVoigt\(StableNeoHookean\(...\), (\S+)\)", str(warned[0].message))[1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")

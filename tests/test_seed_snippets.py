@@ -53,12 +53,12 @@ def test_custom_mesh(names, capsys, monkeypatch):
     assert re.fullmatch(r"Vertices: \d{3,}, Tetrahedra: \d{3,}\n", capsys.readouterr().out)
 
 
-def test_visualization(names, capsys, monkeypatch, tmp_path):
+def test_visualization(names, caplog, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     run("Visualization", names)
-    assert "picture written to output/simulation.png" in capsys.readouterr().out
+    assert "picture written to output/simulation.png" in caplog.text
     assert (tmp_path / "output" / "simulation.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert not names["viz"].has_window and np.array_equal(names["viz"].positions.shape, (125, 3))
     with pytest.raises(ValueError, match=r"positions: expected shape \(125, 3\), got \(3,\)"):

@@ -1,6 +1,5 @@
 """Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents together."""
 
-import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -17,6 +16,7 @@ from diffsim_ti.common.copies import made_again
 from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import positions_of
 from diffsim_ti.common.public import Public
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mesh.collision_surface import BOWED
@@ -108,6 +108,10 @@ class Batch(metaclass=Public):
         own["runs"] = self.tape_face.runs
         return made_again, (Batch, own)
 
+    def __repr__(self) -> str:
+        how = "side by side" if self.lanes else "one after another"
+        return f"Batch({self.num_scenes} scenes {how} of {self.one!r})"
+
     @property
     def outputs(self) -> dict[str, Output]:
         """The outputs of one scene."""
@@ -173,6 +177,7 @@ class Batch(metaclass=Public):
         own = self.sweep.values_of(values, b)
         frames = Frames(*(x[b] for x in states), times, own, resolution, run=Run(own))
         frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
+        frames.scene = self.scene
         for name, output in self.one.computed.items():
             frames.outputs[name] = np.asarray(output.value(frames))
         return frames
@@ -236,7 +241,7 @@ class Batch(metaclass=Public):
     def _warn_of_dead(frames: BatchFrames, what: str) -> None:
         dead = np.flatnonzero(~frames.alive)
         if dead.size:
-            warnings.warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero", stacklevel=3)
+            warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero")
 
     def _vjp_side_by_side(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
         shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import as_numbers
 from diffsim_ti.common.names import no_such
 from diffsim_ti.common.public import Public
@@ -70,6 +71,12 @@ class BatchFrames(Sequence, metaclass=Public):
 
     def __len__(self) -> int:
         return len(self._frames)
+
+    def __repr__(self) -> str:
+        dead = len(self) - int(self.alive.sum())
+        own = [f"{len(self)} scenes", f"times={brief(self.times)}", f"positions={brief(self.positions)}"]
+        own += [f"outputs={brief(self.outputs)}"] * bool(self.outputs) + [f"{dead} stopped before the end"] * bool(dead)
+        return f"BatchFrames({', '.join(own)})"
 
     @overload
     def __getitem__(self, key: str) -> np.ndarray: ...

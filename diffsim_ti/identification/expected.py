@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import public
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.priors import Priors
@@ -14,7 +15,7 @@ from diffsim_ti.identification.problem import Experiment, Problem, is_experiment
 from diffsim_ti.identification.result import Information, described
 
 
-@dataclass
+@dataclass(repr=False)
 class Expectation:
     """What an experiment would tell: standard errors, 95 % intervals about the numbers assumed, what it leaves open."""
 
@@ -23,6 +24,8 @@ class Expectation:
     intervals: dict
     covariance: np.ndarray
     information: Information
+
+    __repr__ = brief_fields
 
     @property
     def unseen(self) -> list[dict[str, float]]:

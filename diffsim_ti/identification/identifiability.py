@@ -10,7 +10,7 @@ from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Rollout
 
 
-@dataclass
+@dataclass(repr=False)
 class Identifiability:
     """What the frames' positions tell of some inputs: eigenvalues of the Fisher matrix, smallest first, in m^2.
 
@@ -33,6 +33,8 @@ class Identifiability:
             parts = ", ".join(f"{name} {np.array2string(np.asarray(x), precision=3)}" for name, x in direction.items())
             lines.append(f"{value:10.3e} m^2 {'NOT SEEN' if k < self.num_singular else ''} {parts}")
         return "\n".join(lines)
+
+    __repr__ = __str__
 
 
 @public

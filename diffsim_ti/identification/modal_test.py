@@ -54,6 +54,9 @@ class ModalTest(metaclass=Public):
         self.outputs = {"frequencies": _Frequencies(self.k)}
         self._rows: tuple[Modes, dict[int, dict]] | None = None
 
+    def __repr__(self) -> str:
+        return f"ModalTest({self.scene!r}, {self.k})"
+
     def forward(self, **values: InputValue) -> Modes:
         """The modes with some of the scene's numbers replaced."""
         return modes(self.scene, self.k, **values)

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import numbers, shape_of, shown
 from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
@@ -45,6 +46,10 @@ class Unknown(metaclass=Public):
             raise ValueError(f"Unknown: start = {self.start} must lie inside range = {range}")
         if range is not None and scale is not None:
             raise ValueError("Unknown: give range or scale, not both")
+
+    def __repr__(self) -> str:
+        given = {name: x for name, x in vars(self).items() if x is not None}
+        return f"Unknown({', '.join(f'{name}={brief(x)}' for name, x in given.items())})"
 
 
 class Free:

@@ -1,6 +1,5 @@
 """What meshes come from and go to: files, surfaces, objects of meshio and PyVista."""
 
-import warnings
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -9,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.files import KEEPS_SETS, as_meshio, parts_of, read_mesh, write_mesh
 from diffsim_ti.mesh.filling import filled
 from diffsim_ti.mesh.sets import without_unused
@@ -76,7 +76,7 @@ class Exchange:
         lost = write_mesh(path, self)
         if lost:
             kept = ", ".join(KEEPS_SETS)
-            warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)
+            warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}")
 
     @classmethod
     def from_surface(cls, points: ArrayLike, triangles: ArrayLike, size: float | None = None) -> "Self":

@@ -1,12 +1,13 @@
 """Noticing that a run goes wrong, and saying where, when and why."""
 
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.copies import CarriesMore
+from diffsim_ti.common.progress import Steady
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.chatter import Chatter
@@ -70,7 +71,7 @@ class Guard:
             self.ws.energy_watch.clear()
         pulled = self.ws.arrays.features().pulled  # which squeezes a calm start
         soon = solver.explicit and (solver.starts_deformed() or pulled)
-        self._passes, self.every = 0, self.first if soon else self.usual
+        self._passes, self.every, self.steady = 0, self.first if soon else self.usual, Steady()
 
     def mark(self, now: int) -> None:
         """The current state, before pass `now`, is good: keep it."""
@@ -134,6 +135,8 @@ class Guard:
                     self.chatter.check(stop, num_passes)
                 self._check_step(stop, num_passes)
             first = stop
+            if first < last:
+                self.steady.log("substep %s of %s", first, num_passes)
 
     def _warn_of_stiff_contact(self, now: int, num_passes: int) -> None:
         """Once, where a barrier was stiffer than a step can follow: energy may then come from nowhere."""
@@ -146,11 +149,10 @@ class Guard:
         for what, omega_dt, limit, enough in looks:
             if omega_dt > limit and not self._warned:
                 self._warned, step, h = True, self.ws.step_of(now - 1, num_passes), self.ws.substep
-                warnings.warn(
+                warn(
                     f"{self.ws.when(step)}: a contact {what}was stiffer than the substep {h:.3g} s "
                     f"can follow (omega dt = {omega_dt:.3g} > {limit}), so that energy may be gained in it: take substeps "
-                    f"of {enough * h / omega_dt:.3g} s, or a softer or wider barrier",
-                    stacklevel=5,
+                    f"of {enough * h / omega_dt:.3g} s, or a softer or wider barrier"
                 )
 
     def _warn_of_gained_energy(self, now: int, num_passes: int) -> None:
@@ -168,7 +170,7 @@ class Guard:
             f"{self.ws.substep:.3g} s: take substeps of {enough:.3g} s, or {others}"
         )
         about = watch.gained, watch.share, step, float(solver.schedule.time(step)), enough
-        warnings.warn(EnergyGained(said, *about), stacklevel=5)
+        warn(EnergyGained(said, *about))
 
     def _check_step(self, now: int, num_passes: int) -> None:
         solver = self.ws.solver

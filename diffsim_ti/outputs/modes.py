@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.checked import shown
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.inputs import StressPoints
@@ -17,7 +18,7 @@ from diffsim_ti.scene import Scene
 SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to which all of them are computed
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Modes(metaclass=Public):
     """frequencies [Hz], ascending, shape (k,), negative where the state is unstable (lambda < 0: -sqrt(-lambda) / 2 pi);
     eigenvalues lambda = (2 pi f)^2 [1/s^2]; shapes [1/sqrt(kg)], (k, num_vertices, 3), with shapes_i . M shapes_j = 1 where
@@ -30,6 +31,8 @@ class Modes(metaclass=Public):
     groups: list[list[int]]
     scene: Scene = field(repr=False)
     displacements: np.ndarray = field(repr=False)
+
+    __repr__ = brief_fields
 
     def __getitem__(self, name: str) -> np.ndarray:
         """What `Frames` call outputs: frequencies."""

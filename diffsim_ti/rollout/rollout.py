@@ -150,6 +150,11 @@ class Rollout(metaclass=Public):
             out[output.name] = output.settled(self.scene)
         return out
 
+    def __repr__(self) -> str:
+        own = [repr(self.solver), f"{self.steps} steps, {self.num_frames} frames"]
+        own += [f"outputs {', '.join(self.computed)}"] if self.computed else []
+        return f"Rollout({', '.join(own)}, gradients by {', '.join(self.wanted) or 'nothing'})"
+
     def with_scene(self, **changes: Unpack[SceneArguments]) -> "Rollout":
         """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
         return self.on(self.solver.for_scene(self.scene.replace(**changes)))
@@ -220,7 +225,7 @@ class Rollout(metaclass=Public):
             start = dict(initial_positions=positions[0], initial_velocities=v[0])
             inputs = inputs | {name: x.astype(np.float64) for name, x in start.items()}
         frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
-        frames.computed = self.computed
+        frames.computed, frames.scene = self.computed, self.scene
         frames.steps = np.arange(self.num_frames) * self.save_every
         frames.error = run.error
         for name, x in self.sweep.noted_values().items():

@@ -114,6 +114,9 @@ class Simulator(metaclass=Public):
             "Simulator(solver), resume(state)"
         )
 
+    def __repr__(self) -> str:
+        return f"Simulator({self.solver!r}, {self.scene.mesh!r}, step {self.step_count}, t = {self.time:.6g} s)"
+
     def reset(self) -> None:
         """Back to the start of the scene."""
         self.step_count = 0

@@ -1,12 +1,12 @@
 """n steps of a solver on the device: forward, in reverse from kept states, and in tangents."""
 
-import warnings
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import as_numbers, listed, number, whole
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.outputs.output import NOTED
@@ -316,7 +316,7 @@ class Sweep:
         return derived
 
     def _no_adjoints(self, run: Run, seed: Seed) -> Derived:
-        warnings.warn(f"the gradient of a run that was stopped is zero: {run.error}", stacklevel=4)
+        warn(f"the gradient of a run that was stopped is zero: {run.error}")
         self._make_ready()
         seed.put(self._adjoint, self.solver.last_frame_is_state)
         derived, _ = seed.collect(self._adjoint, True)
@@ -408,11 +408,10 @@ class Sweep:
 def _warn_of_coarse_steps(solver: Solver, seen: ContactResolution) -> None:
     """Contacts that the steps hardly resolve."""
     damped = solver.stages_contact and solver.contact_damping > 0
-    warnings.warn(
+    warn(
         f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
         f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier"
-        + (", or a smaller contact_damping" if damped else ""),
-        stacklevel=4,
+        + (", or a smaller contact_damping" if damped else "")
     )
 
 
@@ -421,8 +420,7 @@ def _warn_of_explosion(of_frames: tuple, of_start: tuple, duration: float) -> No
     duration [s] of the run."""
     start, end = (by_u + by_v / duration for by_u, by_v in (of_frames, of_start))
     if end > 1e8 * start > 0:
-        warnings.warn(
+        warn(
             f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this "
-            "gradient is of little use; shorten the rollout, pass truncate=, or see gradient_health",
-            stacklevel=4,
+            "gradient is of little use; shorten the rollout, pass truncate=, or see gradient_health"
         )

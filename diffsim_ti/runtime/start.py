@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import shutil
 import tempfile
-import warnings
 import weakref
 from typing import Literal, TypedDict
 
@@ -21,6 +20,7 @@ from typing_extensions import Unpack
 from diffsim_ti.common import ranks
 from diffsim_ti.common.deprecated import renamed_arguments
 from diffsim_ti.common.names import nearest
+from diffsim_ti.common.warn import warn
 from diffsim_ti.runtime.current_program import current_program
 from diffsim_ti.runtime.device import count_cards
 from diffsim_ti.runtime.threads import LOCK, materialize
@@ -212,10 +212,9 @@ def check_host_init() -> None:
     config = impl.current_cfg()
     if config.fast_math and not _settings.get("warned"):
         _settings["warned"] = True
-        warnings.warn(
+        warn(
             "ti.init was called with fast_math=True, which can erase NaNs before they are seen; "
-            "use diffsim_ti.init(), or ti.init(fast_math=False, default_fp=ti.f64)",
-            stacklevel=3,
+            "use diffsim_ti.init(), or ti.init(fast_math=False, default_fp=ti.f64)"
         )
 
 

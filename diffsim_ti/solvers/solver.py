@@ -1,7 +1,6 @@
 """What every solver is: a scene, a step, and how the step is divided."""
 
 import math
-import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal, TypedDict
 
@@ -12,6 +11,7 @@ from typing_extensions import Unpack
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import number, shown, whole
 from diffsim_ti.common.public import Public
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.monitor import stability
 from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
@@ -236,10 +236,9 @@ class Solver(metaclass=Public):
         of = f" of scene {b}, the stiffest of {len(each)}," if values else ""
         needed = math.ceil(self.dt / (share * stable.dt))
         if needed > self.substeps:
-            warnings.warn(
+            warn(
                 f"dt = {self.dt:g} s is divided into {needed} substeps (asked for at least {self.substeps}): "
-                f"the stable step{of} is {stable}",
-                stacklevel=2 if values else 4,  # through bind and a constructor to the user's line
+                f"the stable step{of} is {stable}"
             )
             self.substeps = needed
 

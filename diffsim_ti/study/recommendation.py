@@ -29,7 +29,7 @@ class Option:
         return f"{self.solver.__name__}, {self.substep:.3g} s, {self.precision}"
 
 
-@dataclass
+@dataclass(repr=False)
 class Recommendation:
     """What to use: `solver`, `dt` [s], `steps`, `precision`, `memory` [MB] for the checkpoints, `element`; what to expect
     of it: `seconds` of wall time, `megabytes` kept for gradients, `error` relative to the largest displacement.
@@ -79,3 +79,5 @@ class Recommendation:
                 "left out: " + "; ".join(self.left_out),
             ]
         )
+
+    __repr__ = __str__

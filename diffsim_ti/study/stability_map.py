@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import public
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.rollout.simulator import Simulator
@@ -128,7 +129,7 @@ def boundary(scene: Scene, kind: type[Solver], steps: int = 2000, accuracy: floa
     return float(np.sqrt(low * high))
 
 
-@dataclass
+@dataclass(repr=False)
 class StabilityMap:
     """Runs over dt (rows, as shares of the explicit limit) x an axis (columns), with the limits [s] of the columns.
 
@@ -141,6 +142,8 @@ class StabilityMap:
     limits: np.ndarray
     runs: list[list[Run]]
     bounds: np.ndarray
+
+    __repr__ = brief_fields
 
     @property
     def explicit(self) -> bool:

@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.progress import progress
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.monitor.stability import element_limit
@@ -45,7 +46,7 @@ class Settings(metaclass=Public):
         return Rollout(solver, self.frames, save_every=1)
 
 
-@dataclass
+@dataclass(repr=False)
 class Sweep:
     """Rows of a sweep, one for each point of the grid, in its order; the first axis varies slowest.
 
@@ -54,6 +55,8 @@ class Sweep:
 
     over: dict[str, list[float]]
     rows: list[dict]
+
+    __repr__ = brief_fields
 
     @property
     def results(self) -> list[str]:

@@ -1,12 +1,12 @@
 """Contact of the surface with itself, and of several bodies with each other."""
 
-import warnings
 from collections.abc import Mapping
 
 import numpy as np
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.common.rows import indices
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.collision_surface import cuts_of
@@ -112,11 +112,10 @@ class SelfContact(Term):
         width = float(own.values["self_contact_width"])
         off = bow(mesh) / 4 ** cuts_of(mesh, own)  # so far faces may reach through
         if off > width:
-            warnings.warn(
+            warn(
                 f"{type(self).__name__}: faces of this mesh are curved, and lie up to {off:.3g} m from the triangles that "
                 f"stand for each, more than the width {width:.3g} m: refine the mesh where it is curved, or take a wider "
-                "one",
-                stacklevel=3,
+                "one"
             )
         if self.has_friction:
             self.labels(mesh)

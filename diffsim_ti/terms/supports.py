@@ -1,6 +1,5 @@
 """Supports: which vertices do not move freely, and in which directions."""
 
-import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import ArrayLike
 from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import numbers, shown
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs.posed_supports import PosedSupport
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import triangle_normals
@@ -148,10 +148,9 @@ def _warn_of_several_bodies(mesh: TetrahedralMesh, fixed: Fixed | None) -> None:
     given = [fixed] if isinstance(fixed, str) else fixed if isinstance(fixed, Mapping | list | tuple) else ()
     for name in (name for name in given if isinstance(name, str)):
         if parts := parts_of_joined(mesh, name):
-            warnings.warn(
+            warn(
                 f"fixed: {name!r} contains {len(parts)} bodies, whose sets of this name were joined; name those that are "
-                f"meant: {', '.join(map(repr, parts))}",
-                stacklevel=4,
+                f"meant: {', '.join(map(repr, parts))}"
             )
 
 

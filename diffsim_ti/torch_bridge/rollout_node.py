@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from diffsim_ti.batch import Batch
+from diffsim_ti.common.brief import brief
 from diffsim_ti.common.origin import START_NEARER, warn_of_rounding
 from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
@@ -37,6 +38,9 @@ class TorchFrames(_States, metaclass=Public):
         frames = super().__new__(cls, positions, velocities, displacements)
         frames.outputs, frames.alive = outputs or {}, alive
         return frames
+
+    def __repr__(self) -> str:
+        return f"TorchFrames({brief(self._asdict() | self.outputs)[1:-1]})"
 
     def __getitem__(self, key):
         if isinstance(key, str):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
@@ -22,7 +23,7 @@ from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.scene_marks import marks_of
 
 
-@dataclass
+@dataclass(repr=False)
 class Setting(metaclass=Public):
     """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand.
 
@@ -36,6 +37,8 @@ class Setting(metaclass=Public):
     obstacles: list[Triangles] = field(default_factory=list)
     held: np.ndarray | None = None
 
+    __repr__ = brief_fields
+
     @classmethod
     def of(cls, scene: Scene) -> "Setting":
         """A scene's."""
@@ -43,7 +46,7 @@ class Setting(metaclass=Public):
         return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene), held)
 
 
-@dataclass
+@dataclass(repr=False)
 class Frame(metaclass=Public):
     """A moment of a run.
 
@@ -65,15 +68,17 @@ class Frame(metaclass=Public):
     marks: list[Mark] = field(default_factory=list)
     units: dict[str, str] = field(default_factory=dict)
 
+    __repr__ = brief_fields
+
     @property
     def colours(self) -> dict[str, np.ndarray]:
         """The fields that pictures can be coloured by."""
         return {name: values for name, values in self.fields.items() if name in FIELDS}
 
     @classmethod
-    def of_run(cls, scene: Scene, frames: Frames, k: int) -> "Frame":
-        """Frame k of a Rollout's run of a scene; its fields are displacement, speed, J, von Mises stress where `Stress`
-        supports the law, and the outputs that each vertex or each tetrahedron has: vectors such as
+    def of_run(cls, scene: Scene, frames: Frames, k: int = -1) -> "Frame":
+        """Frame k, default the last, of a Rollout's run of a scene; its fields are displacement, speed, J, von Mises stress
+        where `Stress` supports the law, and the outputs that each vertex or each tetrahedron has: vectors such as
         ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices"). What some vertices have,
         such as Reaction(per_vertex=True), is zero at the others.
 

@@ -1,6 +1,5 @@
 """A closed triangle mesh as an obstacle: its signed distance on a grid, between whose points cubic B-splines are C2."""
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +9,7 @@ from typing_extensions import Unpack
 
 from diffsim_ti.common.checked import numbers, whole, wholes
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
+from diffsim_ti.common.warn import warn
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
@@ -50,7 +50,7 @@ class MeshObstacle(Obstacle):
         width, vertices = float(self.values["barrier_width"]), self._surface[0]
         if self._rounding > OF_WIDTHS * width:
             coarse = f"float32 resolves vertices to {self._rounding:.2g} m, too little for the barrier's width"
-            warnings.warn(f"MeshObstacle: {coarse}: give them in float64", stacklevel=3)
+            warn(f"MeshObstacle: {coarse}: give them in float64")
         low, high = vertices.min(0), vertices.max(0)
         cell = (high - low).max() / self.resolution
         pad = width + 2 * cell

@@ -81,7 +81,7 @@ class Obstacle(Term):
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
         if "twin" in vars(cls):
-            deprecated.warn(f"{cls.__name__}.twin", "counterpart", 4)  # past ABCMeta
+            deprecated.warn(f"{cls.__name__}.twin", "counterpart")
             cls.counterpart = vars(cls)["twin"]
 
     def __init__(
