@@ -1,5 +1,7 @@
 """Simulator: the step-by-step interface of a solver."""
 
+import math
+import warnings
 import weakref
 
 import numpy as np
@@ -15,6 +17,7 @@ from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.solvers.substeps import MOST
 from diffsim_ti.state.bending import FacesBend
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactResolution
@@ -54,6 +57,7 @@ class Simulator:
                 "the solver has no scene: use Simulator(mesh, material, solver), or a solver made from a Scene"
             )
         self.solver, self.scene = solver, solver.scene
+        self._first_solver = solver  # whose substeps a reset goes back to
         solver.simulator = weakref.ref(self)
         self._start = solver.start_values()
         self._notes, self._settled = bool(contact_forces), {}
@@ -92,11 +96,13 @@ class Simulator:
         )
 
     def reset(self) -> None:
-        """Back to the start of the scene."""
+        """Back to the start of the scene, and to the substeps of its solver."""
+        self._take_solver(self._first_solver)
         self.step_count = 0
         self._set: dict[str, np.ndarray] = {}  # inputs that were set since
         self.workspace.load(self._start)
         self.workspace.report.clear()
+        self._guard.restart_with_solver()
         if self._notes:
             self.workspace.forget_contacts()
         if self._start.forces is not None and len(self._start.forces) == 1:
@@ -121,13 +127,35 @@ class Simulator:
         except FacesBend as bent:
             self._take_bent(bent.bend)
             return self.step()
-        except FloatingPointError:
+        except FloatingPointError as error:
             self.workspace.restore(self._before, 0)
             if self._notes:
                 self.workspace.forget_contacts()
-            raise
+            self._take_more_substeps(error)
+            return self.step()
         self.step_count += 1
         self.workspace.place_obstacles(int(self.solver.schedule.first(1)))
+
+    def _take_solver(self, solver: Solver) -> None:
+        self.solver = self.workspace.solver = solver
+
+    def _take_more_substeps(self, error: FloatingPointError) -> None:
+        """Go on with more substeps where their number was left to the solver and these help; else raise the error."""
+        enough = getattr(error, "enough", None)
+        if not self.solver.automatic or enough is None or not enough < self.solver.substep:
+            raise error
+        count = math.ceil(self.solver.dt / enough)
+        if count > MOST:
+            raise error
+        if self.solver is self._first_solver:
+            warnings.warn(
+                f"{self.workspace.when(self.step_count)}: steps are divided into more than {self.solver.substeps} substeps "
+                f"from here on, {count} in this one: pass substeps={count} for the same number from the start ({error})",
+                stacklevel=3,
+            )
+        self.workspace.report.substeps -= self.solver.num_passes(1)  # which are done again
+        self._take_solver(self.solver.with_substeps(count))
+        self.workspace.forget()
 
     def run(self, steps: int) -> None:
         """Advance by so many steps."""
@@ -189,7 +217,7 @@ class Simulator:
     def state(self) -> dict[str, np.ndarray]:
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
         two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps,
-        and the forces that `set_forces` gave. `np.savez(file, **simulator.state)` keeps it, to the bit."""
+        and the forces that `set_forces` gave, and substeps where more were taken than at the start. `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:
@@ -199,6 +227,8 @@ class Simulator:
             out["displacements_before"], out["velocities_before"] = before
         if self.workspace.last_multipliers is not None:
             out["constraint_pressures"] = self.workspace.last_multipliers
+        if self.solver is not self._first_solver:
+            out["substeps"] = np.array(int(self.solver.substeps))
         return out | self._set
 
     def resume(self, state: dict) -> None:
@@ -212,7 +242,8 @@ class Simulator:
         term = self.scene.term(ExternalForce)
         forces = set() if term is None else {self.scene.input_names(term)["external_forces"]}
         held = {"constraint_pressures"} if self.workspace.volumes and not self.solver.explicit else set()
-        optional = two_step | forces | held
+        more_substeps = {"substeps"} if self._first_solver.automatic else set()
+        optional = two_step | forces | held | more_substeps
         lacking, more = known.keys() - optional - given.keys(), given.keys() - known.keys() - optional
         if lacking or more or len(given.keys() & two_step) == 1:
             raise ValueError(
@@ -243,6 +274,8 @@ class Simulator:
             runtime.fill(now.before.v, given["velocities_before"][None])
             now.fresh[0] = False
         self.step_count = int(count)
+        if more_substeps & given.keys():
+            self._take_solver(self.solver.with_substeps(whole("substeps", given["substeps"], 1)))
         if held & given.keys():
             self.workspace.go_on_from(given["constraint_pressures"].copy(), self.step_count)
         self.workspace.place_obstacles(int(self.solver.schedule.first(1)) if count else 0)
