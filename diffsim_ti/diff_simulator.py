@@ -24,9 +24,10 @@ from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 from diffsim_ti.torch_bridge.autograd import torch, uncompiled
 from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
+from diffsim_ti.torch_bridge.simulator import TorchSimulator
 from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
 
-__all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "rollout_frames"]
+__all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "TorchSimulator", "rollout_frames"]
 
 
 class DifferentiableSolver:
