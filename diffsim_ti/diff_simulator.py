@@ -37,9 +37,9 @@ class DifferentiableSolver:
     velocity kept over one dt, whatever the substeps, default 1 (none).
     method: a solver class of the core: SemiImplicitSolver, VelocityVerletSolver, ImplicitEulerSolver,
     ImplicitMidpointSolver or BDF2Solver; options: further arguments of that class, such as tolerance=1e-9.
-    substeps: for explicit methods "auto", what stability and contact ask for at the start, or the least number: the simulator
-    raises it to that and says so once. The count only grows. Implicit methods take a number as it is, "auto" for one; their
-    gradients are as exact as `tolerance`.
+    substeps: for explicit methods "auto", what stability and contact ask for at the start, or the least number: the
+    simulator raises it to that and says so once. The count only grows. Implicit methods take a number as it is, "auto" for
+    one; their gradients are as exact as `tolerance`.
 
     BDF2Solver looks back two steps, but each `step()` and each `rollout()` starts afresh: `step()` refuses it, and
     `rollout(n)` takes its first step by backward Euler. Equilibria (StaticSolver) have no steps: use `rollout_frames`.

@@ -20,11 +20,13 @@ class StepValues:
     What a term has as a constant, or for each step, is held during the step. What it has by a function or by keyframes, as
     motions and paths are, goes linearly to the value that it is given, from where it was.
 
-    join: np.stack, or that of tensors. scenes: how many, where values may have an axis of scenes in front.
+    join: np.stack, or that of tensors, which may then be given. scenes: how many, where values may have an axis of scenes
+    in front.
     """
 
     def __init__(self, inputs: "Inputs", dt: float, join: Callable = np.stack, scenes: int | None = None):
         self.inputs, self.dt, self.join, self.scenes = inputs, dt, join, scenes
+        self.takes_tensors = join is not np.stack
         self.names = tuple(name for name, described in inputs.described.items() if described.is_per_step)
         self._own: set[str] = set()  # inputs that scenes have of their own
 
@@ -38,9 +40,14 @@ class StepValues:
                 raise ValueError(self._unknown(name))
         out = {name: self._staying(name, x) if self.is_ramp(name) else x for name, x in last.items()}
         for name, value in given.items():
-            tensor = hasattr(value, "detach")
+            tensor = self.takes_tensors and hasattr(value, "detach")
+            if getattr(value, "requires_grad", False) and not tensor:
+                raise ValueError(
+                    f"step: {name} is a tensor with a graph, which a Simulator would cut off: take "
+                    f"diff_simulator.TorchSimulator, or give {name}.detach()"
+                )
             out[name] = self._of_step(name, value if tensor else np.array(as_numbers(name, value)), step, last)
-            if not (tensor or self.scenes):  # which are checked where they run
+            if not self.takes_tensors:  # others are checked where they run
                 out |= self.inputs.check({name: out[name]})
         return out
 

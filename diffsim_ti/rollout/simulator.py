@@ -114,8 +114,8 @@ class Simulator:
         return self.step_count * self.solver.dt
 
     def step(self, **values: ArrayLike) -> None:
-        """Advance by solver.dt, with other values of inputs that can change in time, by the scene's names: forces, tractions,
-        pressures, tensions, activations, growth, motions and paths (`step_inputs` lists them).
+        """Advance by solver.dt, with other values of inputs that can change in time, by the scene's names: forces,
+        tractions, pressures, tensions, activations, growth, motions and paths (`step_inputs` lists them).
 
         What a term has as a constant, or for each step, is held during the step: one value in its shape, such as
         `step(activation=0.3)`. What it has by a function or by keyframes, as motions and paths are, goes linearly within the
@@ -240,7 +240,8 @@ class Simulator:
     def state(self) -> dict[str, np.ndarray]:
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
         two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps,
-        what steps were given over time, and substeps where more were taken than at the start. `np.savez(file, **simulator.state)` keeps it, to the bit."""
+        what steps were given over time, and substeps where more were taken than at the start.
+        `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:

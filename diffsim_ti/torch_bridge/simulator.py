@@ -42,7 +42,7 @@ class TorchSimulator:
     ...     simulator.step(**{"pull.forces": gain * (simulator.positions[7:8] - 1.1)})
     >>> simulator.positions[7].sum().backward()
     >>> print(f"{gain.grad:.1e}")
-    -1.1e-05
+    -1.7e-06
     """
 
     def __init__(
@@ -89,10 +89,9 @@ class TorchSimulator:
         self.step_count, self._set, self.outputs = 0, {}, {}
         known, dtype = self.scene.inputs.values, DTYPES[self.scene.precision]
         rest = torch.from_numpy(np.array(known["rest_positions"]))
-        start = known["initial_positions"] if positions is None else positions
-        self.displacements = (torch.as_tensor(start).double() - rest).to(dtype)
-        velocities = known["initial_velocities"] if velocities is None else velocities
-        self.velocities = torch.as_tensor(velocities).to(dtype)
+        start, moving = (_tensor(known[f"initial_{name}"]) for name in ("positions", "velocities"))
+        self.displacements = ((start if positions is None else positions).double() - rest).to(dtype)
+        self.velocities = (moving if velocities is None else velocities).to(dtype)
         if self.scenes is not None:
             whole_shape = (self.scenes, *rest.shape)
             self.displacements, self.velocities = (x.expand(whole_shape) for x in (self.displacements, self.velocities))
