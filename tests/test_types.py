@@ -12,8 +12,12 @@ import typed_client
 
 import diffsim_ti as ds
 from diffsim_ti.common.names import ELSEWHERE, edits, nearest
-from diffsim_ti.common.public import Public
+from diffsim_ti.common.public import Public, Readable
+from diffsim_ti.rollout.rollout import RolloutOptions
 from diffsim_ti.runtime.kernels import Kernel
+from diffsim_ti.scene.scene import SceneArguments
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleOptions
+from diffsim_ti.visual.drawing import Drawing, Look
 
 CALLED = ("TetrahedralMesh", "Simulator", "Frames", "Measurement", "Identification")
 DOORS = "designs diff_physics diff_simulator film identification materials optimization optimization_picture outputs "
@@ -32,8 +36,10 @@ def public() -> dict:
 
 
 PUBLIC = public()
-# what answers itself, by the first argument's scene or Taichi's options; those that users do not make
+MESHES = "create_cube create_box joined from_file from_surface from_meshio from_pyvista"
+# what users make and call by names; `init` hands on what Taichi takes, and answers itself
 TAKES = {name: x for name, x in PUBLIC.items() if isinstance(x, Public) or hasattr(x, "__signature__")}
+TAKES |= {f"TetrahedralMesh.{name}": getattr(ds.TetrahedralMesh, name) for name in MESHES.split()}
 TAKES = {name: x for name, x in TAKES.items() if not (inspect.isclass(x) and issubclass(x, BaseException | tuple))}
 
 
@@ -101,6 +107,16 @@ def test_constructors_show_what_every_obstacle_takes():
     assert repr({p.name: p for p in named(ds.Scene)}["motion"].annotation).startswith(
         "Motion | Pose | Mapping[str, Motion"
     )
+
+
+@pytest.mark.parametrize(
+    "listed, constructor",
+    [(SceneArguments, ds.Scene), (RolloutOptions, ds.Rollout), (ObstacleOptions, Obstacle), (Look, Drawing)],
+)
+def test_typed_lists_say_what_constructors_do(listed, constructor):
+    taken = {p.name: repr(p.annotation) for p in named(constructor)}
+    said = {name: repr(Readable(kind)) for name, kind in listed.__annotations__.items()}
+    assert said == {name: taken[name] for name in said}
 
 
 def slipped(word: str, rng: np.random.Generator) -> str:

@@ -48,7 +48,7 @@ def parts() -> int:
     """How many laws, terms, solvers and outputs there are; made, and not run."""
     mesh = ds.TetrahedralMesh.create_box((3, 3, 3), size=0.5, pattern="five")
     soft = ds.StableNeoHookean(E=1e4, nu=0.3, J_floor=0.02)
-    laws = [
+    laws: list[ds.Material] = [
         soft,
         ds.SmithNeoHookean(1e4, 0.3),
         ds.LinearElastic(mu=4e3, lam=6e3),
@@ -114,9 +114,11 @@ def parts() -> int:
         ds.ElasticEnergy(),
         ds.KineticEnergy(["xmax"]),
         ds.WorkOfLoads(),
+        ds.CenterOfMass(),
     ]
     assert_type(ds.Rollout(solvers[0], ds.UnequalSteps([1e-4, 2e-4])).on(solvers[1], save_every=1), ds.Rollout)
     assert_type(scene.replace(density=900.0, precision="f32"), ds.Scene)
+    assert not any(isinstance(law.law("f64"), ds.EnergyLaw) for law in laws[:3])
     return len(laws) + len(loads) + len(names) + len(solvers) + len(outputs)
 
 

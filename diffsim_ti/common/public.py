@@ -27,6 +27,7 @@ R = TypeVar("R")
 OWN_DOC = type.__dict__["__doc__"]
 ROOM = 116  # columns of docstrings
 UNNAMED = Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD
+BOUND = "self", "cls"
 
 
 class Public(ABCMeta):
@@ -67,7 +68,7 @@ def _new(cls, *arguments, **named):
 
 
 def public(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator of a function that users call."""
+    """Decorator of a function that users call, also below `@classmethod`."""
     takes, owner = _Takes.of([function]), function.__qualname__
 
     @functools.wraps(function)
@@ -116,14 +117,14 @@ class _Takes:
             if more is None:
                 break
         for name, kind in listed.items():  # what no constructor has a default for
-            own = Parameter(name, Parameter.KEYWORD_ONLY, default=_Words(...), annotation=kind)
+            own = Parameter(name, Parameter.KEYWORD_ONLY, default=Readable(...), annotation=kind)
             taken.setdefault(name, own)
         more = None if listed else more
         return cls(taken, frozenset(old), more, signature.return_annotation)
 
     @functools.cached_property
     def names(self) -> list[str]:
-        return [name for name, p in self.parameters.items() if p.kind not in UNNAMED]
+        return [name for name, p in self.parameters.items() if p.kind not in UNNAMED and name not in BOUND]
 
     @functools.cached_property
     def most(self) -> int:
@@ -134,9 +135,10 @@ class _Takes:
     def check(self, owner: str, arguments: tuple, named: dict) -> None:
         """Raise TypeError for a name that is not among them, and for more than go without a name."""
         if len(arguments) > self.most:
+            bound = len(self.parameters.keys() & set(BOUND))
             raise TypeError(
-                f"{owner} takes at most {self.most} arguments without a name, got {len(arguments)}; it takes "
-                f"{', '.join(self.names) or 'none'}"
+                f"{owner} takes at most {self.most - bound} arguments without a name, got {len(arguments) - bound}; it "
+                f"takes {', '.join(self.names) or 'none'}"
             )
         if named.keys() <= self.parameters.keys():
             return
@@ -150,8 +152,8 @@ class _Takes:
     def signature(self) -> Signature:
         """As `help` prints it."""
         shown = sorted([*self.parameters.values(), *([self.more] if self.more else [])], key=lambda p: p.kind)
-        shown = [p if p.annotation is p.empty else p.replace(annotation=_Words(p.annotation)) for p in shown]
-        result = self.result if self.result is Signature.empty else _Words(self.result)
+        shown = [p if p.annotation is p.empty else p.replace(annotation=Readable(p.annotation)) for p in shown]
+        result = self.result if self.result is Signature.empty else Readable(self.result)
         return Signature(shown, return_annotation=result)
 
 
@@ -161,7 +163,7 @@ def _takes(cls: type) -> _Takes:
     return _Takes.of([x for x in makers if inspect.isfunction(x)], bound=True)
 
 
-class _Words:
+class Readable:
     """An annotation as it is printed: by the names of types and of their aliases, without modules."""
 
     def __init__(self, annotation: object):

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance
+from diffsim_ti.common.public import public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.files import KEEPS_SETS, as_meshio, parts_of, read_mesh, write_mesh
 from diffsim_ti.mesh.filling import filled
@@ -33,6 +34,7 @@ class Exchange:
         return cls(vertices, tetrahedra, **sets, fix_orientation=fix_orientation)
 
     @classmethod
+    @public
     def from_file(
         cls, path: str | PathLike, fix_orientation: bool = False, drop_orphans: bool = False, device: str | None = None
     ) -> "Self":
@@ -79,6 +81,7 @@ class Exchange:
             warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}")
 
     @classmethod
+    @public
     def from_surface(cls, points: ArrayLike, triangles: ArrayLike, size: float | None = None) -> "Self":
         """The body within a closed surface, filled by TetGen (`pip install "diffsim-ti[surfaces]"`).
 
@@ -99,6 +102,7 @@ class Exchange:
         return cls(*filled(points, triangles.astype(np.int64), size))
 
     @classmethod
+    @public
     def from_meshio(cls, mesh: "meshio.Mesh", fix_orientation: bool = False, drop_orphans: bool = False) -> "Self":
         """Of meshio's mesh, with its sets, as `from_file` has it of a file."""
         return cls._of_parts(parts_of(mesh, again=True), fix_orientation, drop_orphans)
@@ -108,6 +112,7 @@ class Exchange:
         return as_meshio(self)
 
     @classmethod
+    @public
     def from_pyvista(
         cls, grid: "pyvista.UnstructuredGrid", fix_orientation: bool = False, drop_orphans: bool = False
     ) -> "Self":

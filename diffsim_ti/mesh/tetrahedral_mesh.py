@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance, listed
 from diffsim_ti.common.origin import warn_of_rounding
-from diffsim_ti.common.public import Public
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.elements import Elements
@@ -82,6 +82,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
         warn_of_rounding("vertices", given, self, "give them in float64")
 
     @classmethod
+    @public
     def create_cube(
         cls,
         resolution: int = 5,
@@ -97,6 +98,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
         return cls.create_box(resolution, size, pattern)
 
     @classmethod
+    @public
     def create_box(
         cls,
         resolution: ArrayLike = 5,
@@ -119,6 +121,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
         return mesh._changed(_surface_sets=checked_sets(rows, len(corners), "surface"))
 
     @classmethod
+    @public
     def joined(cls, meshes: Mapping[str, "TetrahedralMesh"] | Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":
         """Several bodies as one mesh of several pieces, one after the other.
 

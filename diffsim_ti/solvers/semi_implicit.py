@@ -12,6 +12,7 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.explicit.solver import CONTACT_DAMPING, ExplicitSolver, Weights
+from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.state.staged_steps import StagedSteps
 from diffsim_ti.state.viscous_stages import MOST, ViscousStages
@@ -25,9 +26,10 @@ class SemiImplicitOptions(TypedDict, total=False):
     mesh: TetrahedralMesh | None
     material: Material | None
     dt: float
-    substeps: int
+    substeps: Substeps
     density: ArrayLike
     gravity: ArrayLike
+    damping: float
     damping: float
     parallel: bool | None
     allow_unstable: bool
@@ -47,12 +49,10 @@ class SemiImplicitSolver(ExplicitSolver):
     the square of their number: strongly damped bodies (KelvinVoigt, damping ratio xi of the fastest motion) take steps that
     cost, with the best number, 1 / 2.1 as much at xi = 5, 1 / 4 at 20, 1 / 9 at 100, and no less at 1 (ViscousStages).
 
-    `SemiImplicitSolver(scene, dt=...)` takes dt as it is and refuses an unstable one, as every explicit solver does.
-
     `SemiImplicitSolver(mesh, material, dt=...)`, or `SemiImplicitSolver(dt=...)` for `Simulator(mesh, material, solver)`, is
     for code that follows torch-diffsim's documents. It makes the scene itself, with density [kg/m^3], gravity [m/s^2, along
     y], `damping`, the share of velocity kept over one dt (a Drag), and nothing else; `set_fixed_vertices` fixes some. It
-    takes `substeps` as the least number: it raises it to what stability asks for and says so.
+    takes a number of `substeps` as the least: it raises it to what stability asks for and says so.
     Raises ValueError for `viscous_stages` beyond 32, without viscosity, and with a FilledChamber or reduced sets.
     """
 
@@ -66,7 +66,7 @@ class SemiImplicitSolver(ExplicitSolver):
         self,
         scene: Scene,
         dt: float = 0.01,
-        substeps: int = 1,
+        substeps: Substeps = "auto",
         parallel: bool | None = None,
         allow_unstable: bool = False,
         check_start: bool = True,
@@ -82,7 +82,7 @@ class SemiImplicitSolver(ExplicitSolver):
         mesh: TetrahedralMesh | None = None,
         material: Material | None = None,
         dt: float = 0.01,
-        substeps: int = 1,
+        substeps: Substeps = "auto",
         density: ArrayLike = 1000.0,
         gravity: ArrayLike = -9.8,
         damping: float = 1.0,
@@ -115,7 +115,7 @@ class SemiImplicitSolver(ExplicitSolver):
             self.bind(mesh, material)
 
     def _keep_for_later(
-        self, mesh=None, material=None, dt=0.01, substeps=1, density=1000.0, gravity=-9.8, damping=1.0, **options
+        self, mesh=None, material=None, dt=0.01, substeps="auto", density=1000.0, gravity=-9.8, damping=1.0, **options
     ) -> tuple:
         """What `bind` needs besides the mesh and the material, which are returned."""
         self.dt, self.substeps, self._fixed = dt, substeps, None
@@ -133,6 +133,7 @@ class SemiImplicitSolver(ExplicitSolver):
         scene = Scene(mesh, material, self._density, self._terms, self._fixed)
         super().__init__(scene, self.dt, self.substeps, **self._options, check_start=False)
         self.choose_substeps()
+        self.check_start = True
 
     def set_fixed_vertices(self, vertices: str | ArrayLike) -> None:
         """Fix a vertex set's name, indices or a mask, of a solver that makes its scene itself, before a Simulator is made.

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import Arrows, Mark, vertex_normals
 from diffsim_ti.terms.obstacles.shapes import Triangles
@@ -66,7 +67,7 @@ class Look(TypedDict, total=False):
     wireframe: bool
 
 
-class Drawing:
+class Drawing(metaclass=Public):
     """Pictures of a body's surface, y upwards.
 
     mesh: its rest shape tells sharp edges from curved surfaces.

@@ -30,6 +30,7 @@ from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernel
 from diffsim_ti.solvers.explicit.stages import stages_of
 from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.pass_table import PassTable
 from diffsim_ti.terms import GasChamber, Growth, SelfContact
 
@@ -83,7 +84,7 @@ class ExplicitSolver(Solver):
         self,
         scene: "Scene",
         dt: float = 0.01,
-        substeps: int = 1,
+        substeps: Substeps = "auto",
         parallel: bool | None = None,
         allow_unstable: bool = False,
         check_start: bool = True,
