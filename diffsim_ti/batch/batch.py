@@ -18,7 +18,7 @@ from diffsim_ti.common.origin import positions_of
 from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
-from diffsim_ti.inputs.description import InputValue
+from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.collision_surface import BOWED
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
@@ -340,7 +340,7 @@ class Batch(metaclass=Public):
 
     # ---- under ti.ad.Tape --------------------------------------------------------------------------------------------
 
-    def field(self, name: str, shared: bool = False):
+    def field(self, name: InputName, shared: bool = False):
         """The Taichi field of an input or of an output ("positions", "velocities", ...), with .grad, as of `Rollout.field`.
 
         Fields of outputs have shape (scenes, frames, num_vertices), and (runs, scenes, ...) in a Batch of several `runs`;

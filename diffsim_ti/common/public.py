@@ -1,9 +1,9 @@
 """What users call: wrong names of arguments are answered with the right ones, and `help()` fits on a screen.
 
 `class X(metaclass=Public)` does this for a class and all that descend from it, also those of users, and `@public` for a
-function. Both read the parameters that stand in signatures, so that a new option is written there and nowhere else. What a
-constructor hands on with **options are options of the next constructor among its bases; what a function hands on are those
-of the TypedDict that it is annotated with, `**look: Unpack[Look]`.
+function. Both read the parameters that stand in signatures, so that a new option is written there and nowhere else. What
+goes on as `**options` is of the TypedDict that it is annotated with, `**options: Unpack[ObstacleOptions]`; of a constructor
+without one, as users may write it, also of the next constructor among its bases.
 """
 
 import functools
@@ -91,7 +91,7 @@ class _Takes:
 
     parameters: dict[str, Parameter]
     old: frozenset[str]  # names that still work (deprecated.py)
-    more: Parameter | None  # what takes any other names, and answers wrong ones itself
+    more: Parameter | None  # what takes any other names, and itself answers those that are nothing to it
     result: object
 
     @classmethod
@@ -100,27 +100,28 @@ class _Takes:
         taken: dict[str, Parameter] = {}
         listed: dict[str, object] = {}
         old: set[str] = set()
-        more, signature = None, Signature()
+        more, result = None, Signature.empty
         for k, function in enumerate(functions):
             signature = inspect.signature(function)
             old |= getattr(function, "old_names", frozenset())
-            own = list(signature.parameters.values())[bound:]
-            more = next((p for p in own if p.kind is Parameter.VAR_KEYWORD), None)
-            options = get_args(more.annotation) if more else ()
-            if options and is_typeddict(options[0]):
-                listed |= options[0].__annotations__
+            own, result = list(signature.parameters.values())[bound:], signature.return_annotation
             for p in own:
                 if p.kind not in UNNAMED and (k == 0 or p.default is not p.empty):
                     taken.setdefault(p.name, p if k == 0 else p.replace(kind=Parameter.KEYWORD_ONLY))
                 elif p.kind is Parameter.VAR_POSITIONAL and k == 0:
                     taken[p.name] = p
-            if more is None:
+            rest = next((p for p in own if p.kind is Parameter.VAR_KEYWORD), None)
+            if rest is None:
                 break
+            options = get_args(rest.annotation)
+            if options and is_typeddict(options[0]):
+                listed |= options[0].__annotations__
+            else:
+                more = rest
         for name, kind in listed.items():  # what no constructor has a default for
             own = Parameter(name, Parameter.KEYWORD_ONLY, default=Readable(...), annotation=kind)
             taken.setdefault(name, own)
-        more = None if listed else more
-        return cls(taken, frozenset(old), more, signature.return_annotation)
+        return cls(taken, frozenset(old), more, result)
 
     @functools.cached_property
     def names(self) -> list[str]:
@@ -143,7 +144,7 @@ class _Takes:
         if named.keys() <= self.parameters.keys():
             return
         unknown = [name for name in named if name not in self.parameters and name not in self.old]
-        if self.more:  # inputs of a scene, say: a name that is one slip from an option was meant to be that
+        if self.more:  # inputs of a scene, options of one's own: what is one slip from an option was meant to be that
             near = {name: nearest(name, self.names) for name in unknown}
             unknown = [name for name, x in near.items() if x and len(x) > 3 and edits(name, x) == 1]
         check_arguments(owner, unknown, self.names)
@@ -201,14 +202,15 @@ def _words(kind: object) -> str:
 
 
 def _parts(cls: type) -> str:
-    """Names of its attributes and methods, those of bases in the package included."""
+    """Names of its attributes and methods, and of those that its bases in the package give it."""
     found: dict[str, object] = {}
     for base in cls.__mro__:
-        if base.__module__.split(".")[0] not in sys.stdlib_module_names:
-            found = {name: x for name, x in vars(base).items() if not name.startswith("_")} | found
-    methods = sorted(x for x in found if callable(found[x]) or isinstance(found[x], classmethod | staticmethod))
+        if base.__module__.split(".")[0] in (cls.__module__.split(".")[0], __name__.split(".")[0]):
+            found = dict.fromkeys(vars(base).get("__annotations__", ())) | vars(base) | found
+    names = sorted(name for name in found if not name.startswith("_"))
+    methods = [x for x in names if callable(found[x]) or isinstance(found[x], classmethod | staticmethod)]
     said = {
-        "Attributes": sorted(found.keys() - set(methods)),
+        "Attributes": [x for x in names if x not in methods],
         f"Methods, of which help({cls.__name__}.NAME) says more": methods,
     }
     lines = [f"{what}: {', '.join(names)}" for what, names in said.items() if names]

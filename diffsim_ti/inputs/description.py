@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,11 @@ from diffsim_ti.common.public import Public
 Shape = tuple[int | str, ...]
 # of an input in the place of the scene's own: numbers of its shape, or {named set: number}
 InputValue = TypeAliasType("InputValue", ArrayLike | Mapping[str, ArrayLike])
+# what many scenes have, for completion; `scene.inputs` lists those of one
+_MANY = Literal[
+    "initial_positions", "initial_velocities", "rest_positions", "density", "youngs_modulus", "poissons_ratio"
+]
+InputName = TypeAliasType("InputName", _MANY | Literal["gravity", "drag_rate", "prescribed_motion"] | str)
 
 
 @dataclass(frozen=True)

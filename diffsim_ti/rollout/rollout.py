@@ -1,7 +1,7 @@
 """Rollout: n steps of a solver as one differentiable operation."""
 
 from collections.abc import Callable, Iterable
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import positions_of
 from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Derived
-from diffsim_ti.inputs.description import InputValue
+from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
@@ -210,6 +210,8 @@ class Rollout(metaclass=Public):
     def forward(self, law_state: ArrayLike | None = None, **values: InputValue) -> Frames:
         """Run from the scene's inputs, with some of them replaced, and return the saved frames.
 
+        values: by the names of inputs, which `scene.inputs` lists with shapes and units.
+
         law_state: what the law remembers at the start, in the shape of `Simulator.law_state`; gradients are by all else.
 
         A material's numbers and others per tetrahedron may be given by named sets, `youngs_modulus={"soft": 2e4}`; gradients
@@ -324,7 +326,7 @@ class Rollout(metaclass=Public):
 
     # ---- under ti.ad.Tape -------------------------------------------------------------------------------------------
 
-    def field(self, name: str):
+    def field(self, name: InputName | Literal["positions", "velocities", "displacements"]):
         """The Taichi field of an input or of an output ("positions", "velocities", ...), with .grad.
 
         Input fields hold the scene's values until a kernel or `from_numpy` writes others; `run` reads them. Those of outputs
