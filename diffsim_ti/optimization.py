@@ -6,13 +6,13 @@ import io
 import math
 import os
 import time
-import warnings
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 from diffsim_ti.common import ranks
 from diffsim_ti.common.progress import progress
+from diffsim_ti.common.public import Public
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.torch_bridge.autograd import torch
 
@@ -59,7 +59,7 @@ def load_state(path: str | Path, mesh: TetrahedralMesh) -> dict | None:
                 reasons.append(f"{candidate}: {error}")
                 continue
             if reasons:
-                warnings.warn(f"{reasons[0]}; using {candidate}", stacklevel=2)
+                warn(f"{reasons[0]}; using {candidate}")
             return state
     if reasons:
         raise ValueError("no usable state: " + "; ".join(reasons) + "; delete the file to start again")
@@ -88,7 +88,7 @@ def _read(path: Path, mesh) -> dict:
     return state
 
 
-class Optimization:
+class Optimization(metaclass=Public):
     """A loop around a torch optimiser that saves, resumes, and keeps the best.
 
     module: holds the parameters; path: state file, resumed from if it is there; None keeps nothing. A resumed run is
@@ -124,6 +124,10 @@ class Optimization:
         else:
             self.best_loss, self._best = math.inf, copy.deepcopy(module.state_dict())
 
+    def __repr__(self) -> str:
+        lowest = f", the lowest loss {self.best_loss:.6g}" if self.losses else ""
+        return f"Optimization({self.iteration} iterations in {self.seconds:.3g} s{lowest}, state in {self.path})"
+
     def _found(self) -> tuple[dict, ValueError | None]:
         """(the state of the file, or that of a new run; what is wrong with it)"""
         try:
@@ -145,7 +149,8 @@ class Optimization:
     ) -> "Optimization":
         """Go on until `iterations` iterations are done in all; loss() makes the graph anew each time.
 
-        after(value): called after each iteration with the loss before it, for instance to draw. title: of a bar on stderr.
+        after(value): called after each iteration with the loss before it, for instance to draw. title: of a bar in a
+        terminal.
 
         Raises FloatingPointError if the loss is not finite, and lets the simulator's errors through; the parameters are
         then the best ones so far.
@@ -162,7 +167,7 @@ class Optimization:
                 torch.nn.utils.clip_grad_norm_([p for group in groups for p in group["params"]], self.clip)
             return value
 
-        with nullcontext(lambda *_: None) if title is None else progress(title, iterations) as show:
+        with progress(title or "optimisation", iterations, bar=title is not None) as show:
             while self.iteration < iterations and not self.is_stuck():
                 value = self._iterate(closure)
                 show(self.iteration, f"loss {value:.4g}")

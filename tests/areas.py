@@ -29,8 +29,8 @@ AREAS = {
     "optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "types release reference examples environment contact_examples static_examples "
     "torch_examples readme",
-    "command line, resources, backends": "cli calls advice hard_use strength layout resources devices launch executed_ptx "
-    "single_precision fewer_variables kernel_sizes tracer",
+    "command line, resources, backends": "cli manners calls advice hard_use strength layout resources devices launch "
+    "executed_ptx single_precision fewer_variables kernel_sizes tracer",
 }
 # files of a minute or so, the longest first: in several processes they come before all others
 LONGEST = (

@@ -1,5 +1,6 @@
 """The command line, its series and its pictures, by what they write and say."""
 
+import re
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import saved_series as series
 from open_laws.relaxing import RelaxingRubber
 from open_laws.viscous import ViscousRubber
 
+import diffsim_ti
 from diffsim_ti import picture
 from diffsim_ti.cli import app as cli
 from diffsim_ti.cli import options
@@ -501,3 +503,59 @@ def test_broken_frames_of_a_series_are_named(capsys, tmp_path, content):
         (tmp_path / "a_0000.vtu").write_text(content)
     said = fails(capsys, "render", tmp_path / "a.pvd", "-o", tmp_path / "a.png")
     assert "a_0000.vtu" in said and "cannot be read" in said
+
+
+# ---- options in a file, what help says --------------------------------------------------------------------------------
+
+
+def test_options_go_to_a_file_and_back_to_the_bit(tmp_path, cube_file, monkeypatch, capsys):
+    def taken(*arguments) -> dict:
+        """The options that `simulate` runs with."""
+        seen = {}
+        with monkeypatch.context() as patched:
+            patched.setattr(options, "check_length", lambda *_: seen.update(sys._getframe(1).f_locals) or sys.exit(0))
+            with pytest.raises(SystemExit):
+                cli.main(["simulate", *map(str, arguments)])
+        return {name: x for name, x in seen.items() if name not in ("begin", "context", "config")}
+
+    typed = [cube_file, "--nu", 0.1 + 0.2, "-E", 1 / 3e-5, "--velocity", 0.1, 1e-300, -2, "--up", "-z", "--no-ground"]
+    typed += ["--fixed", 'say "so" \\ #1', "--fixed", "ymin", "-o", "a.glb", "--order", 2]
+    first, second = tmp_path / "made" / "run.toml", tmp_path / "again.toml"
+    for source, path in ((typed, first), (["--config", first], second)):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["simulate", *map(str, source), "--write-config", str(path)])
+        assert stop.value.code == 0 and str(path) in capsys.readouterr().out
+    assert first.read_bytes() == second.read_bytes() and "# Poisson's ratio [-]" in first.read_text()
+    assert taken(*typed) == taken("--config", first) and taken(*typed)["poissons_ratio"] == 0.1 + 0.2
+    assert taken("--config", first, "--nu", 0.2, "--ground") == taken(*typed) | dict(poissons_ratio=0.2, ground=True)
+
+
+def test_mistakes_in_a_file_of_options(tmp_path, cube_file, capsys):
+    path = tmp_path / "run.toml"
+    for text, words in (
+        ("youngs_modulus = 1e4", "'youngs_modulus': did you mean 'youngs-modulus'? there are mesh, output, material, "),
+        ("qqq = 1", "no option is called 'qqq': there are mesh, "),
+        ("config = 'a'", "no option is called 'config'"),
+        ("duration = 'long'", "Invalid value for '--duration'"),
+        ("duration =", "--config .*: .*--write-config writes one to begin with"),
+    ):
+        path.write_text(text)
+        assert re.search(words.replace("?", "."), fails(capsys, "simulate", cube_file, "--config", path))
+    assert "no such file; --write-config" in fails(capsys, "simulate", "--config", tmp_path / "none.toml")
+    path.write_text("fixed = 'ymin'\nduration = -1")
+    assert "--duration must be > 0" in fails(capsys, "simulate", cube_file, "--config", path)
+
+
+def test_help_says_units_exit_codes_and_the_version(capsys):
+    for arguments, words in (
+        (
+            ["simulate", "--help"],
+            ("simulated time [s]", "[kg/m^3]", "scale the longest side", "[m]", "[N/m^3]", "[1/s]"),
+        ),
+        (["--help"], ("Exit codes: 0 done; 1 check-gradients", "130 interrupted")),
+        (["--version"], (f"diffsim_ti {diffsim_ti.__version__}, taichi 1.", "torch 2.")),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(arguments)
+        said = " ".join(capsys.readouterr().out.split())
+        assert stop.value.code == 0 and all(word in said for word in words), said

@@ -55,6 +55,11 @@ def test_imports_between_folders_go_one_way():
     assert len(uses) > 30 and "mechanics.energy" in uses["monitor"] and not circles(uses)
 
 
+def test_all_warnings_point_at_the_line_of_the_user():
+    """By `warn` of common/warn.py."""
+    assert [p.name for p in MODULES if re.search(r"warnings\.warn\b|stacklevel", p.read_text())] == []
+
+
 def test_at_the_top_stand_folders_and_doors():
     """Modules there are what pages teach to import; all else lies in folders."""
     assert len(list(PACKAGE.glob("*.py"))) <= 12

@@ -71,6 +71,7 @@ def test_statics_say_that_a_body_may_have_buckled_on_the_way():
         frames = rollout.forward()
     assert rollout.report.saddles == 0 < rollout.report.indefinite
     assert len(said) == 1 and 0 < said[0].message.unstable <= rollout.report.indefinite
+    assert said[0].filename == __file__
     assert frames.displacements[-1][:, 0].max() > 0.5
 
 

@@ -380,8 +380,9 @@ def test_contact_that_does_not_hold_is_refused():
         with pytest.raises(ds.NotConverged, match=f"contact .*{words}: hold it by"):
             simulator.step()
     within = ds.Simulator(ds.StaticSolver(lying(0.004, friction=0.5, fixed=[])))  # friction holds it
-    with pytest.warns(UserWarning, match="6 rigid modes.*contact holds it"):
+    with pytest.warns(UserWarning, match="6 rigid modes.*contact holds it") as said:
         within.step()
+    assert said[0].filename == __file__
 
 
 def test_sets_join():

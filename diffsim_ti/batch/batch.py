@@ -1,6 +1,5 @@
 """Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents together."""
 
-import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -14,8 +13,12 @@ from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeAdapter
 from diffsim_ti.common.checked import as_numbers, instance, whole
 from diffsim_ti.common.copies import made_again
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import positions_of
+from diffsim_ti.common.public import Public
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.collision_surface import BOWED
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
@@ -27,7 +30,7 @@ from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
 
 
-class Batch:
+class Batch(metaclass=Public):
     """`scenes` runs of a solver's scene simultaneously, with numbers of their own where they are given with a leading axis.
 
     solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.
@@ -79,12 +82,7 @@ class Batch:
         options = dict(save_every=save_every, gradients=gradients, truncate=truncate, memory=memory)
         self.one = Rollout(solver, steps, outputs=outputs, **options)
         self._lanes_asked = lanes
-        self.solver, self.scene, self.inputs, self.wanted = (
-            self.one.solver,
-            self.one.scene,
-            self.one.inputs,
-            self.one.wanted,
-        )
+        self.scene, self.inputs, self.wanted = self.one.scene, self.one.inputs, self.one.wanted
         self.frames: BatchFrames | None = None  # of the last `run`
         self.gradients: dict[str, np.ndarray] = {}
         self.tape_face = BatchTapeAdapter(self, runs)
@@ -96,6 +94,8 @@ class Batch:
             raise ValueError(f"scenes cannot be computed side by side: {self.why_not}; leave out lanes=True")
         self.lanes = self.why_not is None if lanes is None else bool(lanes)
         self.sweep = BatchSweep(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
+        if self.sweep:
+            self.sweep.run_substeps = self.one.sweep.run_substeps
 
     def __reduce__(self):
         """As it was made; frames and values of its fields are not in it."""
@@ -105,6 +105,15 @@ class Batch:
         own["runs"] = self.tape_face.runs
         return made_again, (Batch, own)
 
+    def __repr__(self) -> str:
+        how = "side by side" if self.lanes else "one after another"
+        return f"Batch({self.num_scenes} scenes {how} of {self.one!r})"
+
+    @property
+    def solver(self) -> Solver:
+        """The solver, with the substeps that runs take."""
+        return self.one.solver
+
     @property
     def outputs(self) -> dict[str, Output]:
         """The outputs of one scene."""
@@ -112,17 +121,27 @@ class Batch:
 
     # ---- forward -----------------------------------------------------------------------------------------------------
 
-    def forward(self, raise_errors: bool = False, **inputs: ArrayLike) -> BatchFrames:
+    def forward(self, raise_errors: bool = False, **inputs: InputValue) -> BatchFrames:
         """Run all scenes, with some inputs replaced. raise_errors: raise what stopped the first one that died."""
         inputs = spread_shape(inputs, self.one.values)
         inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
         values = checked_values(self.one, inputs, self.num_scenes)
+        self._fit(values)
         run = (self._side_by_side if self.lanes else self._by_turns)(values)
         run.sets = sets
         dead = np.flatnonzero(~run.alive)
         if raise_errors and dead.size:
             raise run.error(int(dead[0]))
         return run
+
+    def _fit(self, values: dict) -> None:
+        """Let the stiffest scene choose substeps that were left to the solver, and refuse values that need more."""
+        if self.solver.automatic:
+            matters = self.one.sweep.run_substeps.matters
+            own = any(isinstance(x, Own) and matters(name) for name, x in values.items())
+            each = [{n: value_of(x, b) for n, x in values.items()} for b in range(self.num_scenes if own else 1)]
+            for sweep in (self.one.sweep, *([self.sweep] if self.sweep else [])):
+                sweep.fit(each)
 
     def _side_by_side(self, values: dict) -> BatchFrames:
         run, times = self.sweep.run(values), self.one.times
@@ -170,6 +189,7 @@ class Batch:
         own = self.sweep.values_of(values, b)
         frames = Frames(*(x[b] for x in states), times, own, resolution, run=Run(own))
         frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
+        frames.scene = self.scene
         for name, output in self.one.computed.items():
             frames.outputs[name] = np.asarray(output.value(frames))
         return frames
@@ -206,7 +226,11 @@ class Batch:
     # ---- gradients ---------------------------------------------------------------------------------------------------
 
     def vjp(
-        self, frames: BatchFrames, positions: ArrayLike | None = None, velocities: ArrayLike | None = None, **seeds
+        self,
+        frames: BatchFrames,
+        positions: ArrayLike | None = None,
+        velocities: ArrayLike | None = None,
+        **seeds: ArrayLike | None,
     ) -> dict[str, np.ndarray]:
         """Gradients of a loss by every wanted input, from its gradients by outputs of all scenes, (scenes, ...)."""
         instance("Batch.vjp", "frames", frames, BatchFrames, "what forward returned")
@@ -214,7 +238,7 @@ class Batch:
         given = {name: as_numbers(f"gradient by the frames' {name}", x) for name, x in seeds.items() if x is not None}
         for name, x in given.items():
             if name not in self.outputs:
-                raise ValueError(f"no output named {name!r}; this batch has {', '.join(self.outputs)}")
+                raise ValueError(no_such("output", name, self.outputs, "this batch"))
             shape = (self.num_scenes, *self.outputs[name].shape(self.num_frames))
             if x.shape != shape:
                 raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {x.shape}")
@@ -229,7 +253,7 @@ class Batch:
     def _warn_of_dead(frames: BatchFrames, what: str) -> None:
         dead = np.flatnonzero(~frames.alive)
         if dead.size:
-            warnings.warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero", stacklevel=3)
+            warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero")
 
     def _vjp_side_by_side(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
         shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive
@@ -287,13 +311,13 @@ class Batch:
 
     # ---- tangents ----------------------------------------------------------------------------------------------------
 
-    def tangents(self, frames: BatchFrames, **tangents: ArrayLike) -> dict[str, np.ndarray]:
+    def tangents(self, frames: BatchFrames, **tangents: InputValue) -> dict[str, np.ndarray]:
         """Changes of all outputs, (scenes, ...), for changes of inputs, to first order, float64; zero, with a warning, of
         scenes that did not come to their end."""
         tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
-            raise ValueError(f"tangents: no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
+            raise ValueError(f"tangents: {self.scene.inputs.no_input(unknown[0], 'this batch', self.inputs)}")
         instance("Batch.tangents", "frames", frames, BatchFrames, "what forward returned")
         zero = {name: np.zeros_like(value_of(frames.values[name], 0)) for name in tangents}
         tangents, _ = spread_given(self.scene, tangents, zero, self.num_scenes)
@@ -316,7 +340,7 @@ class Batch:
 
     # ---- under ti.ad.Tape --------------------------------------------------------------------------------------------
 
-    def field(self, name: str, shared: bool = False):
+    def field(self, name: InputName, shared: bool = False):
         """The Taichi field of an input or of an output ("positions", "velocities", ...), with .grad, as of `Rollout.field`.
 
         Fields of outputs have shape (scenes, frames, num_vertices), and (runs, scenes, ...) in a Batch of several `runs`;

@@ -1,8 +1,11 @@
 """The command line: `diffsim-ti` or `python -m diffsim_ti`. One function per command."""
 
+import logging
 import sys
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -13,9 +16,11 @@ from diffsim_ti import runtime
 from diffsim_ti.cli import options as opt
 from diffsim_ti.cli import study, view
 from diffsim_ti.cli.check import check
+from diffsim_ti.cli.config import write_options
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.sweep import sweep
 from diffsim_ti.common import interrupts
+from diffsim_ti.common.progress import LOG
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.stability import element_limit
@@ -27,7 +32,13 @@ from diffsim_ti.verify import check_gradients as judge
 from diffsim_ti.writers import View, writer_for
 from diffsim_ti.writers.adaptive_run import ForwardRun, Interrupted, file_in, run_and_write
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # for which [s] is no unit
+    epilog="Exit codes: 0 done; 1 check-gradients found a wrong gradient, or stability a run that is wrong and does not "
+    "say so; 2 an error, said in one line on stderr; 130 interrupted.",
+)
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
 for command in (
     study.chart,
@@ -46,8 +57,11 @@ for command in (
 @app.callback()
 def everywhere(
     traceback: Annotated[bool, typer.Option("--traceback", help="show the traceback of an error")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=opt.say_version, help="say the version, and stop")
+    ] = False,
 ) -> None:
-    """Soft bodies on tetrahedra, simulated with Taichi. Errors are one line on stderr, with exit code 2."""
+    """Soft bodies on tetrahedra, simulated with Taichi."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -66,9 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _ran(arguments: list[str]) -> tuple[str, int]:
     """(what to say, exit code) of a command."""
     wants_traceback = "--traceback" in arguments  # wherever it stands
-    with warnings.catch_warnings():
-        warnings.simplefilter("default", UserWarning)
-        warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
+    with _lines_on_stderr():
         said = "interrupted"
         try:
             interrupts.commands_may_run()
@@ -90,11 +102,28 @@ def _ran(arguments: list[str]) -> tuple[str, int]:
     return said, code if isinstance(code, int) else 0
 
 
+@contextmanager
+def _lines_on_stderr() -> Iterator[None]:
+    """Warnings and records of the logger "diffsim_ti" as lines on stderr."""
+    handler, level = logging.StreamHandler(sys.stderr), LOG.level
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
+        LOG.addHandler(handler)
+        LOG.setLevel(level or logging.INFO)
+        try:
+            yield
+        finally:
+            LOG.removeHandler(handler)
+            LOG.setLevel(level)
+
+
 # ---- commands ---------------------------------------------------------------------------------------------------------
 
 
 @app.command()
 def simulate(
+    context: typer.Context,
     mesh: opt.MeshFile,
     output: Annotated[
         list[Path] | None,
@@ -139,9 +168,13 @@ def simulate(
     backend: opt.Backend = "cpu",
     precision: opt.Precision = "f32",
     threads: opt.Threads = None,
+    config: opt.Config = None,
+    write_config: opt.WriteConfig = None,
 ) -> None:
     """Simulate a body, by default its fall onto a floor; write a series and a picture of the end, or films, arrays ..."""
     begin = time.perf_counter()
+    if write_config:
+        return write_options(context, write_config)
     opt.check_length(duration, fps, dt)
     view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end", arrows=tuple(arrows or ()))
     asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
@@ -205,7 +238,8 @@ def check_gradients(
 ) -> None:
     """Check every gradient of a short fall onto a floor against differences.
 
-    The body starts half a barrier width above the floor, moving, so that contact takes part. Exit code 0 if all are right.
+    The body starts half a barrier width above the floor, moving, so that contact takes part. Exit code 0 if all are
+    right, 1 if one is wrong.
     """
     runtime.init(backend, precision)
     law, body = opt.make_material(material, youngs_modulus, poissons_ratio), opt.load_body(mesh, size, up, order=order)

@@ -8,9 +8,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import taichi
+import torch
 import typer
 from numpy.typing import ArrayLike
 
+import diffsim_ti
+from diffsim_ti.cli.config import read_options
 from diffsim_ti.materials import MATERIALS
 from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
@@ -49,8 +53,23 @@ Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
 SUFFIXES = f"{', '.join(WRITERS)} (run_%04d.png: every frame, run.png: the end)"
 Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")]
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        is_eager=True, callback=read_options, help="TOML file of options (--write-config); those typed beside it win"
+    ),
+]
+WriteConfig = Annotated[Path | None, typer.Option(help="write all options to this TOML file, and stop")]
 Workers = Annotated[int, typer.Option(help="processes that share the work")]
 Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is written")]
+
+
+def say_version(asked: bool) -> None:
+    """Of the package, and of what computes."""
+    if asked:
+        of_taichi = ".".join(map(str, taichi.__version__))
+        print(f"diffsim_ti {diffsim_ti.__version__}, taichi {of_taichi}, torch {torch.__version__}")
+        raise typer.Exit
 
 
 MOST_FRAMES = 10**6  # of a run: beyond it a duration is a slip

@@ -6,13 +6,14 @@ next one is released; tests/test_deprecated.py goes through all of it.
 """
 
 import functools
-import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import ParamSpec, TypeVar
+
+from diffsim_ti.common.warn import warn as warn_user
 
 # modules at the top of version 0.2.0 -> where they are
 MODULES = {
@@ -39,12 +40,13 @@ MODULES = {
 # names of the package -> their new names there
 NAMES = {"TieLength": "Length", "TieTension": "Tension"}
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")  # one by one: mypy reads no others
+R = TypeVar("R")
 
 
-def warn(old: str, new: str, stacklevel: int = 3) -> None:
+def warn(old: str, new: str) -> None:
     """Warn that `old` goes with the next version."""
-    warnings.warn(f"{old} is called {new}; the old name goes with the next version", DeprecationWarning, stacklevel)
+    warn_user(f"{old} is called {new}; the old name goes with the next version", DeprecationWarning)
 
 
 def renamed_arguments(**new: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -62,6 +64,7 @@ def renamed_arguments(**new: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 named[new[old]] = named.pop(old)
             return function(*arguments, **named)
 
+        call.old_names = frozenset(new)  # type: ignore[attr-defined]
         return call
 
     return decorate

@@ -6,9 +6,9 @@ its numbers as they are. An obstacle that its path takes far from where it was m
 path from there. Displacements u = x - X stay what they are. What float32 cannot resolve all the same is warned of.
 """
 
-import warnings
-
 import numpy as np
+
+from diffsim_ti.common.warn import warn
 
 FAR = 16  # body lengths
 ROUNDING = 2.0**-24
@@ -49,10 +49,9 @@ def warn_of_rounding(what: str, x, mesh, remedy: str) -> None:
         return
     coarse, shortest = ROUNDING * largest, np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1), axis=2).min()
     if coarse > OF_EDGES * shortest:
-        warnings.warn(
+        warn(
             f"{what}: float32 resolves {largest:.3g} m to {coarse:.2g} m, {coarse / shortest:.2g} of the mesh's shortest "
-            f"edge, and what is made of it is off by that: {remedy}",
-            stacklevel=4,
+            f"edge, and what is made of it is off by that: {remedy}"
         )
 
 
@@ -77,9 +76,8 @@ def warn_of_coarse_places(scene) -> None:
         if coarse > OF_WIDTHS * width:
             x = inputs.values["initial_positions"][scene.mesh.surface_vertices]
             if term.gap(x, places.get(term, np.zeros(3))).min() < FAR * inputs.length:
-                warnings.warn(
+                warn(
                     f"{term!r}: float32 resolves its {largest:.3g} m to {coarse:.2g} m, {coarse / width:.2g} of the "
                     "barrier's width, and contacts are off by that: pass precision='f64', or a part of it that is near the "
-                    "body, with about= near it where it turns",
-                    stacklevel=3,
+                    "body, with about= near it where it turns"
                 )

@@ -1,7 +1,7 @@
 """From measurements to numbers: `identify`."""
 
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import shown
 from diffsim_ti.common.progress import progress as progress_bar
+from diffsim_ti.common.public import public
 from diffsim_ti.identification.descent import l_bfgs_b, torch_descent
 from diffsim_ti.identification.levenberg_marquardt import DENSE, levenberg_marquardt
 from diffsim_ti.identification.measurements import measurements
@@ -26,6 +27,7 @@ FAR, AT_MOST = 3.0, 4  # residuals over the noise beyond which further starts ar
 METHODS = {"Levenberg-Marquardt": levenberg_marquardt, "L-BFGS-B": l_bfgs_b}
 
 
+@public
 def identify(
     rollout: Rollout | ModalTest | Iterable[Rollout | ModalTest],
     data: Any,
@@ -54,7 +56,8 @@ def identify(
     unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
     max_iterations: steps, after which it stops as it is. tolerance: stop when a step promises less than this share of
     a standard error per unknown. covariance: default up to 20 unknowns; costs a tangent run each. callback(report of the
-    iteration, frames of each experiment), first of the start as iteration 0: return True to stop. progress: a bar on stderr.
+    iteration, frames of each experiment), first of the start as iteration 0: return True to stop. progress: a bar in a
+    terminal; without one the logger "diffsim_ti" says every five seconds, at level INFO, how far it is.
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
     method: "Levenberg-Marquardt", which takes the fewest simulations; "L-BFGS-B" (SciPy's) needs gradients alone, so serves
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as
@@ -110,7 +113,7 @@ def identify(
         searches.append((one, stopped, converged))
         return stopped != STOPPED
 
-    with progress_bar("identify", most) if progress else nullcontext(lambda *_: None) as show:
+    with progress_bar("identify", most, progress) as show:
         more = search(lambda: Search(problem, priors, resume), show)
         first, why, _ = searches[0]
         if more and (starts is not None or (not why.startswith("stopped") and _is_far(first, FAR))):

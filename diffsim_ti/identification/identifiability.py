@@ -5,10 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.common.public import public
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Rollout
 
 
-@dataclass
+@dataclass(repr=False)
 class Identifiability:
     """What the frames' positions tell of some inputs: eigenvalues of the Fisher matrix, smallest first, in m^2.
 
@@ -32,9 +34,12 @@ class Identifiability:
             lines.append(f"{value:10.3e} m^2 {'NOT SEEN' if k < self.num_singular else ''} {parts}")
         return "\n".join(lines)
 
+    __repr__ = __str__
 
+
+@public
 def identifiability(
-    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values
+    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values: InputValue
 ) -> Identifiability:
     """Which inputs can be recovered from the frames' positions: eigenvalues and directions of the Fisher matrix J^T J.
 
@@ -50,7 +55,8 @@ def identifiability(
     columns, labels = [], []
     for name in names:
         if name not in frames.inputs:
-            raise ValueError(f"identifiability: no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
+            said = rollout.scene.inputs.no_input(name, "this rollout", rollout.inputs)
+            raise ValueError(f"identifiability: {said}")
         value = np.asarray(frames.inputs[name])
         if not np.any(value):
             raise ValueError(f"identifiability: {name} is zero, so that relative changes of it mean nothing")

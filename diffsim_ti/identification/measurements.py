@@ -1,16 +1,18 @@
 """What was measured: values of an output of a rollout, some of them missing, at the frames or at times of their own."""
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import numbers, wholes
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import rounding_of
+from diffsim_ti.common.public import Public
+from diffsim_ti.common.warn import warn
 from diffsim_ti.rollout import Frames, Rollout
 
 
-class Measurement:
+class Measurement(metaclass=Public):
     """Values d of an output y of a rollout, with independent normal noise of standard deviation `noise`.
 
     output: "positions", "velocities", "displacements" or the name of one of the rollout's outputs. values: NaN where a
@@ -37,7 +39,7 @@ class Measurement:
         self.seen = np.isfinite(self.values)
         if rounding_of(values) > self.noise.min(initial=np.inf):
             coarse = f"float32 rounds values by {rounding_of(values):.2g}, more than the noise"
-            warnings.warn(f"{output}: {coarse}: give them in float64", stacklevel=2)
+            warn(f"{output}: {coarse}: give them in float64")
         if np.any(np.isinf(self.values)):
             raise ValueError(f"{output}: values must be finite, or NaN where a sample is missing")
         if self.noise.ndim > self.values.ndim or any(
@@ -48,10 +50,14 @@ class Measurement:
             )
         self.deviation = np.broadcast_to(self.noise, self.values.shape)[self.seen]
 
+    def __repr__(self) -> str:
+        at = "" if self.at is None else f", at {len(self.at)} items"
+        return f"Measurement({self.output!r}, {brief(self.values)}, noise={brief(self.noise)}{at})"
+
     def check(self, rollout: Rollout) -> None:
         """Raise ValueError unless this is a measurement of that rollout."""
         if self.output not in rollout.outputs:
-            raise ValueError(f"data: no output named {self.output!r}; this rollout has {', '.join(rollout.outputs)}")
+            raise ValueError("data: " + no_such("output", self.output, rollout.outputs, "this rollout"))
         shape = list(rollout.outputs[self.output].shape(rollout.num_frames))
         if self.at is not None:
             shape[1] = len(self.at)

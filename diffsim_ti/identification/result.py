@@ -4,10 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import Public
 from diffsim_ti.identification.problem import Problem
 
 
-@dataclass
+@dataclass(repr=False)
 class Information:
     """What the data tell of the free variables t: Fisher matrix J^T J, and with the prior their covariance.
 
@@ -21,6 +23,8 @@ class Information:
     directions: np.ndarray
     covariance: np.ndarray  # of t
     seen_share: float  # trace of what the data settle, of the variables
+
+    __repr__ = brief_fields
 
     @classmethod
     def of(cls, labels, J: np.ndarray, prior: np.ndarray) -> "Information":
@@ -52,7 +56,7 @@ class Information:
         ]
 
 
-@dataclass
+@dataclass(repr=False)
 class MeshCheck:
     """How far estimates move on a finer mesh of the same body, or `reason`: why that is not known.
 
@@ -69,6 +73,8 @@ class MeshCheck:
     simulations: int = 0
     reason: str = ""
 
+    __repr__ = brief_fields
+
     @property
     def matters(self) -> bool:
         """Whether some estimate moves by more than its standard error."""
@@ -81,7 +87,7 @@ class MeshCheck:
 
 
 @dataclass(repr=False)
-class Identification:
+class Identification(metaclass=Public):
     """What `identify` returns.
 
     estimates: {unknown: number or array}; covariance: of the numbers, in the order of `labels`, to first order;

@@ -3,11 +3,10 @@
 Each check raises ValueError as rule, value, remedy; `TetrahedralMesh` runs them in the order in which they stand here.
 """
 
-import warnings
-
 import numpy as np
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh import jacobian
 from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces, squared_edges
 from diffsim_ti.mesh.reference_element import MID_EDGES
@@ -211,10 +210,9 @@ def warn_of_orphans(orphans: np.ndarray) -> None:
     """One UserWarning if there are vertices that no tetrahedron uses."""
     if len(orphans):
         vertices = "1 vertex" if len(orphans) == 1 else f"{len(orphans)} vertices"
-        warnings.warn(
+        warn(
             f"{vertices} in no tetrahedron, first {orphans[0]}: without mass, a simulation keeps them in place; remove "
-            "them, or load with from_file(..., drop_orphans=True)",
-            stacklevel=4,
+            "them, or load with from_file(..., drop_orphans=True)"
         )
 
 
@@ -222,9 +220,8 @@ def warn_of_slivers(mesh) -> None:
     """One UserWarning if there are tetrahedra of a quality below SLIVER."""
     count, worst = int((mesh.quality < SLIVER).sum()), int(np.argmin(mesh.quality))
     if count:
-        warnings.warn(
+        warn(
             f"{count} sliver{'' if count == 1 else 's'} (quality below {SLIVER}), worst {mesh.quality[worst]:.3g} in "
             f"tetrahedron {worst} with an altitude of {mesh.altitudes[worst].min():.3g} m: the stable explicit step "
-            "falls in proportion to the smallest altitude; remesh, or use an implicit solver",
-            stacklevel=4,
+            "falls in proportion to the smallest altitude; remesh, or use an implicit solver"
         )

@@ -1,6 +1,5 @@
 """What meshes come from and go to: files, surfaces, objects of meshio and PyVista."""
 
-import warnings
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -9,6 +8,8 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance
+from diffsim_ti.common.public import public
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.files import KEEPS_SETS, as_meshio, of_meshio, read_mesh, write_mesh
 from diffsim_ti.mesh.filling import filled
 from diffsim_ti.mesh.readers.file_mesh import FileMesh, parts_of
@@ -34,6 +35,7 @@ class Exchange:
         return cls(vertices, tetrahedra, **sets, fix_orientation=fix_orientation)
 
     @classmethod
+    @public
     def from_file(
         cls,
         path: str | PathLike,
@@ -41,6 +43,7 @@ class Exchange:
         drop_orphans: bool = False,
         size: float | None = None,
         cells: int | None = None,
+        device: str | None = None,
     ) -> "Self":
         """Load a body: tetrahedra of four or ten nodes from Gmsh .msh (1 to 4.1), Abaqus .inp, MEDIT .mesh, .vtk, .vtu,
         .pvtu, TetGen .ele and whatever else meshio reads, or a surface from .stl, .obj, .ply, .off, .gltf or .glb, which is
@@ -52,27 +55,28 @@ class Exchange:
         keep their names. Ten-node tetrahedra keep their mid-edge vertices, and edges that are curved.
         What a file holds and the mesh does not keep is listed in one UserWarning: cells of other kinds, triangles away from
         the tetrahedra, empty groups, materials and loads of Abaqus.
-        drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn.
+        drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn. device:
+        as for `create_cube`.
 
         Raises FileNotFoundError, ImportError where meshio needs a further package (h5py for XDMF, CGNS and MED, netCDF4 for
         Exodus), and ValueError for an unreadable file, one without tetrahedra or with both kinds, solid cells of other
         kinds beside tetrahedra, and whatever the constructor refuses.
         """
         instance("from_file", "path", path, str | PathLike, "that of a mesh file")
+        runtime.use_device(device)
         try:
             parts, left_out = read_mesh(path, size, cells)
             mesh = cls._of_parts(parts, fix_orientation, drop_orphans)
         except ValueError as error:
             raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
         if left_out:
-            warnings.warn(f"{path}: left out: {'; '.join(left_out)}", stacklevel=2)
+            warn(f"{path}: left out: {'; '.join(left_out)}")
         return mesh
 
     @classmethod
     def load_from_msh(cls, path: str | PathLike, device: str | None = None) -> "Self":
         """`from_file(path)` in the seeds' spelling; device as for `create_cube`."""
-        runtime.use_device(device)
-        return cls.from_file(path)
+        return cls.from_file(path, device=device)
 
     def save(self, path: str | PathLike) -> None:
         """Write the mesh through meshio, in the format that the suffix names.
@@ -88,9 +92,10 @@ class Exchange:
         lost = write_mesh(path, self)
         if lost:
             kept = ", ".join(KEEPS_SETS)
-            warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)
+            warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}")
 
     @classmethod
+    @public
     def from_surface(
         cls, points: ArrayLike, triangles: ArrayLike, size: float | None = None, cells: int | None = None
     ) -> "Self":
@@ -117,6 +122,7 @@ class Exchange:
         return cls(*filled(points, triangles.astype(np.int64), size=size, cells=cells)[:2])
 
     @classmethod
+    @public
     def from_meshio(cls, mesh: "meshio.Mesh", fix_orientation: bool = False, drop_orphans: bool = False) -> "Self":
         """Of meshio's mesh, with its sets, as `from_file` has it of a file."""
         return cls._from(of_meshio(mesh), fix_orientation, drop_orphans)
@@ -125,7 +131,7 @@ class Exchange:
     def _from(cls, mesh: FileMesh, fix_orientation: bool, drop_orphans: bool) -> "Self":
         parts, left_out = parts_of(mesh, again=True)
         if left_out:
-            warnings.warn(f"left out: {'; '.join(left_out)}", stacklevel=3)
+            warn(f"left out: {'; '.join(left_out)}")
         return cls._of_parts(parts, fix_orientation, drop_orphans)
 
     def to_meshio(self) -> "meshio.Mesh":
@@ -133,6 +139,7 @@ class Exchange:
         return as_meshio(self)
 
     @classmethod
+    @public
     def from_pyvista(
         cls, grid: "pyvista.UnstructuredGrid", fix_orientation: bool = False, drop_orphans: bool = False
     ) -> "Self":

@@ -5,11 +5,11 @@ import logging
 import subprocess
 import sys
 import tempfile
-import warnings
 from pathlib import Path
 
 import numpy as np
 
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces
 from diffsim_ti.mesh.sets import components, places_of_triangles
 
@@ -186,10 +186,9 @@ def by_ftetwild(points: np.ndarray, triangles: np.ndarray, size: float | None, f
     tetrahedra[turned] = tetrahedra[turned][:, [0, 2, 1, 3]]
     volume = float(np.abs(signed_volumes(edge_matrices(vertices, tetrahedra))).sum())
     lost = f"; its parts {', '.join(parts)} are no sets then" if parts else ""
-    warnings.warn(
+    warn(
         f"{fault}: filled by fTetWild, which moves the surface by up to {1e-3 * np.linalg.norm(np.ptp(points, 0)):.2g} m; "
-        f"the body has {volume:.4g} m^3{lost}; mend the surface to keep it exactly",
-        stacklevel=5,
+        f"the body has {volume:.4g} m^3{lost}; mend the surface to keep it exactly"
     )
     used, corners = np.unique(tetrahedra, return_inverse=True)
     return vertices[used], corners.reshape(-1, 4).astype(np.int64)

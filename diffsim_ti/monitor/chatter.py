@@ -5,12 +5,12 @@ most substeps, vertices move to and fro as fast as the body slides, and it slide
 2 m/s on mu = 0.7 went 5 % too far, one of 10 MPa 0.5 %; with a KelvinVoigt time of a tenth of the stable step, -0.15 %.
 """
 
-import warnings
 import weakref
 
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.sets import pieces
 
 SHAKEN, OPEN, NEAR = 0.3, 0.5, 2  # of the sliding speed; of what has touched; widths
@@ -71,9 +71,8 @@ class Chatter:
             time = VISCOUS * float(ws.solver.stable_dt().dt)
             damped = f"KelvinVoigt({material}(...), {time:.2g}) as the material"
             remedy = f"{damped}, which damps these vibrations, or {remedy}"
-        warnings.warn(
+        warn(
             f"{ws.when(ws.step_of(now - 1, num_passes))}: a body that slides on {term!r} at {slide:.3g} m/s vibrates at "
             f"{shake:.3g} m/s, and its contact opens and closes, because these steps have no damping: friction then does "
-            f"not oppose the sliding, and sliding distances are a few per cent too long; take {remedy}",
-            stacklevel=7,
+            f"not oppose the sliding, and sliding distances are a few per cent too long; take {remedy}"
         )

@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.inputs import kinetic_energy, ratios_at_corners
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.host_force import Instant
@@ -106,7 +107,7 @@ class Energy(float):
         return out
 
 
-@dataclass
+@dataclass(repr=False)
 class TetrahedronFields:
     """Per tetrahedron: energy density [J/m^3], von Mises stress [Pa], volume ratio J [-]; float64. Of ten nodes: means over
     the points, the smallest J there and at the corners, and Cauchy's stress [Pa] at the points, shape (num_tetrahedra, 4,
@@ -116,6 +117,8 @@ class TetrahedronFields:
     von_mises: np.ndarray
     J: np.ndarray
     stress: np.ndarray | None = None
+
+    __repr__ = brief_fields
 
 
 def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:

@@ -4,13 +4,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Derived
 from diffsim_ti.rollout.run import Run
+from diffsim_ti.scene import Scene
 from diffsim_ti.state.watch import ContactResolution
 
 
-@dataclass(eq=False)
-class Frames:
+@dataclass(eq=False, repr=False)
+class Frames(metaclass=Public):
     """Saved states of one run: positions [m] (far from the origin in float64), velocities [m/s], displacements from the rest
     shape [m] (which keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
 
@@ -34,6 +37,8 @@ class Frames:
     `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
     the last good one.
 
+    `scene`: of which they are.
+
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
 
@@ -42,7 +47,7 @@ class Frames:
     displacements: np.ndarray
     times: np.ndarray
     inputs: dict = field(repr=False)
-    contact_resolution: ContactResolution | None = None
+    contact_resolution: ContactResolution | None = field(default=None, repr=False)
     outputs: dict[str, np.ndarray] = field(default_factory=dict)
     contact_forces: np.ndarray | None = field(default=None, repr=False)
     computed: dict = field(default_factory=dict, repr=False)
@@ -52,6 +57,9 @@ class Frames:
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
     error: FloatingPointError | None = None
+    scene: Scene | None = field(default=None, repr=False)
+
+    __repr__ = brief_fields
 
     @property
     def alive(self) -> bool:
@@ -59,8 +67,8 @@ class Frames:
         return self.error is None
 
     def __getstate__(self) -> dict:
-        """Without the run, which lives on the device: a copy by pickle has no gradient."""
-        return vars(self) | dict(run=None)
+        """Without the run, which lives on the device, and the scene: a copy by pickle has no gradient and no picture."""
+        return vars(self) | dict(run=None, scene=None)
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name in ("positions", "velocities", "displacements"):

@@ -1,17 +1,18 @@
 """What a sweep takes and gives: a run that can be done again, and a loss's gradients by its frames."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.inputs import Derived
 from diffsim_ti.state.watch import ContactResolution
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Run:
     """A forward run, by what it takes to do it again: the values of its inputs, and what else sets its start.
 
@@ -24,12 +25,14 @@ class Run:
     """
 
     values: dict
-    start: Callable | None = None
+    start: Callable | None = field(default=None, repr=False)
     first_step: int = 0
     law_state: np.ndarray | None = None
-    contacts: Callable[[], ContactResolution] | None = None
-    seen_by: object | None = None
+    contacts: Callable[[], ContactResolution] | None = field(default=None, repr=False)
+    seen_by: object | None = field(default=None, repr=False)
     error: FloatingPointError | None = None
+
+    __repr__ = brief_fields
 
     @cached_property
     def contact_resolution(self) -> ContactResolution:

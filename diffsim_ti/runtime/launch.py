@@ -1,6 +1,7 @@
 """Kernels with their arrays bound once, launched many times."""
 
 import contextlib
+import logging
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from taichi.lang import impl
 from taichi.types import primitive_types
 
 from diffsim_ti.common import ranks
+from diffsim_ti.common.progress import LOG
 from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
 from diffsim_ti.runtime.arrays import check_owner, full_shape
 from diffsim_ti.runtime.language import made
@@ -112,14 +114,15 @@ PATIENCE, SHORT = 5, 500  # [s]; variables of kernels that take less than a seco
 
 @contextlib.contextmanager
 def say_if_long(what: str):
-    """Say so on stderr, once, if a `with` block of Taichi takes longer than PATIENCE [s].
+    """Say so on stderr, once, if a `with` block of Taichi takes longer than PATIENCE [s] and the logger "diffsim_ti" shows
+    warnings.
 
     The compiler holds Python's lock, so that no thread of this process could say it, and no interrupt is heard: another
     process waits, and is ended if the block ends first. Of several ranks the first one says it.
     """
     text = f"diffsim_ti: {what} takes longer than {PATIENCE} s; an interrupt (Ctrl-C) is heard when it is done"
     waiting = None
-    if os.name == "posix" and ranks.is_first():
+    if os.name == "posix" and ranks.is_first() and LOG.isEnabledFor(logging.WARNING):
         with contextlib.suppress(OSError):
             script = 'sleep "$1"; kill -0 "$2" 2> /dev/null && echo "$3" >&2'
             arguments = ["sh", "-c", script, "sh", str(PATIENCE), str(os.getpid()), text]

@@ -1,8 +1,8 @@
 """Where a scene's tetrahedra lock: they resist changes of volume, and so bend too little, as Poisson's ratio nears 0.5."""
 
-import warnings
 from typing import TYPE_CHECKING
 
+from diffsim_ti.common.warn import warn
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.terms import Growth
 
@@ -30,8 +30,7 @@ def warn_if_locking(scene: "Scene") -> None:
     if _averages(scene):
         remedy += 'pass volume="patches" to the Scene, '
     if nu > limit + 1e-12:
-        warnings.warn(
+        warn(
             f"{scene.material.name}: Poisson's ratio {nu:.6g} is above {limit}, where {kind} tetrahedra lock (bend too "
-            f'little): {remedy}cut the cells of create_box with pattern="five", refine the mesh, or lower the ratio',
-            stacklevel=3,
+            f'little): {remedy}cut the cells of create_box with pattern="five", refine the mesh, or lower the ratio'
         )

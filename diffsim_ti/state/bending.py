@@ -4,12 +4,12 @@ Contact takes a face for the four triangles of its nodes, unless it was curved f
 Where a face has bent farther, the run that finds it is done again with faces as curved as they are.
 """
 
-import warnings
 import weakref
 
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.collision_surface import BOWED, cuts_of
 from diffsim_ti.mesh.face_points import bow, bows, points_of_bow
 
@@ -52,10 +52,9 @@ class Bending:
             bend, width = FacesBend(float(off.max())), self.ws.pairs.width
             left = bend.bend / 2 / 4 ** cuts_of(a.mesh, a.self_contact, bend.bend)
             if left > width:
-                warnings.warn(
+                warn(
                     f"{bend}, and lie up to {left:.3g} m from the triangles of SelfContact, more than its width {width:.3g} "
-                    f"m: refine the mesh, or take a width of {left:.3g} m",
-                    stacklevel=7,
+                    f"m: refine the mesh, or take a width of {left:.3g} m"
                 )
             raise bend
         self.ws.place_obstacles(now)

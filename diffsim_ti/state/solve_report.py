@@ -5,7 +5,10 @@ from collections import deque
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.copies import CarriesMore
+from diffsim_ti.common.progress import Steady
+from diffsim_ti.common.public import Public
 
 
 class Buckled(CarriesMore, UserWarning):
@@ -20,7 +23,7 @@ class Buckled(CarriesMore, UserWarning):
         self.step, self.saddles, self.unstable = step, saddles, unstable
 
 
-@dataclass
+@dataclass(repr=False)
 class StepReport:
     """Solves of one step of an implicit or static solver, all of its substeps together.
 
@@ -42,6 +45,8 @@ class StepReport:
     seconds: float = 0.0
     residuals: list | None = None
 
+    __repr__ = brief_fields
+
     def add(self, solve) -> None:
         """Add what a solve took (NewtonReport)."""
         self.iterations += max(len(solve.residuals) - 1, 0)  # the last look finds it solved
@@ -52,7 +57,7 @@ class StepReport:
         self.residuals = (self.residuals or []) + [list(solve.residuals)]
 
 
-class SolveReport:
+class SolveReport(metaclass=Public):
     """`steps`: a StepReport for each of the last 10 000 steps, empty for explicit solvers, which solve nothing; `seconds`
     and `substeps`, of all. Totals: `iterations`, `products`, `energies`, `cuts`, `blocked`, `indefinite`, `saddles`;
     `residual`: the largest with which a step ended. Of a Rollout's last forward run, or of a Simulator since its reset;
@@ -61,12 +66,13 @@ class SolveReport:
 
     def __init__(self):
         self.steps: deque[StepReport] = deque(maxlen=10_000)
-        self.seconds, self.substeps, self._noting = 0.0, 0, False
+        self._noting = False
+        self.clear()
 
     def clear(self) -> None:
         """Forget all."""
         self.steps.clear()
-        self.seconds, self.substeps = 0.0, 0
+        self.seconds, self.substeps, self._steady = 0.0, 0, Steady()
 
     @contextmanager
     def of_passes(self, count: int):
@@ -87,6 +93,8 @@ class SolveReport:
             self.steps[-1].seconds += seconds
             for solve in solves:
                 self.steps[-1].add(solve)
+            last = self.steps[-1]
+            self._steady.log("step %s: %s Newton iterations, residual %.2g", step, last.iterations, last.residual)
 
     def _total(self, name: str):
         return sum(getattr(step, name) for step in self.steps)

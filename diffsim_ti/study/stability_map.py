@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import public
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
@@ -111,6 +113,7 @@ def kept_energy(solver: Solver, mass: np.ndarray, v: np.ndarray, du: np.ndarray,
     return float(-(h**2 / 8 * f * f / mass).sum())
 
 
+@public
 def boundary(scene: Scene, kind: type[Solver], steps: int = 2000, accuracy: float = 0.005) -> float:
     """Largest dt [s] at which the solver, its refusal overridden, stays bounded: by bisection around the limit.
 
@@ -126,7 +129,7 @@ def boundary(scene: Scene, kind: type[Solver], steps: int = 2000, accuracy: floa
     return float(np.sqrt(low * high))
 
 
-@dataclass
+@dataclass(repr=False)
 class StabilityMap:
     """Runs over dt (rows, as shares of the explicit limit) x an axis (columns), with the limits [s] of the columns.
 
@@ -139,6 +142,8 @@ class StabilityMap:
     limits: np.ndarray
     runs: list[list[Run]]
     bounds: np.ndarray
+
+    __repr__ = brief_fields
 
     @property
     def explicit(self) -> bool:
@@ -177,6 +182,7 @@ SHARES = {
 }
 
 
+@public
 def stability_map(
     kind: type[Solver],
     axis: Axis,

@@ -11,7 +11,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.progress import progress
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.monitor.stability import element_limit
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.rollout.set_values import split_name, spread_all
@@ -25,7 +27,7 @@ TURN = threading.Lock()  # workers of one process take turns, as Taichi does
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(metaclass=Public):
     """How a scene is run where no rollout is given: solver class, duration [s] and number of frames."""
 
     solver: type = VelocityVerletSolver
@@ -44,7 +46,7 @@ class Settings:
         return Rollout(solver, self.frames, save_every=1)
 
 
-@dataclass
+@dataclass(repr=False)
 class Sweep:
     """Rows of a sweep, one for each point of the grid, in its order; the first axis varies slowest.
 
@@ -53,6 +55,8 @@ class Sweep:
 
     over: dict[str, list[float]]
     rows: list[dict]
+
+    __repr__ = brief_fields
 
     @property
     def results(self) -> list[str]:
@@ -82,6 +86,7 @@ def largest_motion(frames: Frames) -> dict[str, float]:
     return out
 
 
+@public
 def sweep(
     make: Callable[..., Scene | Rollout] | Scene | Rollout,
     over: Mapping[str, Sequence[float]],

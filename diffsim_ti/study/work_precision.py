@@ -9,7 +9,9 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.progress import progress
+from diffsim_ti.common.public import public
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver, stable_dt
@@ -56,7 +58,7 @@ class Point:
         return f"{self.solver.removesuffix('Solver')}, {mesh}{step}, {self.precision}"
 
 
-@dataclass
+@dataclass(repr=False)
 class Chart:
     """The runs of a problem, the reference they were measured against and its own error (relative, like theirs)."""
 
@@ -64,6 +66,8 @@ class Chart:
     points: list[Point]
     reference_error: float
     left_out: list[str] = field(default_factory=list)
+
+    __repr__ = brief_fields
 
     @property
     def front(self) -> list[Point]:
@@ -264,6 +268,7 @@ class Runs:
                 )
 
 
+@public
 def chart(
     problem: Problem,
     solvers: Sequence[type[Solver]] | None = None,

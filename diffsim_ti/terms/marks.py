@@ -9,13 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import triangle_normals
 
 MOST = 60  # arrows that are drawn of one load, spread evenly
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Moment:
     """What a term is drawn at: positions [m], shape (num_vertices, 3); time [s]; values: {plain name of an input of the
     term: its value now}, of what is given over time the one of that moment, without the axis of time."""
@@ -25,9 +27,11 @@ class Moment:
     time: float
     values: Mapping[str, np.ndarray]
 
+    __repr__ = brief_fields
 
-@dataclass(frozen=True)
-class Arrows:
+
+@dataclass(frozen=True, repr=False)
+class Arrows(metaclass=Public):
     """Arrows at points [m], shape (k, 3), of vectors of a unit, (k, 3). Those of one label have one scale in a picture,
     whose longest is named in its key. onto: which end at their point, as what pushes, (k,) of bool; others begin there.
     through: whether they are seen through bodies, as forces between two must be."""
@@ -38,26 +42,33 @@ class Arrows:
     onto: np.ndarray
     through: bool = False
 
+    __repr__ = brief_fields
 
-@dataclass(frozen=True)
-class Lines:
+
+@dataclass(frozen=True, repr=False)
+class Lines(metaclass=Public):
     """Straight lines, such as springs: their two ends [m], shape (k, 2, 3)."""
 
     label: str
     ends: np.ndarray
 
+    __repr__ = brief_fields
 
-@dataclass(frozen=True)
-class Points:
+
+@dataclass(frozen=True, repr=False)
+class Points(metaclass=Public):
     """Discs at points [m], shape (k, 3)."""
 
     label: str
     points: np.ndarray
 
+    __repr__ = brief_fields
+
 
 Mark = Arrows | Lines | Points
 
 
+@public
 def arrows(
     label: str, mesh: TetrahedralMesh, positions: np.ndarray, vertices: ArrayLike, vectors: np.ndarray, most: int = MOST
 ) -> Arrows:

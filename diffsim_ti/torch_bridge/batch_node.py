@@ -3,6 +3,7 @@
 import numpy as np
 
 from diffsim_ti.batch import Batch
+from diffsim_ti.common.brief import brief
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
 from diffsim_ti.torch_bridge.set_tensors import as_tensors, on_host
 
@@ -18,6 +19,9 @@ class TorchBatchFrames(dict):
     def __init__(self, outputs: dict, alive: np.ndarray):
         super().__init__(outputs)
         self.alive = torch.from_numpy(alive.copy())
+
+    def __repr__(self) -> str:
+        return f"TorchBatchFrames({len(self.alive)} scenes, {brief(dict(self))[1:-1]})"
 
     positions, velocities, displacements = (property(lambda self, name=name: self[name]) for name in STATES)
 

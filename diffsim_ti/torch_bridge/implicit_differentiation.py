@@ -1,13 +1,14 @@
 """PyTorch interface: gradients through solutions of equations, and conjugate gradients. Right for any equation, not
 only ours."""
 
-import warnings
-
 import numpy as np
 
+from diffsim_ti.common.public import Public, public
+from diffsim_ti.common.warn import warn
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
 
 
+@public
 def conjugate_gradient(A, b: torch.Tensor, x0: torch.Tensor | None = None, max_iters: int = 100, atol: float = 1e-6):
     """Solve A x = b for a symmetric positive definite operator given by products A(v); |b - A x| <= atol.
 
@@ -22,19 +23,16 @@ def conjugate_gradient(A, b: torch.Tensor, x0: torch.Tensor | None = None, max_i
         Ap = A(p)
         curvature = (p * Ap).sum()
         if curvature <= 0:
-            warnings.warn(
-                f"conjugate_gradient: A is not positive definite (p.A p = {float(curvature):.3g})", stacklevel=2
-            )
+            warn(f"conjugate_gradient: A is not positive definite (p.A p = {float(curvature):.3g})")
             return x
         alpha = rr / curvature
         x, r = x + alpha * p, r - alpha * Ap
         rr, old = (r * r).sum(), rr
         p = r + (rr / old) * p
     if rr.sqrt() > atol:
-        warnings.warn(
+        warn(
             f"conjugate_gradient did not converge: |b - A x| = {float(rr.sqrt()):.3g} > atol = {atol:g} after "
-            f"{max_iters} iterations; raise max_iters or precondition",
-            stacklevel=2,
+            f"{max_iters} iterations; raise max_iters or precondition"
         )
     return x
 
@@ -87,7 +85,7 @@ class _Implicit(torch.autograd.Function):
         return None, None, None, *(next(grads) if p.requires_grad else None for p in params)
 
 
-class ImplicitDifferentiation:
+class ImplicitDifferentiation(metaclass=Public):
     """Gradients through a solution by the implicit function theorem: dx*/dp = -(dF/dx)^-1 dF/dp."""
 
     @staticmethod

@@ -1,9 +1,9 @@
 """How far an optimiser may move a number: bounds that keep the way back, a step for each number, steps that are refused."""
 
 import gc
-import warnings
 from collections.abc import Iterator
 
+from diffsim_ti.common.warn import warn
 from diffsim_ti.torch_bridge.autograd import torch
 
 
@@ -32,7 +32,7 @@ def bounded(x: torch.Tensor, low: float, high: float, name: str = "") -> torch.T
         return x
     if name and (least < low or largest > high):
         message = f"{name} has left [{low:g}, {high:g}] and is taken at that bound; its gradient leads back"
-        warnings.warn(message + ": smaller steps come from material.parameter_groups(relative=...)", stacklevel=2)
+        warn(message + ": smaller steps come from material.parameter_groups(relative=...)")
     return _Bounded.apply(x, low, high)
 
 

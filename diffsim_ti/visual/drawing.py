@@ -1,11 +1,12 @@
 """Drawing: frame after frame of one body, with the same camera, colours, floor, obstacles and legend, by either back end."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import Arrows, Mark, vertex_normals
 from diffsim_ti.terms.obstacles.shapes import Triangles
@@ -55,7 +56,18 @@ def held_along(mesh: TetrahedralMesh, vertices: np.ndarray, held: np.ndarray) ->
     return vertices[rank == 3], vertices[which], axes
 
 
-class Drawing:
+class Look(TypedDict, total=False):
+    """How a body is seen; `Drawing` says what each means and is where it is left out."""
+
+    camera: Camera | None
+    azimuth: float
+    elevation: float
+    fixed: ArrayLike | None
+    held: ArrayLike | None
+    wireframe: bool
+
+
+class Drawing(metaclass=Public):
     """Pictures of a body's surface, y upwards.
 
     mesh: its rest shape tells sharp edges from curved surfaces.

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
@@ -21,8 +23,8 @@ from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.scene_marks import marks_of
 
 
-@dataclass
-class Setting:
+@dataclass(repr=False)
+class Setting(metaclass=Public):
     """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand.
 
     held: of fixed vertices the projectors onto the directions in which each is fixed, shape (len(fixed), 3, 3), where some
@@ -35,6 +37,8 @@ class Setting:
     obstacles: list[Triangles] = field(default_factory=list)
     held: np.ndarray | None = None
 
+    __repr__ = brief_fields
+
     @classmethod
     def of(cls, scene: Scene) -> "Setting":
         """A scene's."""
@@ -42,8 +46,8 @@ class Setting:
         return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene), held)
 
 
-@dataclass
-class Frame:
+@dataclass(repr=False)
+class Frame(metaclass=Public):
     """A moment of a run.
 
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
@@ -64,15 +68,17 @@ class Frame:
     marks: list[Mark] = field(default_factory=list)
     units: dict[str, str] = field(default_factory=dict)
 
+    __repr__ = brief_fields
+
     @property
     def colours(self) -> dict[str, np.ndarray]:
         """The fields that pictures can be coloured by."""
         return {name: values for name, values in self.fields.items() if name in FIELDS}
 
     @classmethod
-    def of_run(cls, scene: Scene, frames: Frames, k: int) -> "Frame":
-        """Frame k of a Rollout's run of a scene; its fields are displacement, speed, J, von Mises stress where `Stress`
-        supports the law, and the outputs that each vertex or each tetrahedron has: vectors such as
+    def of_run(cls, scene: Scene, frames: Frames, k: int = -1) -> "Frame":
+        """Frame k, default the last, of a Rollout's run of a scene; its fields are displacement, speed, J, von Mises stress
+        where `Stress` supports the law, and the outputs that each vertex or each tetrahedron has: vectors such as
         ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices"). What some vertices have,
         such as Reaction(per_vertex=True), is zero at the others.
 
@@ -92,21 +98,22 @@ class Frame:
         return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
 
     @classmethod
-    def of(cls, simulator: Simulator, outputs: Iterable[Output] = (), last: Simulator | None = None, **more) -> "Frame":
-        """The present state of a simulator, in its scene's precision. more: further arguments of the class.
+    def of(cls, simulator: Simulator, outputs: Iterable[Output] = (), last: Simulator | None = None) -> "Frame":
+        """The present state of a simulator, in its scene's precision.
 
         outputs: become fields as in `of_run`; last: the simulator that took the last step to this state, if another did.
         """
         u, v, scene = simulator.displacements, simulator.velocities, simulator.scene
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
         fields |= measured_fields(simulator)
-        moved = [points for points, _ in obstacle_surfaces(scene, simulator.time)] if scene.moving else None
         x, values = simulator.positions, simulator.values
+        rows = {name: values[name][-1] for name in scene.inputs.paths}
+        moved = [points for points, _ in obstacle_surfaces(scene, simulator.time, rows)] if scene.moving else None
         drawn = marks_of(scene, x, simulator.time, simulator.step_count, values)
         by = last or simulator
         shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)
         shown |= _loads(scene, x, simulator.step_count, simulator.values_of_step)
-        return cls(simulator.time, x, u, v, fields | shown, moved, **dict(marks=drawn, units=units) | more)
+        return cls(simulator.time, x, u, v, fields | shown, moved, marks=drawn, units=units)
 
 
 def _strained(scene: Scene, frames: Frames, k: int) -> dict[str, np.ndarray]:

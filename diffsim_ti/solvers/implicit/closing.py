@@ -9,12 +9,12 @@ holds it. Their fixed points are the equilibria, and the last solve is Newton's 
 Rockafellar 1976, Monotone operators and the proximal point algorithm, doi:10.1137/0314056.
 """
 
-import warnings
 import weakref
 
 import numpy as np
 
 from diffsim_ti.common.errors import NotConverged
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.terms.supports import rigid_motions_left
 
@@ -72,7 +72,7 @@ class Closing:
             left = self.left(place)
         if not self.said:
             self.said = True
-            warnings.warn(f"static solve: but for contact {ws.solver.loose}; contact holds it", stacklevel=2)
+            warn(f"static solve: but for contact {ws.solver.loose}; contact holds it")
         return place
 
     def _words(self, left: np.ndarray) -> str:

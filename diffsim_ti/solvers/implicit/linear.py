@@ -1,11 +1,11 @@
 """Linear systems of the implicit solvers: A x = b with A = c M + d2E/du2 on the free vertices, by products alone."""
 
 import math
-import warnings
 
 import numpy as np
 
 from diffsim_ti.common.errors import NotConverged
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import diagonal_of
 from diffsim_ti.mechanics.host_force import NONE, HostForces
 from diffsim_ti.mechanics.supports.free import Free, linear_of
@@ -107,7 +107,7 @@ def _say(preconditioner, message: str) -> None:
     """Once of each preconditioner."""
     if not preconditioner.has_warned:
         preconditioner.has_warned = True
-        warnings.warn(message, stacklevel=2)
+        warn(message)
 
 
 def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_iterations: int, eps: float):

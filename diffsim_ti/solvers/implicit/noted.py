@@ -1,10 +1,10 @@
 """What is noted of the solves of an implicit run: what they took, and whether statics left a branch of equilibria."""
 
-import warnings
 import weakref
 
 import numpy as np
 
+from diffsim_ti.common.warn import warn
 from diffsim_ti.state.solve_report import Buckled
 
 
@@ -38,7 +38,7 @@ class Noted:
                 )
             went = "it went to a lower equilibrium, which may be one of several, and gradients are of it"
             said = f"step {step}: {left}; {went}"
-            warnings.warn(Buckled(said, step, saddles, unstable), stacklevel=2)
+            warn(Buckled(said, step, saddles, unstable))
 
     def _left_a_branch(self, j: int, u, held, problem: tuple, saddles: int) -> bool:
         """Whether the equilibrium of pass j is farther from that before it than the tangents at both explain. On one smooth

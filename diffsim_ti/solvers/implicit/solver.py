@@ -10,13 +10,14 @@ velocities by exp(-c h) in a stage of its own. Statics: no inertia, u* is where 
 """
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from diffsim_ti.common.checked import between, whole
 from diffsim_ti.solvers.implicit.adjoint import ImplicitAdjoint
 from diffsim_ti.solvers.implicit.tangent import ImplicitTangent
 from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.stage import Stage
 
 if TYPE_CHECKING:
@@ -50,11 +51,11 @@ class ImplicitSolver(Solver):
         self,
         scene: "Scene",
         dt: float = 0.01,
-        substeps: int = 1,
+        substeps: Substeps = 1,
         tolerance: float = 1e-6,
         max_iterations: int = 50,
         parallel: bool | None = None,
-        preconditioner: str = "auto",
+        preconditioner: Literal["auto", "block_jacobi", "multigrid"] = "auto",
     ):
         if preconditioner not in ("auto", "block_jacobi", "multigrid"):
             raise ValueError(f"preconditioner must be auto, block_jacobi or multigrid, got {preconditioner!r}")
