@@ -1,6 +1,5 @@
 """Simulator: the step-by-step interface of a solver."""
 
-import math
 import warnings
 import weakref
 
@@ -17,7 +16,7 @@ from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.solvers.substeps import MOST
+from diffsim_ti.solvers.substeps import MOST, needed
 from diffsim_ti.state.bending import FacesBend
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactResolution
@@ -171,14 +170,14 @@ class Simulator:
         enough = getattr(error, "enough", None)
         if not self.solver.automatic or enough is None or not enough < self.solver.substep:
             raise error
-        count = math.ceil(self.solver.dt / enough)
+        count = needed(self.solver.dt, enough, 1.0)
         if count > MOST:
             raise error
         if self.solver is self._first_solver:
             warnings.warn(
                 f"{self.workspace.when(self.step_count)}: steps are divided into more than {self.solver.substeps} substeps "
                 f"from here on, {count} in this one: pass substeps={count} for the same number from the start ({error})",
-                stacklevel=3,
+                stacklevel=4,
             )
         self.workspace.report.substeps -= self.solver.num_passes(1)  # which are done again
         self._take_solver(self.solver.with_substeps(count))
