@@ -46,7 +46,7 @@ def parts() -> int:
     """How many laws, terms, solvers and outputs there are; made, and not run."""
     mesh = ds.TetrahedralMesh.create_box((3, 3, 3), size=0.5, pattern="five")
     soft = ds.StableNeoHookean(E=1e4, nu=0.3, J_floor=0.02)
-    laws = [
+    laws: list[ds.Material] = [
         soft,
         ds.SmithNeoHookean(1e4, 0.3),
         ds.LinearElastic(mu=4e3, lam=6e3),
@@ -100,7 +100,8 @@ def parts() -> int:
     ]
     outputs: list[ds.outputs.Output] = [
         ds.MaterialPoints(mesh.centroids[:2]),
-        ds.ContactForce("ball", part="friction"),
+        ds.CenterOfMass("xmax"),
+        ds.ContactForce("ball", part="friction", on="xmin"),
         ds.ContactTraction(ball),
         ds.SelfContactForce("xmin", part="normal"),
         ds.Stress(kind="first_piola"),
@@ -116,6 +117,12 @@ def parts() -> int:
     assert_type(ds.Rollout(solvers[0], ds.UnequalSteps([1e-4, 2e-4])).on(solvers[1], save_every=1), ds.Rollout)
     assert_type(scene.replace(density=900.0, precision="f32"), ds.Scene)
     return len(laws) + len(loads) + len(names) + len(solvers) + len(outputs)
+
+
+class Cubic(ds.EnergyLaw):
+    """The energy of a law is what a user writes of it."""
+
+    coefficient_names = ("mu", "lam")
 
 
 def turning(time: float) -> tuple[float, ...]:
