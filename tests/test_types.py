@@ -144,9 +144,9 @@ def test_words_of_other_programs_are_answered():
     count = 0
     for thing in TAKES.values():
         options = [p.name for p in named(thing)]
-        for word in ELSEWHERE.keys() - set(options):
-            meant = [x for x in ELSEWHERE[word] if x in options]
-            near = nearest(word, options)
+        for word, meant in ELSEWHERE.items():
+            meant = [x for x in meant if x in options and word not in options]
+            near = nearest(word, options) if meant else None
             count += bool(meant)
             assert not meant or near == meant[0] or edits(word, near) == 1, (thing, word, near)
     assert count > 100

@@ -7,6 +7,8 @@ import numpy as np
 from typing_extensions import assert_type
 
 import diffsim_ti as ds
+from diffsim_ti.outputs import Output
+from diffsim_ti.terms import Term
 
 
 def fall() -> float:
@@ -64,7 +66,7 @@ def parts() -> int:
     spring = ds.Spring(0, ds.Anchor((0.0, 0.0, -1.0)), stiffness=10.0, name="spring")
     cable = ds.Cable([0, 1], tension=lambda t: 2 * t, name="cable")
     ball = ds.Sphere((0.0, -2.0, 0.0), 0.5, friction=0.3, path=lambda t: (t, 0.0, 0.0), name="ball")
-    loads: list[ds.terms.Term] = [
+    loads: list[Term] = [
         ds.Gravity((0.0, -9.81, 0.0)),
         ds.Drag(0.5),
         ds.ExternalForce((0.0, 0.0, 1.0), "xmax"),
@@ -98,7 +100,7 @@ def parts() -> int:
         ds.BDF2Solver(scene, max_iterations=20),
         ds.StaticSolver(scene, load_steps=2),
     ]
-    outputs: list[ds.outputs.Output] = [
+    outputs: list[Output] = [
         ds.MaterialPoints(mesh.centroids[:2]),
         ds.CenterOfMass("xmax"),
         ds.ContactForce("ball", part="friction", on="xmin"),

@@ -59,8 +59,8 @@ class Term(metaclass=Public):
         """{plain name of an input: the tensor that it was given as}"""
         return {i.plain: i.given for i in self.described if i.given is not None}
 
-    def with_input(self, plain: str, **changes) -> "Term":
-        """A copy in which the input of a plain name has another value, shapes ..."""
+    def with_input(self, plain: str, **changes: object) -> "Term":
+        """A copy in which the input of a plain name has another value, shapes ..., fields of `Input`."""
         out = copy(self)
         out.described = tuple(replace(i, **changes) if i.plain == plain else i for i in self.described)
         out.left_to_scene = tuple(name for name in self.left_to_scene if name != plain)
