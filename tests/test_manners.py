@@ -22,7 +22,7 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.monitor.quantities import TetrahedronFields
 from diffsim_ti.torch_bridge.rollout_node import rollout_frames
 from diffsim_ti.verify import GradientCheck, GradientReport
-from diffsim_ti.writers import WRITERS, Frame, Setting, View, open_writer
+from diffsim_ti.writers import WRITERS, Frame, Setting, View, open_writer, save_frames
 
 PACKAGE = Path(__file__).parent.parent / "diffsim_ti"
 
@@ -209,3 +209,10 @@ def test_writers_work_with_their_defaults(objects, tmp_path, suffix):
     with open_writer(tmp_path / f"run{suffix}", objects["scene"], View()) as out:
         out.write(Frame.of_run(objects["scene"], objects["frames"]))
     assert out.count == 1 and (tmp_path / f"run{suffix}").stat().st_size > 100
+
+
+def test_a_run_is_saved_in_a_line(objects, tmp_path):
+    assert save_frames(tmp_path / "run.npz", objects["frames"]).count == 3
+    np.testing.assert_array_equal(np.load(tmp_path / "run.npz")["positions"], objects["frames"].positions)
+    with pytest.raises(ValueError, match="a copy by pickle has no scene: write each by open_writer"):
+        save_frames(tmp_path / "run.npz", objects["unpickled"])
