@@ -18,14 +18,16 @@ from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
+from diffsim_ti.solvers.substeps import Chosen, Substeps, checked
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 from diffsim_ti.torch_bridge.autograd import torch, uncompiled
 from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
+from diffsim_ti.torch_bridge.simulator import TorchSimulator
 from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
 
-__all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "rollout_frames"]
+__all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "TorchSimulator", "rollout_frames"]
 
 
 class DifferentiableSolver:
@@ -35,8 +37,9 @@ class DifferentiableSolver:
     velocity kept over one dt, whatever the substeps, default 1 (none).
     method: a solver class of the core: SemiImplicitSolver, VelocityVerletSolver, ImplicitEulerSolver,
     ImplicitMidpointSolver or BDF2Solver; options: further arguments of that class, such as tolerance=1e-9.
-    substeps: for explicit methods the least number: the simulator raises it to what stability and contact ask for, says so
-    once, and keeps the count. Implicit methods take it as it is; their gradients are as exact as `tolerance`.
+    substeps: for explicit methods "auto", what stability and contact ask for at the start, or the least number: the
+    simulator raises it to that and says so once. The count only grows. Implicit methods take a number as it is, "auto" for
+    one; their gradients are as exact as `tolerance`.
 
     BDF2Solver looks back two steps, but each `step()` and each `rollout()` starts afresh: `step()` refuses it, and
     `rollout(n)` takes its first step by backward Euler. Equilibria (StaticSolver) have no steps: use `rollout_frames`.
@@ -47,7 +50,7 @@ class DifferentiableSolver:
         dt: float = 0.01,
         gravity: float | ArrayLike | torch.Tensor = -9.8,
         damping: float = 1.0,
-        substeps: int = 1,
+        substeps: Substeps = "auto",
         method: type[Solver] = SemiImplicitSolver,
         **options,
     ):
@@ -62,7 +65,8 @@ class DifferentiableSolver:
                 "method: StaticSolver has no steps; use rollout_frames(Rollout(StaticSolver(scene), 1), ...)"
             )
         self.method, self.options = method, options
-        self.dt, self.gravity, self.damping, self.substeps = float(dt), gravity, float(damping), int(substeps)
+        self.dt, self.gravity, self.damping = float(dt), gravity, float(damping)
+        self.substeps = checked(substeps, method.explicit)
 
     def gravity_vector(self, like: torch.Tensor) -> torch.Tensor:
         """Gravity as a vector of 3, with its graph."""
@@ -318,8 +322,9 @@ class DifferentiableSimulator:
         omega2 += self._contact_rigidity(scene, values) * barrier.REFERENCE_CURVATURE
         needed = math.ceil(self.solver.dt * math.sqrt(omega2) / 2 / 0.8)
         if needed > self._substeps:
-            warn(
-                f"dt = {self.solver.dt:g} s is divided into {needed} substeps (asked for at least {self.solver.substeps}), "
-                "which stability and contact ask for"
-            )
-            self._substeps, self._rollouts = needed, {}
+            if not isinstance(self._substeps, Chosen):
+                warn(
+                    f"dt = {self.solver.dt:g} s is divided into {needed} substeps (asked for at least "
+                    f"{self.solver.substeps}), which stability and contact ask for"
+                )
+            self._substeps, self._rollouts = type(self._substeps)(needed), {}

@@ -198,7 +198,7 @@ def test_steps_are_stable_up_to_the_limit(numbers):
         grown.append(np.abs(last - start.mean(0)).max())
     assert grown[0] < 1e-5 and grown[1] > 100 * grown[0]
     with pytest.raises(ValueError, match="exceeds the stable step"):
-        ds.VelocityVerletSolver(body, dt=1.01 * limit)
+        ds.VelocityVerletSolver(body, dt=1.01 * limit, substeps=1)
 
 
 # ---- gradients ---------------------------------------------------------------------------------------------------------

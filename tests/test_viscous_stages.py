@@ -60,7 +60,7 @@ def test_steps_are_stable_up_to_the_limit(numbers):
         last = ds.Rollout(solver, 400, save_every=400).forward().velocities[-1]
         assert np.abs(last - start.mean(0)).max() < 1e-5
         with pytest.raises(ValueError, match="exceeds the stable step"):
-            ds.SemiImplicitSolver(body, dt=1.01 * limits[n], viscous_stages=n)
+            ds.SemiImplicitSolver(body, dt=1.01 * limits[n], substeps=1, viscous_stages=n)
     assert ds.SemiImplicitSolver(body, dt=1e-9, viscous_stages=8).stable_dt() <= limits[8]
 
 
@@ -68,7 +68,7 @@ def test_a_step_that_has_been_outgrown_is_noticed():
     """Where a run is given stronger viscosity than the step was made for."""
     body = scene(ds.KelvinVoigt(ELASTIC, time=0.03), initial_positions=CUBE.vertices * [1.2, 1, 1])
     limit = ds.SemiImplicitSolver(body, dt=1e-9, viscous_stages=4).stable_dt(tight=True).dt
-    rollout = ds.Rollout(ds.SemiImplicitSolver(body, dt=0.9 * limit, viscous_stages=4), 100, save_every=100)
+    rollout = ds.Rollout(ds.SemiImplicitSolver(body, dt=0.9 * limit, substeps=1, viscous_stages=4), 100, save_every=100)
     rollout.forward()
     with pytest.raises(ds.Divergence, match="outgrown the stable step"):
         rollout.forward(viscous_time=1.0)

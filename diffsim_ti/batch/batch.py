@@ -79,12 +79,7 @@ class Batch:
         options = dict(save_every=save_every, gradients=gradients, truncate=truncate, memory=memory)
         self.one = Rollout(solver, steps, outputs=outputs, **options)
         self._lanes_asked = lanes
-        self.solver, self.scene, self.inputs, self.wanted = (
-            self.one.solver,
-            self.one.scene,
-            self.one.inputs,
-            self.one.wanted,
-        )
+        self.scene, self.inputs, self.wanted = self.one.scene, self.one.inputs, self.one.wanted
         self.frames: BatchFrames | None = None  # of the last `run`
         self.gradients: dict[str, np.ndarray] = {}
         self.tape_face = BatchTapeAdapter(self, runs)
@@ -96,6 +91,8 @@ class Batch:
             raise ValueError(f"scenes cannot be computed side by side: {self.why_not}; leave out lanes=True")
         self.lanes = self.why_not is None if lanes is None else bool(lanes)
         self.sweep = BatchSweep(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
+        if self.sweep:
+            self.sweep.run_substeps = self.one.sweep.run_substeps
 
     def __reduce__(self):
         """As it was made; frames and values of its fields are not in it."""
@@ -110,6 +107,11 @@ class Batch:
         return f"Batch({self.num_scenes} scenes {how} of {self.one!r})"
 
     @property
+    def solver(self) -> Solver:
+        """The solver, with the substeps that runs take."""
+        return self.one.solver
+
+    @property
     def outputs(self) -> dict[str, Output]:
         """The outputs of one scene."""
         return self.one.outputs
@@ -121,12 +123,22 @@ class Batch:
         inputs = spread_shape(inputs, self.one.values)
         inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
         values = checked_values(self.one, inputs, self.num_scenes)
+        self._fit(values)
         run = (self._side_by_side if self.lanes else self._by_turns)(values)
         run.sets = sets
         dead = np.flatnonzero(~run.alive)
         if raise_errors and dead.size:
             raise run.error(int(dead[0]))
         return run
+
+    def _fit(self, values: dict) -> None:
+        """Let the stiffest scene choose substeps that were left to the solver, and refuse values that need more."""
+        if self.solver.automatic:
+            matters = self.one.sweep.run_substeps.matters
+            own = any(isinstance(x, Own) and matters(name) for name, x in values.items())
+            each = [{n: value_of(x, b) for n, x in values.items()} for b in range(self.num_scenes if own else 1)]
+            for sweep in (self.one.sweep, *([self.sweep] if self.sweep else [])):
+                sweep.fit(each)
 
     def _side_by_side(self, values: dict) -> BatchFrames:
         run, times = self.sweep.run(values), self.one.times

@@ -8,7 +8,6 @@ from diffsim_ti import runtime
 from diffsim_ti.batch.adjoint import BatchAdjoint, BatchTangent
 from diffsim_ti.batch.workspace import BatchWorkspace
 from diffsim_ti.inputs import Derived
-from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.state.watch import ContactResolution, ContactWatch, limits, worst
@@ -76,13 +75,10 @@ class BatchSweep(Sweep):
     """Runs of many scenes; values are arrays that all share, or `Own`."""
 
     def __init__(self, solver, steps: int, num_scenes: int, memory: float | None = None, **options):
-        super().__init__(solver, steps, memory=memory, **options)
         self.num_scenes = num_scenes
         whole = -(-num_scenes // runtime.LANES) * runtime.LANES  # in blocks, of vectors of three; else of four
-        held = whole / 4 * 3 if runtime.runs_on_cpu() else num_scenes
-        self.checkpoints = choose_checkpoints(
-            self.num_passes, int(self.state_bytes * held), None, memory, self.checkpoints.law_state
-        )
+        self.held = whole / 4 * 3 if runtime.runs_on_cpu() else num_scenes
+        super().__init__(solver, steps, memory=memory, **options)
 
     def values_of(self, values: dict, b: int) -> dict:
         """The values of scene b."""

@@ -214,6 +214,16 @@ class Inputs:
         return any(x.makes_rows for x in self.scene.interactions)
 
     @property
+    def change_in_time(self) -> bool:
+        """Whether something of it does, as the scene is given."""
+        return any(
+            name not in self.values or self.values[name].ndim == len(rule)
+            for name in self._per_step
+            for rule in self.described[name].shapes
+            if "steps" in rule or "steps + 1" in rule
+        )
+
+    @property
     def names(self) -> tuple[str, ...]:
         return tuple(self.values)
 
@@ -232,8 +242,11 @@ class Inputs:
     def at_step(self, step: int, dt: float, values: dict | None = None) -> dict[str, np.ndarray]:
         """The values of a run of one step of dt [s], that of number `step`, with some of them replaced; where loads are made
         together, of what is given for each step that step's row."""
-        out = self.at_times([step * dt, (step + 1) * dt]) | (values or {})
+        given = values or {}
+        out = self.at_times([step * dt, (step + 1) * dt]) | given
         for name in self._per_step:
+            if name in given:
+                continue
             rules = [rule for rule in self.described[name].shapes if len(rule) == out[name].ndim]
             if any("steps" in rule for rule in rules) and self.makes_rows:
                 if step >= len(out[name]):

@@ -1,5 +1,6 @@
 """Noticing that a run goes wrong, and saying where, when and why."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -17,7 +18,10 @@ from diffsim_ti.terms.obstacles.barrier import beta
 
 
 class Divergence(CarriesMore, FloatingPointError):
-    """The state is not finite, or the step has become unstable. Carries step, vertex, tetrahedron and stable_dt [s]."""
+    """The state is not finite, or the step has become unstable. Carries step, vertex, tetrahedron and stable_dt [s], and
+    `enough` [s], a substep that is short enough, or None where no substep is known to be."""
+
+    enough: float | None = None
 
     def __init__(self, message: str, step: int, vertex: int | None, tetrahedron: int | None, stable_dt: float):
         super().__init__(message)
@@ -45,6 +49,7 @@ class Crossing(Divergence):
     ):
         super().__init__(message, step, vertex, None, stable_dt)
         self.depth, self.speed, self.stiffness = depth, speed, stiffness
+        self.enough = stable_dt if stiffness is None else None
 
 
 class Guard:
@@ -54,7 +59,8 @@ class Guard:
     within a tenth of the stable one it checks more often, for beyond it a motion soon grows e-fold in ten passes.
     """
 
-    usual, close, first = 400, 50, 10  # passes between two checks; the first one where a start is deformed or pulled
+    # passes between two checks; near the stable step, or first where "auto" asked for it; first of deformed or pulled starts
+    usual, close, first = 400, 50, 10
 
     def __init__(self, workspace: Workspace):
         self.ws = workspace
@@ -71,7 +77,15 @@ class Guard:
             self.ws.energy_watch.clear()
         pulled = self.ws.arrays.features().pulled  # which squeezes a calm start
         soon = solver.explicit and (solver.starts_deformed() or pulled)
-        self._passes, self.every, self.steady = 0, self.first if soon else self.usual, Steady()
+        usual = self.close if solver.automatic and solver.knows_limit else self.usual
+        self._passes, self.every, self._seen_omega2 = 0, self.first if soon else usual, 0.0
+        self.steady = Steady()
+
+    def restart_with_solver(self) -> None:
+        """The same where a run may change its substeps, which then do so at the same passes too."""
+        if self.ws.solver.automatic:
+            self._stiffness = None
+            self.restart()
 
     def mark(self, now: int) -> None:
         """The current state, before pass `now`, is good: keep it."""
@@ -184,7 +198,12 @@ class Guard:
         stiff = omega2 * self.ws.substep**2  # stable up to 4
         if np.isfinite(omega2) and stiff <= 4 and not apart:
             longer = 4 if stiff < 1 else 2  # the body has to become four times as stiff first
-            self.every = min(longer * self.every, self.close if stiff > 0.9**2 * 4 else self.usual)
+            most = self.close if stiff > 0.9**2 * 4 else self.usual
+            if solver.automatic and (
+                stiff > 0.8**2 * 4 or omega2 > 1.1 * self._seen_omega2 > 0
+            ):  # it has to be in time
+                most = min(most, 2 * self.close)
+            self.every, self._seen_omega2 = min(longer * self.every, most), omega2
             return
         step, limit = self.ws.step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
         tet = self._stiffness.worst_tetrahedron()
@@ -195,14 +214,23 @@ class Guard:
             else f"has outgrown the stable step {limit:.4g} s of the present state (tetrahedron {tet}; elements are "
             "squeezed, or vertices press into a contact)"
         )
-        raise Divergence(
-            f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: take substeps of "
-            f"{self._calm_substep(limit):.3g} s (reduce dt, raise substeps), or pass allow_unstable=True to the solver",
+        enough = self._calm_substep(limit)
+        error = Divergence(
+            f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: take substeps of {enough:.3g} s "
+            f"({self._how(enough)}), or pass allow_unstable=True to the solver",
             step,
             None,
             tet,
             float(limit),
         )
+        error.enough = enough
+        raise error
+
+    def _how(self, enough: float) -> str:
+        """In words, how to come to substeps of so many [s]."""
+        if not self.ws.solver.automatic:
+            return "reduce dt, raise substeps"
+        return f"pass substeps={math.ceil(self.ws.solver.dt / enough)}, or reduce dt"
 
     def _calm_substep(self, stable: float) -> float:
         """A substep [s] to take where the present one was too long for a state whose stable step is given."""
@@ -299,16 +327,17 @@ class Guard:
         tet = int(around[J_around.argmin()]) if around.size else 0
         stable, state = self._stable_step()
         step = self.ws.step_of(j, num_passes)
+        enough = None if self.ws.substep <= stable else self._calm_substep(stable)
         why = (
             f"the substep {self.ws.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: take substeps of "
-            f"{self._calm_substep(stable):.3g} s (reduce dt, raise substeps, or use an implicit solver)"
+            f"{enough:.3g} s ({self._how(enough)}, or use an implicit solver)"
             if not self.ws.substep <= stable
             else f"the stable step {state} is {stable:.4g} s, so check forces, contacts, inputs and inverted tetrahedra"
         )
         bodies = ws.arrays.bodies
         if bodies is not None and vertex in bodies.vertices[bodies.rigid[bodies.owner]]:
             why += "; a rigid set turns by a radian in a substep at the most"
-        raise Divergence(
+        error = Divergence(
             f"{self.ws.when(step)}: {bad} of vertex {vertex} is not finite; smallest J around it "
             f"= {J_around.min():.3g} in tetrahedron {tet}; {why}; the last good state is kept",
             step,
@@ -316,6 +345,8 @@ class Guard:
             tet,
             stable,
         )
+        error.enough = enough
+        raise error
 
     def _stable_step(self) -> tuple[float, str]:
         """The stable step of the last good state or, where that one is too far gone, of the start."""

@@ -62,7 +62,7 @@ def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages
         patches = volume_patches(scene.mesh)
         means = np.bincount(patches, lam * derived.volumes) / np.bincount(patches, derived.volumes)
         lam = means[patches]
-    dilatation, largest = _squares_of_strains(scene.mesh, derived)
+    dilatation, largest = (x.copy() for x in _squares_of_strains(scene, derived))
     within = scene.reduced.elements(scene.mesh.elements) if scene.reduced else []
     together = [(body, own) for body, own in zip(scene.reduced.bodies, within) if body.kind != "basis" and len(own)]
     for _, own in together:
@@ -99,7 +99,15 @@ def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages
     return StepLimit(float(2 / np.sqrt(total)) if total > 0 else np.inf, worst, "element bound")
 
 
-def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
+def _squares_of_strains(scene: Scene, derived) -> tuple[np.ndarray, np.ndarray]:
+    """The same for a rest shape, kept as long as it stays."""
+    known, of = getattr(scene, "_strains", None), (derived.gradients, derived.volumes)
+    if known is None or any(x is not y for x, y in zip(known[0], of)):
+        known = scene._strains = of, _strains_of(scene.mesh, derived)
+    return known[1]
+
+
+def _strains_of(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
     """For each element, the most that the integrals of (div v)^2 and |grad v|^2 may be of that of v^2 by lumped masses."""
     element, (_, N, V) = mesh.reference, StressPoints.of(mesh, derived)
     if element.order == 1:

@@ -80,7 +80,7 @@ class Rollout:
     ):
         instance("Rollout", "solver", solver, Solver, "a solver such as SemiImplicitSolver(scene)")
         solver, steps = self._stepped(solver, steps)
-        self.solver, self.scene = solver, solver.scene
+        self.scene = solver.scene
         options = dict(save_every=save_every, checkpoint_every=checkpoint_every, memory=memory, gradients=gradients)
         options |= dict(clip=clip, truncate=truncate, health=health, raise_errors=raise_errors)
         given = (outputs,) if isinstance(outputs, Output) else tuple(listed("outputs", outputs, "Outputs"))
@@ -109,7 +109,8 @@ class Rollout:
         """The solver that takes these steps, and how many they are."""
         steps = steps(solver) if callable(steps) else steps
         if not isinstance(steps, UnequalSteps) and len(shape_of("steps", steps)) == 1:
-            steps = UnequalSteps(steps, solver.substeps)
+            steps = UnequalSteps(steps)
+            steps = UnequalSteps(steps.lengths, solver.substeps_of(steps.lengths))
         if isinstance(steps, UnequalSteps):
             return solver.on(steps), len(steps)
         if not isinstance(steps, int | float | np.integer) or not (steps >= 0 and steps == int(min(steps, 1e18))):
@@ -142,6 +143,11 @@ class Rollout:
         """As many steps of another solver, with some of the options replaced."""
         steps = self.steps if self.schedule is None else self.schedule
         return Rollout(solver, steps, **self._options | options)
+
+    @property
+    def solver(self) -> Solver:
+        """The solver, with the substeps that runs take."""
+        return self.sweep.solver
 
     @property
     def schedule(self) -> UnequalSteps | None:

@@ -1,5 +1,6 @@
 """Simulator: the step-by-step interface of a solver."""
 
+import math
 import weakref
 
 import numpy as np
@@ -8,13 +9,15 @@ from numpy.typing import ArrayLike
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance, numbers, whole
 from diffsim_ti.common.origin import positions_of
-from diffsim_ti.inputs.poses import PoseColumns
+from diffsim_ti.common.warn import warn
+from diffsim_ti.inputs.step_values import StepValues
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.solvers.substeps import MOST
 from diffsim_ti.state.bending import FacesBend
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactResolution
@@ -54,9 +57,11 @@ class Simulator:
                 "the solver has no scene: use Simulator(mesh, material, solver), or a solver made from a Scene"
             )
         self.solver, self.scene = solver, solver.scene
+        self._first_solver = solver  # whose substeps a reset goes back to
         solver.simulator = weakref.ref(self)
         self._start = solver.start_values()
         self._notes, self._settled = bool(contact_forces), {}
+        self._changes = self.scene.inputs.change_in_time
         if contact_forces:
             solver.check_contact_forces()
         self._make_workspace()
@@ -77,8 +82,7 @@ class Simulator:
         self._make_workspace(bend)
         self.workspace.restore(before, 0)
         self.workspace.report, self.workspace.watch.earlier = old.report, [old.watch.resolution()]
-        if old.arrays.rows["forces"] is not None:
-            self.workspace.arrays.load_rows(forces=old.arrays.rows["forces"])
+        self._stale = True
         self._load_step()
         self.workspace.place_obstacles(0)
         if self.workspace.pairs:
@@ -95,23 +99,53 @@ class Simulator:
         return f"Simulator({self.solver!r}, {self.scene.mesh!r}, step {self.step_count}, t = {self.time:.6g} s)"
 
     def reset(self) -> None:
-        """Back to the start of the scene."""
+        """Back to the start of the scene, and to the substeps of its solver."""
+        self._take_solver(self._first_solver)
         self.step_count = 0
-        self._set: dict[str, np.ndarray] = {}  # inputs that were set since
+        self._set: dict[str, np.ndarray] = {}  # inputs that were given since, as a run of the last step has them
+        self._stale = True  # whether the device may have rows of other steps than `arrays.rows`
+        self._step_values = StepValues(self.scene.inputs, self.solver.dt)
         self.workspace.load(self._start)
         self.workspace.report.clear()
+        self._guard.restart_with_solver()
         if self._notes:
             self.workspace.forget_contacts()
-        if self._start.forces is not None and len(self._start.forces) == 1:
-            self.workspace.arrays.load_rows(forces=self._start.forces)  # set_forces may have changed them
 
     @property
     def time(self) -> float:
         """Simulated time [s]."""
         return self.step_count * self.solver.dt
 
-    def step(self) -> None:
-        """Advance by solver.dt."""
+    def step(self, **values: ArrayLike) -> None:
+        """Advance by solver.dt, with other values of inputs that can change in time, by the scene's names: forces,
+        tractions, pressures, tensions, activations, growth, motions and paths (`step_inputs` lists them).
+
+        What a term has as a constant, or for each step, is held during the step: one value in its shape, such as
+        `step(activation=0.3)`. What it has by a function or by keyframes, as motions and paths are, goes linearly within the
+        step to the value given, from where it was: `step(path=(0.0, 0.1, 0.0))`; or two values, as the step begins and ends.
+        Values stay, as they end, in the steps to come, until others are given or the simulator is reset. A run of a
+        Rollout with the same rows has the same states. For gradients of control loops see `diff_simulator.TorchSimulator`.
+        Raises ValueError for unknown names and for shapes, before anything moves.
+        """
+        before = self._set
+        self._set = self._step_values.next(self.step_count, values, before)
+        self._stale = self._stale or bool(values)
+        try:
+            while not self._advance():
+                pass
+        except BaseException:
+            self._set, self._stale = before, True
+            raise
+        self.step_count += 1
+        self.workspace.place_obstacles(int(self.solver.schedule.first(1)))
+
+    @property
+    def step_inputs(self) -> tuple[str, ...]:
+        """Names of the inputs that `step` takes."""
+        return self._step_values.names
+
+    def _advance(self) -> bool:
+        """Try to take a step; False where it is to be tried again, from where it began."""
         self._load_step()
         self.workspace.first_step = self.step_count
         passes = self.solver.num_passes(1)
@@ -123,14 +157,34 @@ class Simulator:
                 self._guard.advance(0, passes, passes, int(self._notes))
         except FacesBend as bent:
             self._take_bent(bent.bend)
-            return self.step()
-        except FloatingPointError:
+            return False
+        except FloatingPointError as error:
             self.workspace.restore(self._before, 0)
             if self._notes:
                 self.workspace.forget_contacts()
-            raise
-        self.step_count += 1
-        self.workspace.place_obstacles(int(self.solver.schedule.first(1)))
+            self._take_more_substeps(error)
+            return False
+        return True
+
+    def _take_solver(self, solver: Solver) -> None:
+        self.solver = self.workspace.solver = solver
+
+    def _take_more_substeps(self, error: FloatingPointError) -> None:
+        """Go on with more substeps where their number was left to the solver and these help; else raise the error."""
+        enough = getattr(error, "enough", None)
+        if not self.solver.automatic or enough is None or not enough < self.solver.substep:
+            raise error
+        count = math.ceil(self.solver.dt / enough)
+        if count > MOST:
+            raise error
+        if self.solver is self._first_solver:
+            warn(
+                f"{self.workspace.when(self.step_count)}: steps are divided into more than {self.solver.substeps} substeps "
+                f"from here on, {count} in this one: pass substeps={count} for the same number from the start ({error})"
+            )
+        self.workspace.report.substeps -= self.solver.num_passes(1)  # which are done again
+        self._take_solver(self.solver.with_substeps(count))
+        self.workspace.forget()
 
     def run(self, steps: int) -> None:
         """Advance by so many steps."""
@@ -142,25 +196,21 @@ class Simulator:
         self.solver.substeps = whole("substeps", substeps, 1)
 
     def _load_step(self) -> None:
-        """Bring what depends on the step to the device: motion of fixed vertices, forces per step."""
-        arrays, values = self.workspace.arrays, self._start
-        if values.motion is not None:
-            times, inputs = [self.time, self.time + self.solver.dt], self.scene.inputs
-            posed = inputs.derive(inputs.at_times(times)).motion if self.scene.posed_supports else None
-            arrays.load_rows(motion=self.scene.motion_rows(times) if posed is None else posed)
-        if values.path is not None:
-            rows, away = self.scene.path_rows([self.time, self.time + self.solver.dt]), self.scene.inputs.away.values()
-            arrays.load_rows(path=PoseColumns(rows, "path", away).value(*rows.values())[0])
-        inputs = self.scene.inputs
-        if inputs.makes_rows:
-            now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))
-            made = {name: getattr(now, name) for name in ("forces", "growths", *arrays.rows_of_steps)}
-            arrays.load_rows(**{name: rows for name, rows in made.items() if rows is not None})
-        elif values.forces is not None and len(values.forces) > 1:
-            rows = values.forces
+        """Bring what depends on the step to the device: motions, paths, loads."""
+        inputs, arrays = self.scene.inputs, self.workspace.arrays
+        if not (self._stale or self._changes):
+            return
+        now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))
+        made = {name: getattr(now, name) for name in ("motion", "path", "forces", "growths", *arrays.rows_of_steps)}
+        if made["forces"] is not None and len(made["forces"]) > 1:  # a single ExternalForce's, as they are given
+            rows = made["forces"]
             if self.step_count >= len(rows):
                 raise ValueError(f"external_forces are given for {len(rows)} steps, this is step {self.step_count}")
-            arrays.load_rows(forces=rows[self.step_count][None])
+            made["forces"] = rows[self.step_count][None]
+        known = arrays.rows
+        new = {name: x for name, x in made.items() if x is not None and (self._stale or x is not known[name])}
+        arrays.load_rows(**new)
+        self._stale = False
 
     @property
     def displacements(self) -> np.ndarray:
@@ -192,7 +242,8 @@ class Simulator:
     def state(self) -> dict[str, np.ndarray]:
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
         two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps,
-        and the forces that `set_forces` gave. `np.savez(file, **simulator.state)` keeps it, to the bit."""
+        what steps were given over time, and substeps where more were taken than at the start.
+        `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:
@@ -202,6 +253,8 @@ class Simulator:
             out["displacements_before"], out["velocities_before"] = before
         if self.workspace.last_multipliers is not None:
             out["constraint_pressures"] = self.workspace.last_multipliers
+        if self.solver is not self._first_solver:
+            out["substeps"] = np.array(int(self.solver.substeps))
         return out | self._set
 
     def resume(self, state: dict) -> None:
@@ -212,10 +265,10 @@ class Simulator:
         """
         given, known = {name: np.asarray(state[name]) for name in state}, self.state
         two_step = {"displacements_before", "velocities_before"} if self._has_before else set()
-        term = self.scene.term(ExternalForce)
-        forces = set() if term is None else {self.scene.input_names(term)["external_forces"]}
+        over_time = set(self._step_values.names)
         held = {"constraint_pressures"} if self.workspace.volumes and not self.solver.explicit else set()
-        optional = two_step | forces | held
+        more_substeps = {"substeps"} if self._first_solver.automatic else set()
+        optional = two_step | over_time | held | more_substeps
         lacking, more = known.keys() - optional - given.keys(), given.keys() - known.keys() - optional
         if lacking or more or len(given.keys() & two_step) == 1:
             raise ValueError(
@@ -233,8 +286,8 @@ class Simulator:
                 )
         law_state = self.workspace.checked_law_state(given["law_state"]) if "law_state" in given else None
         self.reset()
-        for name in forces & given.keys():
-            self.set_forces(given[name])
+        kept = {name: given[name] for name in over_time & given.keys()}
+        self._set = self._step_values.next(int(count), kept, {})
         now = self.workspace.state
         runtime.fill(now.u, given["displacements"][None])
         runtime.fill(now.v, given["velocities"][None])
@@ -246,6 +299,8 @@ class Simulator:
             runtime.fill(now.before.v, given["velocities_before"][None])
             now.fresh[0] = False
         self.step_count = int(count)
+        if more_substeps & given.keys():
+            self._take_solver(self.solver.with_substeps(whole("substeps", given["substeps"], 1)))
         if held & given.keys():
             self.workspace.go_on_from(given["constraint_pressures"].copy(), self.step_count)
         self.workspace.place_obstacles(int(self.solver.schedule.first(1)) if count else 0)
@@ -253,7 +308,8 @@ class Simulator:
     @property
     def values(self) -> dict[str, np.ndarray]:
         """The values of the scene's inputs, with those that were set since, and of what is given over time, now."""
-        return self.scene.inputs.at_times([self.time]) | self._set
+        ends = {name: x[-1:] if self._step_values.is_ramp(name) else x for name, x in self._set.items()}
+        return self.scene.inputs.at_times([self.time]) | ends
 
     @property
     def values_of_step(self) -> dict[str, np.ndarray]:
@@ -329,9 +385,8 @@ class Simulator:
             raise ValueError(f"set_forces needs a scene with a constant ExternalForce, of shape (k, 3); {remedy}")
         if forces.shape != given.shape or not np.all(np.isfinite(forces)):
             raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
-        self._set[self.scene.input_names(term)["external_forces"]] = forces
-        if not self.scene.inputs.makes_rows:  # else with others, when a step is loaded
-            self.workspace.arrays.load_rows(forces=forces[None])
+        self._set = self._set | {self.scene.input_names(term)["external_forces"]: forces}
+        self._stale = True
 
     @property
     def contact_resolution(self) -> ContactResolution:

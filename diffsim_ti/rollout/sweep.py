@@ -15,6 +15,7 @@ from diffsim_ti.rollout.run import Run, Seed
 from diffsim_ti.rollout.shape import MOVED
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.solvers.substeps import RunSubsteps
 from diffsim_ti.state.bending import FacesBend
 from diffsim_ti.state.watch import ContactResolution
 
@@ -63,17 +64,13 @@ class Sweep:
         self.clip = None if clip is None else number("clip", clip)
         self.truncate = None if truncate is None else whole("truncate", truncate)
         self.careful = health or clip is not None
-        memory = None if memory is None else number("memory", memory, unit="MB")
-        checkpoint_every = None if checkpoint_every is None else whole("checkpoint_every", checkpoint_every, 0)
+        self._memory = None if memory is None else number("memory", memory, unit="MB")
+        self._every = None if checkpoint_every is None else whole("checkpoint_every", checkpoint_every, 0)
         self.health: list[dict] = []
         self.first_step = 0  # steps that came before those of a run, for reports
-        self.num_passes = solver.num_passes(self.steps)
-        a_step = self.num_passes / max(self.steps, 1)
-        every = None if checkpoint_every is None else max(1, round(max(1, int(checkpoint_every)) * a_step))
         self.state_bytes = 4 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
-        places = -(-self.scene.mesh.num_tetrahedra // runtime.LANES) * runtime.LANES
-        law_state = places * len(self.scene.law.state_names) / (4 * self.scene.mesh.num_vertices)
-        self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory, law_state)
+        self.run_substeps = RunSubsteps(solver, self.values) if solver.automatic else None
+        self._plan()
         self.workspace = None  # made by the first run
         self._bend = 0.0  # how far faces have bent in runs so far [m] (state/bending.py)
         self._name = object()  # that runs bear
@@ -82,6 +79,26 @@ class Sweep:
         self._adjoint = None  # the solver's, made by the first pull-back
         self.noted_changes: dict[str, np.ndarray] = {}  # of what runs note, by the last tangent
         self._recorded, self._warned = False, False  # whether the record holds all passes; whether of coarse contacts
+
+    def _plan(self) -> None:
+        """Choose the states that are kept, for the solver's substeps."""
+        self.num_passes = self.solver.num_passes(self.steps)
+        a_step = self.num_passes / max(self.steps, 1)
+        every = None if self._every is None else max(1, round(max(1, self._every) * a_step))
+        places = -(-self.scene.mesh.num_tetrahedra // runtime.LANES) * runtime.LANES
+        law_state = places * len(self.scene.law.state_names) / (4 * self.scene.mesh.num_vertices)
+        kept = int(self.state_bytes * self.held)
+        self.checkpoints = choose_checkpoints(self.num_passes, kept, every, self._memory, law_state)
+
+    held = 1  # states that one of the kept ones has room for
+
+    def fit(self, each: list[dict]) -> None:
+        """See to it that substeps which were left to the solver suit the values of a run, those of each scene of a batch."""
+        if self.solver.automatic:
+            solver = self.run_substeps.fit(each)
+            if solver.substeps != self.solver.substeps:
+                self.solver = solver
+                self._plan()
 
     def _check_names(self, names) -> tuple[str, ...]:
         self.wants_shape = False  # the sum of these by initial and by rest positions (shape.py)
@@ -147,6 +164,7 @@ class Sweep:
     def run(self, values: dict, start: Callable | None = None, law_state=None) -> Run:
         """Run from the scene's inputs with some values replaced; see `Run` for the rest."""
         run, self.last_error = Run(self._checked(values), start, self.first_step, law_state), None
+        self.fit([run.values])
         try:
             self._forward(run)
         except FloatingPointError as error:

@@ -9,6 +9,7 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.explicit.solver import ExplicitSolver, Weights
+from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.state.staged_steps import StagedSteps
 from diffsim_ti.state.viscous_stages import MOST, ViscousStages
@@ -25,11 +26,9 @@ class SemiImplicitSolver(ExplicitSolver):
     the square of their number: strongly damped bodies (KelvinVoigt, damping ratio xi of the fastest motion) take steps that
     cost, with the best number, 1 / 2.1 as much at xi = 5, 1 / 4 at 20, 1 / 9 at 100, and no less at 1 (ViscousStages).
 
-    `SemiImplicitSolver(scene, dt=...)` takes dt as it is and refuses an unstable one, as every explicit solver does.
-
     `SemiImplicitSolver(mesh, material, dt=...)`, or `SemiImplicitSolver(dt=...)` for `Simulator(mesh, material, solver)`,
-    makes the scene itself, with density [kg/m^3] and gravity [m/s^2, along y] and nothing else, and takes `substeps` as the
-    least number: it raises it to what stability asks for and says so.
+    makes the scene itself, with density [kg/m^3] and gravity [m/s^2, along y] and nothing else, and takes a number of
+    `substeps` as the least: it raises it to what stability asks for and says so.
     Raises ValueError for `viscous_stages` beyond 32, without viscosity, and with a FilledChamber or reduced sets.
     """
 
@@ -43,7 +42,7 @@ class SemiImplicitSolver(ExplicitSolver):
         self,
         scene: Scene,
         dt: float = 0.01,
-        substeps: int = 1,
+        substeps: Substeps = "auto",
         parallel: bool | None = None,
         allow_unstable: bool = False,
         check_start: bool = True,
@@ -56,7 +55,7 @@ class SemiImplicitSolver(ExplicitSolver):
         mesh: TetrahedralMesh | None = None,
         material: Material | None = None,
         dt: float = 0.01,
-        substeps: int = 1,
+        substeps: Substeps = "auto",
         density=1000.0,
         gravity=-9.8,
         parallel: bool | None = None,
@@ -82,7 +81,7 @@ class SemiImplicitSolver(ExplicitSolver):
             self.bind(mesh, material)
 
     def _keep_for_later(
-        self, mesh=None, material=None, dt=0.01, substeps=1, density=1000.0, gravity=-9.8, **options
+        self, mesh=None, material=None, dt=0.01, substeps="auto", density=1000.0, gravity=-9.8, **options
     ) -> tuple:
         """What `bind` needs besides the mesh and the material, which are returned."""
         self.dt, self.substeps = dt, substeps
@@ -96,6 +95,7 @@ class SemiImplicitSolver(ExplicitSolver):
         scene = Scene(mesh, material, self._density, Gravity(self._gravity))
         super().__init__(scene, self.dt, self.substeps, **self._options, check_start=False)
         self.choose_substeps()
+        self.check_start = True
 
     @property
     def positions(self):

@@ -3,17 +3,19 @@
 import math
 from abc import ABC
 from collections.abc import Mapping
+from copy import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.common.checked import number, shown, whole
+from diffsim_ti.common.checked import number, shown
 from diffsim_ti.common.warn import warn
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.monitor import stability
 from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
+from diffsim_ti.solvers.substeps import SHARE, Chosen, Substeps, checked, divided, needed
 from diffsim_ti.state.schedule import EqualSteps, Schedule, UnequalSteps
 
 if TYPE_CHECKING:
@@ -23,11 +25,16 @@ if TYPE_CHECKING:
 class Solver(ABC):
     """Advances a scene by steps of dt [s], each divided into `substeps` equal substeps.
 
+    substeps: a number, or "auto" of explicit solvers: one where dt is stable at the start (`stable_dt`), else so many that
+        each is 0.7 of the stable step at the most. The first run of a Rollout or a Batch raises their number to what its
+        values ask for, in a batch the stiffest scene; a later run that needs more, and one whose state outgrows the stable
+        step, raises an error with the number to pass. A Simulator takes more for the steps to come, with a warning.
+        Implicit solvers are stable with any step and take "auto" for one.
     parallel: each substep on all threads, or many of them in a row on one; None chooses by size.
     allow_unstable: take a step beyond the stable one all the same: neither the start nor the run is checked.
-    check_start: whether the constructor refuses a step beyond the stable one; False where `substeps` is chosen later, before
-        each step or by `choose_substeps`. The run is checked all the same.
-    Raises ValueError for dt <= 0, substeps < 1, or a step beyond the stable one.
+    check_start: whether the constructor looks at the stable step, which a number of substeps may not exceed; False where
+        `substeps` is chosen later, before each step or by `choose_substeps`. The run is checked all the same.
+    Raises ValueError for dt <= 0, substeps < 1, substeps beyond the stable step, and where "auto" would take over 10 000.
     """
 
     explicit = False
@@ -44,12 +51,12 @@ class Solver(ABC):
         self,
         scene: "Scene",
         dt: float = 0.01,
-        substeps: int = 1,
+        substeps: Substeps = "auto",
         parallel: bool | None = None,
         allow_unstable: bool = False,
         check_start: bool = True,
     ):
-        dt, substeps = number("dt", dt, unit="s"), whole("substeps", substeps, 1)
+        dt, substeps = number("dt", dt, unit="s"), checked(substeps, self.explicit)
         self.check_scene(scene)
         for x in scene.interactions:
             if self.explicit and x.in_kernels and type(x).kernel is Interaction.kernel:
@@ -57,7 +64,7 @@ class Solver(ABC):
                     f"{type(x).__name__} has no `kernel`, which explicit steps run: write it, or take an implicit solver"
                 )
         self.scene = scene if self.explicit else scene.with_consistent_mass()
-        self.dt, self.substeps = float(dt), int(substeps)
+        self.dt, self.substeps = float(dt), substeps
         self.parallel, self.allow_unstable, self.check_start = parallel, allow_unstable, check_start
         runtime.check_host_init()
         runtime.check_backend(scene.precision)
@@ -71,7 +78,7 @@ class Solver(ABC):
         self._tight: stability.StepLimit | None = None
         self._deformed: bool | None = None
         if self.explicit and check_start and not allow_unstable:
-            self._refuse_unstable()
+            self._check_step()
 
     def check_scene(self, scene) -> None:
         """Raise ValueError for what is no scene."""
@@ -124,7 +131,7 @@ class Solver(ABC):
     def check_schedule(self, schedule: UnequalSteps) -> None:
         """Raise ValueError for steps that this solver cannot take."""
         if self.explicit and self.check_start and not self.allow_unstable:
-            self._refuse_unstable()
+            self._check_step()
 
     def lengths(self, j: ArrayLike, rate: float) -> tuple[np.ndarray, np.ndarray]:
         """(lengths h of passes j [s], exp(-rate h))"""
@@ -182,20 +189,68 @@ class Solver(ABC):
             self._deformed = bool(u.any() and np.abs(H(u)).max() > strain)
         return self._deformed
 
-    def _refuse_unstable(self) -> None:
+    @property
+    def automatic(self) -> bool:
+        """Whether the number of substeps was left to the solver, and may be raised."""
+        looked_at = self.check_start and not self.allow_unstable
+        return isinstance(self.substeps, Chosen) and self._schedule is None and looked_at
+
+    @property
+    def knows_limit(self) -> bool:
+        """Whether the tight stable step of the start was asked for."""
+        return self._tight is not None
+
+    def _check_step(self) -> None:
+        """Divide a step that is beyond the stable one, or refuse it."""
         if self.substep > self.stable_dt().dt or self.starts_deformed():
-            self._refuse_beyond(self.stable_dt(tight=True))
+            tight = self.stable_dt(tight=True)
+            if self.automatic and self.substep > tight.dt:
+                self.substeps = Chosen(divided(self.dt, tight))
+            self._refuse_beyond(tight)
+
+    def substeps_of(self, lengths: np.ndarray) -> int | np.ndarray:
+        """Substeps of steps of some lengths [s]: the solver's own, or one by one where they were left to it."""
+        if not self.automatic:
+            return self.substeps
+        if np.max(lengths, initial=0) <= self.stable_dt().dt and not self.starts_deformed():
+            return 1
+        tight = self.stable_dt(tight=True)
+        return np.array([divided(float(length), tight) for length in lengths])
+
+    def with_substeps_for(self, stable: stability.StepLimit | None) -> "Solver":
+        """The solver itself, or a copy with more substeps where a stable step asks for them."""
+        count = self.substeps if stable is None else divided(self.dt, stable)
+        return self if count <= self.substeps else self.with_substeps(count)
+
+    def with_substeps(self, count: int) -> "Solver":
+        """A copy with another number of substeps, which may be raised further."""
+        out = copy(self)
+        out.substeps = Chosen(count)
+        return out
+
+    def limit_at(self, values: dict) -> stability.StepLimit:
+        """The tight stable step of the start at the values of a run, which has those of its steps."""
+        inputs = self.scene.inputs
+        return self._tight_limit(inputs.at_times([0.0, self.dt]) | values)
 
     def check_run(self, values: dict) -> None:
         """Raise ValueError where the substep is beyond what gases and cables over time ask for, which a run samples."""
         if not self.explicit or not self.check_start or self.allow_unstable or not sampled_by_runs(self.scene):
             return
-        if self.substep > stability.element_limit(self.scene, values, self.kicks).dt:
+        if not self.automatic and self.substep > stability.element_limit(self.scene, values, self.kicks).dt:
             self._refuse_beyond(self._tight_limit(values))
+
+    def refuse_values(self, stable: stability.StepLimit) -> None:
+        """Raise ValueError for values of a run that ask for more substeps than the runs before it."""
+        raise ValueError(
+            f"the stable step of these values is {stable}, and this run's substeps of {self.substep:.4g} s were chosen in "
+            "the first run and stay, so that runs can be compared: make the solver with substeps="
+            f"{needed(self.dt, stable.dt)}, or another Rollout or Batch"
+        )
 
     def _refuse_beyond(self, tight: stability.StepLimit) -> None:
         if self.substep > tight.dt:
-            what, remedy = "dt / substeps =", f"reduce dt, pass substeps={math.ceil(self.dt / tight.dt / 0.95)}"
+            what, remedy = "dt / substeps =", f"reduce dt, pass substeps={needed(self.dt, tight.dt, 0.95)}"
             if self._schedule is not None:
                 what, remedy = f"of {self._schedule}, the longest:", "shorten the longest steps"
             raise ValueError(
@@ -203,8 +258,9 @@ class Solver(ABC):
                 "solver, or pass allow_unstable=True to this one"
             )
 
-    def choose_substeps(self, share: float = 0.7, values: Mapping[str, ArrayLike] | None = None) -> None:
-        """Raise `substeps` to what stability asks for, with a margin, and say so once if that is more than given.
+    def choose_substeps(self, share: float = SHARE, values: Mapping[str, ArrayLike] | None = None) -> int:
+        """Raise `substeps` to what stability asks for, with a margin, and return it; say so once if a smaller number was
+        given.
 
         values: of the scenes of a `Batch`, inputs with their axis in front; the stiffest scene decides, which is named.
         """
@@ -216,13 +272,15 @@ class Solver(ABC):
         b = min(range(len(each)), key=lambda b: each[b].dt, default=None)
         stable = self.stable_dt(tight=True) if b is None else each[b]
         of = f" of scene {b}, the stiffest of {len(each)}," if values else ""
-        needed = math.ceil(self.dt / (share * stable.dt))
-        if needed > self.substeps:
-            warn(
-                f"dt = {self.dt:g} s is divided into {needed} substeps (asked for at least {self.substeps}): "
-                f"the stable step{of} is {stable}"
-            )
-            self.substeps = needed
+        count = needed(self.dt, stable.dt, share)
+        if count > self.substeps:
+            if not isinstance(self.substeps, Chosen):
+                warn(
+                    f"dt = {self.dt:g} s is divided into {count} substeps (asked for at least {self.substeps}): "
+                    f"the stable step{of} is {stable}"
+                )
+            self.substeps = type(self.substeps)(count)
+        return int(self.substeps)
 
     def describe(self) -> str:
         """How the scene advances, in a line."""

@@ -105,8 +105,9 @@ class Frame:
         u, v, scene = simulator.displacements, simulator.velocities, simulator.scene
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
         fields |= measured_fields(simulator)
-        moved = [points for points, _ in obstacle_surfaces(scene, simulator.time)] if scene.moving else None
         x, values = simulator.positions, simulator.values
+        rows = {name: values[name][-1] for name in scene.inputs.paths}
+        moved = [points for points, _ in obstacle_surfaces(scene, simulator.time, rows)] if scene.moving else None
         drawn = marks_of(scene, x, simulator.time, simulator.step_count, values)
         by = last or simulator
         shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)

@@ -27,6 +27,11 @@ class Tunnelling(FloatingPointError):
     stable_dt: float | None = None
     stiffness: float | None = None
 
+    @property
+    def enough(self) -> float | None:
+        """A substep [s] that is short enough, None where no substep is."""
+        return self.stable_dt if self.stiffness is None else None
+
 
 class Overlap(ValueError):
     """A state in which surfaces touch or pass through each other, or an obstacle reaches into a face."""

@@ -17,6 +17,7 @@ from diffsim_ti.solvers.implicit.adjoint import ImplicitAdjoint
 from diffsim_ti.solvers.implicit.tangent import ImplicitTangent
 from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.stage import Stage
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class ImplicitSolver(Solver):
         self,
         scene: "Scene",
         dt: float = 0.01,
-        substeps: int = 1,
+        substeps: Substeps = 1,
         tolerance: float = 1e-6,
         max_iterations: int = 50,
         parallel: bool | None = None,
