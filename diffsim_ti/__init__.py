@@ -28,11 +28,13 @@ from diffsim_ti.identification import (
 )
 from diffsim_ti.materials import (
     Corotated,
+    EnergyLaw,
     FibreReinforced,
     Gent,
     Grown,
     KelvinVoigt,
     LinearElastic,
+    Material,
     MooneyRivlin,
     Ogden,
     Prony,
@@ -46,6 +48,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import (
+    CenterOfMass,
     ChamberPressure,
     ContactForce,
     ContactTraction,
@@ -120,11 +123,14 @@ __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", 
 __all__ += ["ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Rollout", "Frames", "Batch"]
 __all__ += ["BatchFrames", "Ensemble", "UnequalSteps", "adaptive_steps", "SolveReport", "Divergence", "Crossing"]
 __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPoints", "ContactForce"]
+__all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
 __all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]
 
 sys.meta_path.append(deprecated.MovedModules())
-if not TYPE_CHECKING:  # type checkers report old names
+if TYPE_CHECKING:  # type checkers report old names
+    from diffsim_ti.torch_bridge.rollout_node import rollout_frames as rollout_frames
+else:
     __getattr__ = deprecated.package_attribute

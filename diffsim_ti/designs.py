@@ -6,11 +6,12 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.special import comb
 
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import edge_matrices, inverse_edges, shape_gradients, signed_volumes
 
 
-class Cage:
+class Cage(metaclass=Public):
     """Free-form deformation: rest positions X + sum_k B_k(X) d_k by displacements d of a lattice of control points.
 
     shape: points of the lattice along x, y, z, at least 2 each, over the mesh's bounding box; d has shape (*shape, 3) [m].
@@ -60,7 +61,7 @@ def _stiffness(mesh: TetrahedralMesh) -> sparse.csc_matrix:
     return sparse.csc_matrix((blocks.ravel(), (rows, columns)), shape=(mesh.num_vertices,) * 2)
 
 
-class SurfaceDisplacement:
+class SurfaceDisplacement(metaclass=Public):
     """Displacements d of the surface's vertices, shape (num surface vertices, 3) [m]; inside, div grad u = 0.
 
     Rest positions are X + u, u = d on `mesh.surface_vertices` and -K_ii^-1 K_is d inside, K by linear tetrahedra.
@@ -125,6 +126,7 @@ def smallest_ratio(mesh: TetrahedralMesh, positions: ArrayLike) -> float:
     return float((ratios / signed_volumes(edge_matrices(mesh.vertices, mesh.tetrahedra))).min())
 
 
+@public
 def guarded_step(design, d: ArrayLike, step: ArrayLike, least: float = 0.2) -> np.ndarray:
     """The step, halved until the smallest J of the new rest shape is at least `least`.
 

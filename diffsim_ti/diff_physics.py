@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.materials import StableNeoHookean, moduli
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
@@ -45,7 +46,7 @@ def refuse_state(law, where: str, remedy: str) -> None:
         raise ValueError(f"{type(law).__name__} has a state ({names}) that {where} does not support: {remedy}")
 
 
-class TorchMaterial(torch.nn.Module):
+class TorchMaterial(torch.nn.Module, metaclass=Public):
     """What learnable materials share: E and nu as tensors, and the one law that exists in Taichi.
 
     A subclass gives `E` [Pa] and `nu` [-], attributes or properties that are tensors of shape () or (num_tetrahedra,): from
@@ -274,7 +275,7 @@ def _trilinear(mesh, resolution: tuple) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(weights, 1), np.stack(corners, 1)
 
 
-class CheckpointedRollout:
+class CheckpointedRollout(metaclass=Public):
     """Long rollouts in little memory, in the seeds' two spellings.
 
     `CheckpointedRollout.rollout(step_fn, state0, num_steps, checkpoint_every)`: any torch step function; returns all
@@ -319,12 +320,14 @@ class CheckpointedRollout:
         return states
 
 
+@public
 def smooth_step(x: torch.Tensor, edge: float = 0.0, width: float = 1.0) -> torch.Tensor:
     """Smooth step from 0 to 1 around `edge`: 3 t^2 - 2 t^3 with t = clamp((x - edge) / width + 1/2, 0, 1); C1."""
     t = ((x - edge) / width + 0.5).clamp(0, 1)
     return t * t * (3 - 2 * t)
 
 
+@public
 def log_barrier(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
     """-log(x) for x > eps, continued below by its second-order Taylor polynomial at eps (C2)."""
     safe = x.clamp(min=eps)

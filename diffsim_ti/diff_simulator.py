@@ -5,12 +5,17 @@ No physics lives here: forward is a run of a Rollout's sweep, backward pulls bac
 
 import math
 from collections.abc import Iterable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
+from diffsim_ti.common import deprecated
+from diffsim_ti.common.answers import answered
 from diffsim_ti.common.origin import middle_far_part, warn_of_rounding
+from diffsim_ti.common.public import Public, check_options
 from diffsim_ti.common.warn import warn
 from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial, refuse_state
 from diffsim_ti.mesh import TetrahedralMesh
@@ -18,6 +23,7 @@ from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
+from diffsim_ti.solvers.solver import SolverOptions
 from diffsim_ti.solvers.substeps import Chosen, Substeps, checked
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.obstacles import barrier
@@ -30,7 +36,8 @@ from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
 __all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "TorchSimulator", "rollout_frames"]
 
 
-class DifferentiableSolver:
+@answered
+class DifferentiableSolver(metaclass=Public):
     """How a DifferentiableSimulator steps: any solver with inertia, symplectic Euler unless said otherwise.
 
     dt [s]; gravity [m/s^2]: a number along y, 3 numbers, or a tensor of either (with gradient); damping: the share of
@@ -52,7 +59,7 @@ class DifferentiableSolver:
         damping: float = 1.0,
         substeps: Substeps = "auto",
         method: type[Solver] = SemiImplicitSolver,
-        **options,
+        **options: Unpack[SolverOptions],
     ):
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
@@ -64,6 +71,7 @@ class DifferentiableSolver:
             raise ValueError(
                 "method: StaticSolver has no steps; use rollout_frames(Rollout(StaticSolver(scene), 1), ...)"
             )
+        check_options(type(self).__name__, method, options)
         self.method, self.options = method, options
         self.dt, self.gravity, self.damping = float(dt), gravity, float(damping)
         self.substeps = checked(substeps, method.explicit)
@@ -79,15 +87,18 @@ class DifferentiableSolver:
         return g
 
 
-class DifferentiableSimulator:
+@answered
+class DifferentiableSimulator(metaclass=Public):
     """Steps a soft body through torch's graph: positions and velocities are tensors with gradients to all that went in.
 
     material: DifferentiableMaterial, SpatiallyVaryingMaterial or another TorchMaterial (diff_physics); density [kg/m^3]:
-    a number or a tensor, scalar or per tetrahedron; fixed_vertices: set name, indices or mask; contact: None for the seeds'
-    ground, False for none, or a DifferentiableBarrierContact, whose numbers may be tensors with gradient; terms: further
-    core terms, whose numbers may be tensors with gradient, too, as in `Sphere(radius=tensor)`.
+    a number or a tensor, scalar or per tetrahedron; fixed_vertices: set name, indices or mask; contact: "ground", the floor
+    that torch-diffsim's documents have, False for none, or a DifferentiableBarrierContact, whose numbers may be tensors with
+    gradient; terms: further core terms, whose numbers may be tensors with gradient, too, as in `Sphere(radius=tensor)`.
 
-    The seeds' ground is a barrier (stiffness 1e4, width 0.01) at y = 0 where the body starts at least one width above it,
+    This is the adapter for code that follows those documents; `Scene`, `Simulator` and `Rollout`, in torch through
+    `rollout_frames`, say the same and more.
+    "ground" is a barrier (stiffness 1e4, width 0.01) at y = 0 where the body starts at least one width above it,
     otherwise one width below its lowest vertex; it is fixed at the start. `describe()` says which.
     device: where tensors live. "cuda" also starts Taichi on the card; RuntimeError if it runs elsewhere already.
     The precision follows the material's dtype. Raises Divergence if the run outgrows its substeps; the state is then as
@@ -114,7 +125,7 @@ class DifferentiableSimulator:
         solver: DifferentiableSolver,
         density: float | torch.Tensor = 1000.0,
         fixed_vertices: str | ArrayLike | None = None,
-        contact: DifferentiableBarrierContact | bool | None = None,
+        contact: DifferentiableBarrierContact | Literal["ground", False] = "ground",
         terms: Iterable[Term] | None = None,
         device: str | torch.device = "cpu",
     ):
@@ -124,11 +135,14 @@ class DifferentiableSimulator:
         refuse_state(material.core(mesh).law("f64"), "DifferentiableSimulator", remedy)
         self._terms = list(terms or [])
         if contact is None:
+            deprecated.warn("DifferentiableSimulator(contact=None)", 'contact="ground"')
+            contact = "ground"
+        if isinstance(contact, str) and contact == "ground":
             lowest, width = float(mesh.vertices[:, 1].min()), 0.01
             ground = 0.0 if lowest >= width else lowest - width
             contact = DifferentiableBarrierContact(1e4, width, ground_height=ground)
         if contact is not False and not isinstance(contact, DifferentiableBarrierContact):
-            raise ValueError(f"contact must be None, False or a DifferentiableBarrierContact, got {contact!r}")
+            raise ValueError(f'contact must be "ground", False or a DifferentiableBarrierContact, got {contact!r}')
         self._contact: DifferentiableBarrierContact | None = contact or None
         self._substeps, self._rollouts, self._scenes = solver.substeps, {}, {}
         self._ratio = self._last = self._rest = None
@@ -165,6 +179,17 @@ class DifferentiableSimulator:
         if velocities is not None:
             self._velocities = self._checked("velocities", velocities, self._rest.shape)
         self._choose_substeps()
+
+    def set_fixed_vertices(self, vertex_indices: str | ArrayLike | None) -> None:
+        """Fix other vertices from now on, where they are: a vertex set's name, indices or a mask; None fixes none."""
+        if vertex_indices is not None:
+            self.mesh.vertex_indices(vertex_indices)  # refuses what is none
+        self.fixed_vertices, self._rollouts, self._scenes = vertex_indices, {}, {}
+
+    @property
+    def time(self) -> float:
+        """Simulated time since the start or a reset [s]."""
+        return self._steps * self.solver.dt
 
     def detach(self) -> None:
         """Cut the graph here and keep the motion: gradients of later losses stop at the present state (truncated

@@ -7,12 +7,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from typing_extensions import Unpack
 
+from diffsim_ti.common.public import public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import Mark
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.colouring import Colouring, to_vertices
-from diffsim_ti.visual.drawing import Drawing
+from diffsim_ti.visual.drawing import Drawing, Look
 from diffsim_ti.visual.glyphs import arrow_length, ends, longest
 from diffsim_ti.visual.series import SavedSeries
 from diffsim_ti.writers import View, writer_for
@@ -21,6 +23,7 @@ from diffsim_ti.writers.film import check_film, encoder
 KINDS = (".mp4", ".gif", ".png")
 
 
+@public
 def render_series(
     series: str | Path,
     output: str | Path,
@@ -55,6 +58,7 @@ def render_series(
     return writer.count
 
 
+@public
 def save_film(
     path: str | Path,
     mesh: TetrahedralMesh,
@@ -68,14 +72,18 @@ def save_film(
     limits: tuple[float, float] | None = None,
     box: np.ndarray | None = None,
     marks: Sequence[Sequence[Mark]] | None = None,
-    **look,
+    colours: str | None = None,
+    ground: float | None = None,
+    backend: str = "auto",
+    **look: Unpack[Look],
 ) -> int:
     """Draw states of a body into `path` (.mp4, .gif), or the last one (.png); the number drawn.
 
     positions: shape (n, num_vertices, 3) [m]; values: shape (n, m), per vertex or tetrahedron, coloured as in `save_picture`
     with one scale for all; obstacles: n lists of (points, triangles), which may move but not change; title: k -> text;
     box, shape (2, 3) [m]: what to frame, default all positions;
-    marks: n lists, as `save_picture` takes them; look: what else `Drawing` takes.
+    marks: n lists, as `save_picture` takes them, as are colours, ground [m] and look; backend: "auto", "vulkan" or
+    "software".
     Raises ValueError for bad arguments, RuntimeError if MP4's encoder is not installed.
     """
     path, positions = Path(path), np.asarray(positions, np.float64)
@@ -86,16 +94,18 @@ def save_film(
     for name, rows in (("values", values), ("obstacles", obstacles), ("marks", marks)):
         if rows is not None and len(rows) != len(positions):
             raise ValueError(f"{name}: must be given for each of the {len(positions)} frames, got {len(rows)}")
+    colouring = None
     if values is not None:
         values = [to_vertices(mesh, row) for row in values]
         shown = np.stack(values)[:, mesh.surface_vertices]
-        look["colouring"] = Colouring.of(shown, label, limits, look.pop("colours", None))
+        colouring = Colouring.of(shown, label, limits, colours)
     drawn = [mark for row in marks or () for mark in row]
     scale, length = longest(drawn), arrow_length(mesh)
     around = [ends(mark, scale, length).reshape(-1, 3) for mark in drawn]
     seen = np.concatenate([positions[:, mesh.surface_vertices].reshape(-1, 3), *around])
     box = np.stack([seen.min(0), seen.max(0)]) if box is None else box
-    drawing = Drawing(mesh, size, obstacles=obstacles[0] if obstacles else (), box=box, **look)
+    own = dict(ground=ground, colouring=colouring, box=box, backend=backend)
+    drawing = Drawing(mesh, size, obstacles=obstacles[0] if obstacles else (), **own, **look)
     drawing.scale = scale
     frames = range(len(positions))[-1:] if path.suffix == ".png" else range(len(positions))
     path.parent.mkdir(parents=True, exist_ok=True)

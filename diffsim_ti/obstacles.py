@@ -5,6 +5,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from diffsim_ti.common.public import public
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Obstacle
 from diffsim_ti.terms.obstacles.shapes import Triangles, ball, bowl, box, revolved, square, tube
@@ -18,6 +19,7 @@ def floor_of(scene: Scene) -> float | None:
     return next((height for height in heights if height is not None), None)
 
 
+@public
 def obstacle_surfaces(scene: Scene, time: float = 0.0, rows: Mapping = MappingProxyType({})) -> list[Triangles]:
     """(points [m], shape (k, 3), triangles) of each obstacle of a scene at `time` [s] that has a surface to draw.
 

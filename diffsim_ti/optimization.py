@@ -11,6 +11,7 @@ from pathlib import Path
 
 from diffsim_ti.common import ranks
 from diffsim_ti.common.progress import progress
+from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.torch_bridge.autograd import torch
@@ -87,7 +88,7 @@ def _read(path: Path, mesh) -> dict:
     return state
 
 
-class Optimization:
+class Optimization(metaclass=Public):
     """A loop around a torch optimiser that saves, resumes, and keeps the best.
 
     module: holds the parameters; path: state file, resumed from if it is there; None keeps nothing. A resumed run is

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.mesh import TetrahedralMesh
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ START, FOUND, TARGET = "#b8b8b8", "#6fa8dc", "#d55e00"
 LEAST = 1e-300  # a loss of nothing is drawn below the axis
 
 
-class OptimizationPicture:
+class OptimizationPicture(metaclass=Public):
     """Evaluations of an optimisation, as they come, and their picture.
 
     mesh, target, truth, loss_label, plane, size: as in `optimization_figure`; path: where the picture goes.
@@ -36,11 +37,15 @@ class OptimizationPicture:
         target: ArrayLike,
         path: str | Path | None = None,
         every: float | None = None,
-        **look,
+        truth: dict | None = None,
+        loss_label: str = "loss",
+        plane: str = "xy",
+        size: tuple[int, int] = (960, 320),
     ):
         if every is not None and (path is None or not every >= 0):
             raise ValueError(f"every: must be >= 0 [s] and go with a path, got {every} and path {path}; leave it out")
-        self.mesh, self.target, self.path, self.every, self.look = mesh, target, path and Path(path), every, look
+        self.mesh, self.target, self.path, self.every = mesh, target, path and Path(path), every
+        self.look = dict(truth=truth, loss_label=loss_label, plane=plane, size=size)
         self.losses, self.parameters, self.start, self.found = [], {}, None, None
         self._written = time.perf_counter()
 
@@ -74,11 +79,26 @@ class OptimizationPicture:
         self._written = time.perf_counter()
 
 
-def save_optimization(path: str | Path, *arguments, **options) -> None:
-    """Write `optimization_figure` of the arguments in the format of the suffix (PNG, SVG, PDF ...)."""
-    optimization_figure(*arguments, **options).savefig(path)
+@public
+def save_optimization(
+    path: str | Path,
+    losses: ArrayLike,
+    parameters: dict,
+    mesh: TetrahedralMesh,
+    found: ArrayLike,
+    target: ArrayLike,
+    start: ArrayLike | None = None,
+    truth: dict | None = None,
+    loss_label: str = "loss",
+    plane: str = "xy",
+    size: tuple[int, int] = (960, 320),
+) -> None:
+    """Write `optimization_figure` of the arguments, positions in [m], in the format of the suffix (PNG, SVG, PDF ...)."""
+    figure = optimization_figure(losses, parameters, mesh, found, target, start, truth, loss_label, plane, size)
+    figure.savefig(path)
 
 
+@public
 def optimization_figure(
     losses: ArrayLike,
     parameters: dict,

@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.differences import CentralDifferences, TaylorResult, central_difference, taylor_test
+from diffsim_ti.common.public import public
 from diffsim_ti.identification import Identifiability, identifiability
 from diffsim_ti.inputs import RunSize
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.solvers import NotConverged
 
@@ -46,6 +48,7 @@ def pull_back(rollout: Rollout, frames: Frames, loss: Loss) -> dict[str, np.ndar
     return rollout.vjp(frames, *parts, **outputs)
 
 
+@public
 def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
     """A loss that no symmetry hides from: w . positions + z . velocities + |positions|^2 / 2 with random w, z.
 
@@ -66,7 +69,10 @@ def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
     return loss
 
 
-def dot_product_test(rollout: Rollout, inputs: Iterable[str] | None = None, seed: int = 0, **values) -> float:
+@public
+def dot_product_test(
+    rollout: Rollout, inputs: Iterable[str] | None = None, seed: int = 0, **values: InputValue
+) -> float:
     """Relative difference of <w, J v> and <J^T w, v> for random v in all inputs and random w in all frames.
 
     Further outputs of the rollout are tried each by itself, since they have other units; the largest difference counts.
@@ -223,6 +229,7 @@ def _solved_to(rollout: Rollout, tolerance: float):
         rollout.solver, rollout.sweep = kept
 
 
+@public
 def check_gradients(
     rollout: Rollout,
     loss: Loss | None = None,
@@ -426,6 +433,7 @@ class GradientHealth:
     __repr__ = __str__
 
 
+@public
 def gradient_health(rollout: Rollout, limit: float = 1e10) -> GradientHealth:
     """Health of the last reverse sweep of a Rollout made with health=True: is the gradient still of use?
 
@@ -443,7 +451,8 @@ def gradient_health(rollout: Rollout, limit: float = 1e10) -> GradientHealth:
     return GradientHealth(steps, norms, float(slope), int(steps[over[0]]) if len(over) else None)
 
 
-def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: float = 1e-5, **values) -> dict:
+@public
+def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: float = 1e-5, **values: InputValue) -> dict:
     """Hessian of the loss times a direction over some inputs, by central differences of exact gradients.
 
     direction: input name -> change of that input. Error O(epsilon^2) of the direction as given; use f64.
@@ -458,6 +467,7 @@ def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: floa
     return out
 
 
+@public
 def gauss_newton_product(rollout: Rollout, frames: Frames, direction: dict, weight: ArrayLike = 1.0) -> dict:
     """J^T (weight J d): the Gauss-Newton Hessian of 1/2 |sqrt(weight) (positions - target)|^2 times a direction; exact.
 

@@ -6,24 +6,29 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
+from diffsim_ti.common.answers import answered
 from diffsim_ti.common.progress import LOG
+from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import Mark
+from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.backdrop import Backdrop
+from diffsim_ti.visual.drawing import Look
 from diffsim_ti.visual.viewer import open_window
 
 if TYPE_CHECKING:
     from taichi.ui import Window
 
 
-class SimulationVisualizer:
+@answered
+class SimulationVisualizer(metaclass=Public):
     """Shows a mesh whose positions change: `update(positions)` while it runs, `show()` at the end.
 
     With a display and a Vulkan driver: a Taichi window (the right button turns, Escape closes). Otherwise
-    `show()` writes a PNG to `path` and says where, by the logger "diffsim_ti". `has_window` says which. look: what else
-    `Drawing` takes: obstacles, fixed, held, wireframe, azimuth ...; `update(positions, marks)` shows arrows and lines, as
-    `save_picture` takes them.
+    `show()` writes a PNG to `path` and says where, by the logger "diffsim_ti". `has_window` says which. ground, obstacles
+    and look are as in `save_picture`; `update(positions, marks)` shows arrows and lines, as `save_picture` takes them.
     """
 
     def __init__(
@@ -32,13 +37,14 @@ class SimulationVisualizer:
         path: str | Path = "output/simulation.png",
         title: str = "diffsim_ti",
         ground: float | None = None,
-        **look,
+        obstacles: Sequence[Triangles] = (),
+        **look: Unpack[Look],
     ):
-        self.mesh, self.path, self.ground, self.look = mesh, Path(path), ground, look
+        self.mesh, self.path, self.ground, self.look = mesh, Path(path), ground, dict(look, obstacles=obstacles)
         self.positions, self.marks = np.array(mesh.vertices), ()
         self.window = open_window(title, (1024, 768))
         if self.window is not None:
-            self._scene = _Scene(self.window, mesh, ground, look)
+            self._scene = _Scene(self.window, mesh, ground, self.look)
 
     @property
     def has_window(self) -> bool:

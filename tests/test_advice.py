@@ -236,7 +236,7 @@ FOLLOWED = {
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0], tetrahedra="left", per="set"),
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0, 1.0], tetrahedra=["left", "right"], per="set"),
     ),
-    ("runtime/start.py", "init has no argument"): (lambda: ds.init(backend="cpu"), lambda: None),
+    ("runtime/start.py", "init has no argument"): (lambda: ds.init(device="cpu"), lambda: None),
     ("runtime/start.py", "cannot be chosen"): (lambda: ds.init("cpu", fast_math=True), lambda: None),
     ("torch_bridge/rollout_node.py", "but this rollout computes"): (
         lambda: rollout_frames(ds.Rollout(verlet(), 1, gradients=["initial_positions"]), density=TORCH_E),

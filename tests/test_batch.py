@@ -20,7 +20,7 @@ ROUND_OFF = {"f32": 2e-6, "f64": 1e-13}  # of sums, in another order
 
 
 def floor(friction: float = 0.3) -> ds.Ground:
-    return ds.Ground(LOW - 0.008, friction=friction, stiffness_per_area=2e5)
+    return ds.Ground(LOW - 0.008, friction=friction, stiffness_per_area=2e5, width=0.01)
 
 
 def drawn(seed: int) -> tuple[ds.Batch, dict]:
@@ -46,10 +46,12 @@ def drawn(seed: int) -> tuple[ds.Batch, dict]:
     if wall == 2:
         turns = few(0.5)
         push = lambda t: np.array([0.0, 0.3 * t, 0.2 * t] + [0.0, 0.0, 0.5 * t] * turns)  # noqa: E731
-        terms.append(ds.HalfSpace((0, LOW - 0.008, 0), (0.1, 1, 0), path=push, friction=0.2, stiffness_per_area=2e5))
+        terms.append(
+            ds.HalfSpace((0, LOW - 0.008, 0), (0.1, 1, 0), path=push, friction=0.2, stiffness_per_area=2e5, width=0.01)
+        )
         own["half_space_point"] = [0, LOW - 0.008, 0] + 1e-3 * rng.normal(size=(B, 3))
     if wall == 3:
-        terms.append(ds.Sphere((0.05, 0.05, 0.05), 0.12, inside=True, stiffness_per_area=2e5))
+        terms.append(ds.Sphere((0.05, 0.05, 0.05), 0.12, inside=True, stiffness_per_area=2e5, width=0.01))
         own["sphere_radius"] = rng.uniform(0.115, 0.125, B)
     held = rng.integers(3)
     options = [{}, dict(fixed={"xmin": "xyz"}), dict(fixed={"xmin": "x"})][held]
@@ -199,7 +201,7 @@ def test_backends(law):
 
     Given forces are in other tests: with them a tangent takes more arrays than lavapipe lends a kernel, 32.
     """
-    wall = ds.HalfSpace((0, LOW - 0.008, 0), (0.1, 1, 0), path=push, friction=0.2, stiffness_per_area=2e5)
+    wall = ds.HalfSpace((0, LOW - 0.008, 0), (0.1, 1, 0), path=push, friction=0.2, stiffness_per_area=2e5, width=0.01)
     elastic = law == "elastic"
     terms = [ds.Gravity(-9.8), ds.Drag(0.5), *([wall] if elastic else [])]
     material = ELASTIC if elastic else ds.Prony(ELASTIC, [0.3, 0.2], [1e-2, 1e-1])
@@ -291,7 +293,9 @@ def test_scenes_fail_alone(lanes):
 
 
 def test_a_scene_that_crosses_an_obstacle_fails_alone():
-    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Ground(LOW - 0.05, stiffness=10.0)])
+    scene = ds.Scene(
+        MESH, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Ground(LOW - 0.05, stiffness=10.0, width=0.01)]
+    )
     batch = ds.Batch(ds.SemiImplicitSolver(scene, dt=1e-3), 30, 3, save_every=5, lanes=True)
     speed = np.zeros((3, *MESH.vertices.shape))
     speed[:, :, 1] = np.array([-0.1, -20.0, 0.1])[:, None]
@@ -304,7 +308,10 @@ def test_a_scene_that_crosses_an_obstacle_fails_alone():
 
 GIVEN = dict(  # over time: terms and options of a scene
     path=(lambda: [], {}),
-    pose=(lambda: [ds.HalfSpace((0, -9.0, 0), (0, 1, 0), path=lambda t: (0, t, 0, 0, 0, t), stiffness=1e3)], {}),
+    pose=(
+        lambda: [ds.HalfSpace((0, -9.0, 0), (0, 1, 0), path=lambda t: (0, t, 0, 0, 0, t), stiffness=1e3, width=0.01)],
+        {},
+    ),
     load=(
         lambda: [
             ds.Traction(lambda t: (10 * t, 0, 0), "ymax"),
@@ -328,7 +335,7 @@ BY_TURNS = ds.BDF2Solver, ds.VelocityVerletSolver, ds.ImplicitMidpointSolver, ds
 def test_a_scene_by_turns_fails_alone_whatever_is_given_over_time(given, solver):
     """The first and the last fly into the floor, far too fast, after a while."""
     path = (lambda t: (0, t, 0)) if "path" in given else None
-    terms, options = [ds.Ground(-10.0, stiffness_per_area=1e4, path=path, name="floor")], {}
+    terms, options = [ds.Ground(-10.0, stiffness_per_area=1e4, width=0.01, path=path, name="floor")], {}
     for name in given.split():
         terms, options = terms + GIVEN[name][0](), options | GIVEN[name][1]
     scene = ds.Scene(MESH, ELASTIC, 1000.0, terms=terms, precision="f64", **options)

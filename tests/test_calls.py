@@ -298,7 +298,7 @@ def test_no_lengths_of_steps_are_refused(steps):
 
 
 def test_unknown_options_of_init_are_refused():
-    for name in ("backend", "device", "fp"):
+    for name in ("architecture", "device", "fp"):
         with pytest.raises(TypeError, match=f"init has no argument '{name}'"):
             ds.init(**{name: "cpu"})
 

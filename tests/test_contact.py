@@ -143,8 +143,8 @@ def test_a_body_in_an_obstacle_is_refused(name):
 
 def test_touching_exactly_is_refused_and_a_path_counts():
     with pytest.raises(ValueError, match="starts below or on the ground"):
-        points(tetrahedron(0.0), ds.Ground(stiffness=1e4))
-    rising = ds.Ground(stiffness=1e4, path=lambda t: [0, 0.3, 0])
+        points(tetrahedron(0.0), ds.Ground(stiffness=1e4, width=0.01))
+    rising = ds.Ground(stiffness=1e4, width=0.01, path=lambda t: [0, 0.3, 0])
     with pytest.raises(ValueError, match="starts below or on the ground"):
         points(tetrahedron(0.15), rising)
     points(tetrahedron(0.35), rising)
@@ -153,8 +153,8 @@ def test_touching_exactly_is_refused_and_a_path_counts():
 def test_stiffness_is_chosen_and_said():
     """From the speed of the fall: at rest on the floor the weight still leaves a gap."""
     mesh, material = tetrahedron(0.1), ds.StableNeoHookean(1e5, 0.3)
-    scene = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace()])
-    faster = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace()], initial_velocities=[0, -5, 0])
+    scene = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace(width=0.01)])
+    faster = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace(width=0.01)], initial_velocities=[0, -5, 0])
     k, more = (float(s.inputs.values["barrier_stiffness_per_area"]) for s in (scene, faster))
     assert more > 3 * k > 0 and f"stiffness per area {k:.4g} N/m^3 of HalfSpace" in scene.describe()
     assert "barrier_stiffness_per_area [N/m^3]" in scene.describe()
@@ -163,7 +163,7 @@ def test_stiffness_is_chosen_and_said():
     simulator.run(2000)
     assert simulator.contact_resolution.smallest_gap > 0.02 * 0.01
     with pytest.raises(ValueError, match="nothing says how stiff"):
-        ds.Scene(mesh, material, terms=[ds.HalfSpace()])
+        ds.Scene(mesh, material, terms=[ds.HalfSpace(width=0.01)])
 
 
 @pytest.mark.parametrize("solver", FORCE + RESTING)
@@ -173,7 +173,7 @@ def test_weight_at_rest_on_a_slope(solver, mass, gap):
     angle = 0.3
     n = np.array([np.sin(angle), np.cos(angle), 0])
     mesh = tetrahedron(0.3)
-    plane = ds.HalfSpace(BASE[0] + [0, 0.3, 0] - resting_gap(mass * G) * n, n, stiffness=1e4, friction=1.0)
+    plane = ds.HalfSpace(BASE[0] + [0, 0.3, 0] - resting_gap(mass * G) * n, n, stiffness=1e4, width=0.01, friction=1.0)
     scene = points(mesh, plane, mass, fixed=[1, 2, 3], terms=[ds.Gravity(-G / np.cos(angle))])
     end = ds.Rollout(solver(scene, dt=1e-3), 500).forward()
     reached = (end.positions[-1, 0] - plane.values["half_space_point"]) @ n
@@ -187,7 +187,7 @@ def test_absent_obstacles_compile_nothing():
     arrays = bare.workspace.arrays
     assert arrays.features().groups == () and np.prod(bare.workspace.watch.seen.shape) == 1
     assert np.prod(arrays.path.shape) == 1 and str(bare.contact_resolution) == "contact: none"
-    plain = ds.Simulator(ds.SemiImplicitSolver(points(tetrahedron(0.5), ds.Ground(stiffness=1e4)), dt=1e-4))
+    plain = ds.Simulator(ds.SemiImplicitSolver(points(tetrahedron(0.5), ds.Ground(stiffness=1e4, width=0.01)), dt=1e-4))
     (group,) = plain.workspace.arrays.features().groups
     assert not group.force.friction and group.path < 0 and group.size == 3
 
@@ -224,7 +224,9 @@ def test_symmetric_contact_stays_symmetric(solver):
     x = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0], [0, 0, 0]]) * 0.2
     tets = [[0, 2, 4, 5], [2, 1, 4, 5], [1, 3, 4, 5], [3, 0, 4, 5]]
     mesh = ds.TetrahedralMesh(x + [0, 0.01, 0], tets, fix_orientation=True)
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), ds.Ground(stiffness=1e4, friction=0.3)])
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), ds.Ground(stiffness=1e4, width=0.01, friction=0.3)]
+    )
     end = ds.Rollout(solver(scene, dt=2e-4), 2000).forward()
     p = end.positions[-1]
     mirrored, turned = p[[1, 0, 2, 3, 4, 5]] * [-1, 1, 1], p[[2, 3, 0, 1, 4, 5]][:, [2, 1, 0]]
@@ -259,3 +261,38 @@ def test_momentum_balance(solver):
 def slope_of(s):
     with np.errstate(all="ignore"):
         return np.where(s < 1, -(s - 1) * (2 * np.log(np.minimum(s, 1)) + (s - 1) / s), 0)
+
+
+@pytest.mark.parametrize("up", ["x", "-z"])
+def test_any_axis_may_point_up(up):
+    """A fall that is turned with its gravity and its floor is the fall, turned, and so are its gradients."""
+    axis, sign = "xyz".index(up[-1]), -1 if up[0] == "-" else 1
+    turn = (np.diag([1, sign, sign]) @ np.eye(3)[[(axis + 2) % 3, axis, (axis + 1) % 3]]).T
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (0.3, 0.2, 0.1), origin=(0, 0.06, 0))
+    results = []
+    for direction, R in (("y", np.eye(3)), (up, turn)):
+        terms = [ds.Gravity(-9.81, up=direction), ds.Ground(0.05, width=0.02, friction=0.3, up=direction)]
+        options = dict(terms=terms, initial_velocities=R @ [0.5, 0, 0.1], precision="f64")
+        scene = ds.Scene(mesh.rotated(R), ds.StableNeoHookean(5e4, 0.3), **options)
+        rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 50, gradients=["ground_height", "gravity"])
+        frames, seed = rollout.forward(), np.zeros((2, mesh.num_vertices, 3))
+        seed[-1] = np.cos(np.arange(3 * mesh.num_vertices)).reshape(-1, 3) @ R.T
+        by = rollout.vjp(frames, positions=seed)
+        results.append((frames.positions[-1] @ R, by["ground_height"], by["gravity"] @ R))
+    for own, turned in zip(*results):
+        np.testing.assert_allclose(turned, own, rtol=1e-8, atol=1e-12)
+    assert f"Ground(up={up!r}" in scene.describe() and abs(by["ground_height"]) > 0
+    origin = 1e6 * np.eye(3)[axis]  # what is measured from far away has the height above it
+    floor = scene.terms[1]
+    assert floor.shift(origin)[0] == sign * 1e6
+    drawn, _ = floor.surface(1.0)
+    assert np.allclose(floor.distance(drawn), 0)
+    with pytest.raises(ValueError, match=f"at -0.14 m above {up} = 0.2"):
+        scene.replace(terms=[ds.Ground(0.2, stiffness=1.0, up=up)])
+
+
+def test_what_points_up_is_refused_otherwise():
+    with pytest.raises(ValueError, match="Ground: up must be one of 'x', 'y', 'z', '-x', '-y', '-z', got 'w'"):
+        ds.Ground(up="w")
+    with pytest.raises(ValueError, match="leave up='z' out"):
+        ds.Gravity((0, 0, -9.81), up="z")

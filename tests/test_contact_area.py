@@ -195,7 +195,7 @@ def test_the_scene_chooses_it_by_the_impact():
     chosen = []
     for resolution in (2, 4):
         mesh = ds.TetrahedralMesh.create_cube(resolution=resolution, size=0.2).translated((0, 0.05, 0))
-        scene = ds.Scene(mesh, SOFT, terms=[ds.Gravity(), ds.Ground(name="floor")])
+        scene = ds.Scene(mesh, SOFT, terms=[ds.Gravity(), ds.Ground(width=0.01, name="floor")])
         assert "floor.stiffness_per_area [N/m^3]" in scene.describe() and "of Ground" in scene.describe()
         chosen.append(float(scene.inputs.values["floor.stiffness_per_area"]))
     assert chosen[0] == pytest.approx(chosen[1]) and chosen[0] > 0
@@ -227,10 +227,14 @@ def test_the_scene_chooses_it_by_what_presses(kind):
 
 def test_the_scene_chooses_it_by_what_moves():
     mesh = ds.TetrahedralMesh.create_cube(resolution=2, size=0.2).translated((0, 0.05, 0))
-    still = ds.Scene(mesh, SOFT, terms=[ds.Ground(name="floor")], initial_velocities=(0, -0.8, 0))
-    path = ds.Scene(mesh, SOFT, terms=[ds.Ground(name="floor", path=lambda t: [0, 0.8 * t, 0])])
+    still = ds.Scene(mesh, SOFT, terms=[ds.Ground(width=0.01, name="floor")], initial_velocities=(0, -0.8, 0))
+    path = ds.Scene(mesh, SOFT, terms=[ds.Ground(width=0.01, name="floor", path=lambda t: [0, 0.8 * t, 0])])
     led = ds.Scene(
-        mesh, SOFT, terms=[ds.Ground(name="floor")], fixed="ymax", motion=([0, 1], [[0, 0, 0], [0, -0.8, 0]])
+        mesh,
+        SOFT,
+        terms=[ds.Ground(width=0.01, name="floor")],
+        fixed="ymax",
+        motion=([0, 1], [[0, 0, 0], [0, -0.8, 0]]),
     )
     chosen = [float(scene.inputs.values["floor.stiffness_per_area"]) for scene in (still, path, led)]
     assert chosen[1:] == pytest.approx([chosen[0]] * 2)
@@ -269,3 +273,28 @@ def test_backend_of_areas_in_implicit_steps():
     """A face on a needle moves up as in float64 on a processor; without the needle it would go 0.8 mm down."""
     positions = on_a_needle("f32", stiffness_per_area=1e7).forward().positions
     assert (positions[-1] - positions[0])[:, 1].mean() == pytest.approx(8.3163e-4, rel=1e-3)
+
+
+def test_the_scene_chooses_the_width_by_the_smallest_body():
+    """One per cent of its longest side, said in the scene's description; what is given stays, whatever the body."""
+    small, tall = (ds.TetrahedralMesh.create_box(2, size) for size in ((0.02, 0.01, 0.01), (0.3, 2.0, 0.3)))
+    both = ds.TetrahedralMesh.joined({"small": small, "tall": tall.translated((1.0, 0, 0))}).translated((0, 0.7, 0))
+    corners, closed = TABLE.vertices - [0, 2, 0], TABLE.surface_triangles
+    own = ds.Sphere((0, -9, 0), 1.0, stiffness=1.0, width=0.5)
+    terms = [ds.Ground(), ds.MeshObstacle(corners, closed, resolution=4, stiffness=1.0), own, ds.SelfContact()]
+    assert "barrier_width=chosen by the scene" in repr(terms[0]) and "width=chosen" not in repr(own)
+    for mesh, size in ((small.translated((0, 1, 0)), 0.02), (tall.translated((0, 1, 0)), 2.0), (both, 0.02)):
+        scene = ds.Scene(mesh, SOFT, terms=[ds.Gravity(), *terms])
+        values = scene.inputs.values
+        assert values["barrier_width"] == values["barrier_width_2"] == pytest.approx(0.01 * size, rel=1e-12)
+        assert values["barrier_width_3"] == 0.5 and values["self_contact_width"] == pytest.approx(
+            1e-3 * size, rel=1e-12
+        )
+        assert f"barrier_width={0.01 * size:g}" in scene.describe()
+        given = ds.MeshObstacle(corners, closed, resolution=4, stiffness=1.0, width=0.01 * size)
+        assert np.array_equal(scene.terms[2].table, given.table)
+    again = scene.replace(mesh=tall.translated((0, 1, 0)))  # it is chosen anew
+    assert again.inputs.values["barrier_width"] == pytest.approx(0.02)
+
+
+TABLE = ds.TetrahedralMesh.create_cube(resolution=2)

@@ -18,7 +18,9 @@ def test_speed_table(solver, dt, how):
     crossed = []
     for speed in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 65.0):
         scene = points(
-            tetrahedron(0.3 * speed * dt + 0.03), ds.Ground(stiffness=1e4), initial_velocities=[0.1, -speed, 0]
+            tetrahedron(0.3 * speed * dt + 0.03),
+            ds.Ground(stiffness=1e4, width=0.01),
+            initial_velocities=[0.1, -speed, 0],
         )
         own = solver(scene, dt=dt, allow_unstable=True)
         steps = max(3, int(0.1 / speed / dt))
@@ -45,7 +47,7 @@ def test_speed_table(solver, dt, how):
 
 @solvers
 def test_the_state_before_is_kept(solver):
-    scene = points(tetrahedron(0.108), ds.Ground(stiffness=1e4), mass=0.05, initial_velocities=[0, -10, 0])
+    scene = points(tetrahedron(0.108), ds.Ground(stiffness=1e4, width=0.01), mass=0.05, initial_velocities=[0, -10, 0])
     simulator = ds.Simulator(solver(scene, dt=1e-2))
     with pytest.raises(ds.Crossing) as caught:
         simulator.run(5)
@@ -128,7 +130,7 @@ def test_moving_obstacles_in_forward_runs():
 @pytest.mark.parametrize("solver", FORCE)
 def test_a_run_that_fails_may_be_marked(solver):
     """As in a Batch: frames hold the last good state, gradients are zero, and the next run is as if nothing had been."""
-    scene = points(tetrahedron(0.035), ds.Ground(stiffness=1e2), initial_velocities=[0.1, -0.3, 0])
+    scene = points(tetrahedron(0.035), ds.Ground(stiffness=1e2, width=0.01), initial_velocities=[0.1, -0.3, 0])
     rollout = ds.Rollout(solver(scene, dt=1e-3), 120, save_every=10, raise_errors=False)
     failed = np.tile([0.1, -1.0, 0], (4, 1))
     frames = rollout.forward(initial_velocities=failed)

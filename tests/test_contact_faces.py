@@ -251,14 +251,15 @@ def test_a_state_from_outside_is_looked_at_between_its_vertices(solver):
 
 
 @pytest.mark.parametrize("obstacle", [
-    ds.Ground(-0.02), ds.HalfSpace((0, -0.02, 0), stiffness=1e3), ds.Sphere((0, 0.3, 0), 2.0, inside=True, stiffness=1e3),
-    ds.Sphere((0, -30.02, 0), 30.0, stiffness=1e3),
+    ds.Ground(-0.02, width=0.01), ds.HalfSpace((0, -0.02, 0), stiffness=1e3, width=0.01),
+    ds.Sphere((0, 0.3, 0), 2.0, inside=True, stiffness=1e3, width=0.01),
+    ds.Sphere((0, -30.02, 0), 30.0, stiffness=1e3, width=0.01),
 ], ids=lambda o: type(o).__name__)  # fmt: skip
 def test_obstacles_larger_than_triangles_cost_nothing(obstacle):
     workspace = ds.Simulator(ds.SemiImplicitSolver(cube(obstacle), dt=1e-3)).workspace
     assert workspace.faces is None and workspace.watch.seen.shape == (3, 8)
     assert workspace.arrays.corner.shape == (32,)
-    ball = cube(ds.Sphere((0, -0.52, 0), 0.5, stiffness=1e3))
+    ball = cube(ds.Sphere((0, -0.52, 0), 0.5, stiffness=1e3, width=0.01))
     assert ds.Simulator(ds.SemiImplicitSolver(ball, dt=1e-3)).workspace.faces is not None
 
 
@@ -274,7 +275,7 @@ def test_a_pass_that_cannot_follow_says_so(monkeypatch):
 
 def test_the_stable_step_does_not_know_contact_within_faces():
     """A barrier of a thousand times the stiffness is followed at seven tenths of the body's limit."""
-    free = ds.Simulator(ds.SemiImplicitSolver(cube(ds.Ground(-1.0)), dt=2e-3))
+    free = ds.Simulator(ds.SemiImplicitSolver(cube(ds.Ground(-1.0, width=0.01)), dt=2e-3))
     limit = Stiffness(free.workspace).largest()[0]
     for stiffness in (2e3, 2e6):
         scene = cube(NARROW["capsule"][0](stiffness=stiffness, width=WIDTH), speed=0.6, lift=0.003)

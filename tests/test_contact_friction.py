@@ -19,7 +19,7 @@ def on_incline(friction: float, friction_speed: float, **options):
     turn = np.stack([-down, n, np.cross(-down, n)], 1)
     mesh = tetrahedron(resting_gap(G * np.cos(angle)))
     mesh = ds.TetrahedralMesh(mesh.vertices @ turn.T, mesh.tetrahedra)
-    plane = ds.HalfSpace(normal=n, stiffness=1e4, friction=friction, friction_speed=friction_speed)
+    plane = ds.HalfSpace(normal=n, stiffness=1e4, width=0.01, friction=friction, friction_speed=friction_speed)
     return points(mesh, plane, terms=[ds.Gravity(-G)], **options), down
 
 
@@ -47,7 +47,7 @@ def test_stopping_distance(solver, friction, distance, precision):
     """R21, from 2 m/s; it also stops, and does not come back."""
     scene = points(
         tetrahedron(resting_gap(G)),
-        ds.Ground(stiffness=1e4, friction=friction),
+        ds.Ground(stiffness=1e4, width=0.01, friction=friction),
         terms=[ds.Gravity(-G)],
         initial_velocities=[2, 0, 0],
         precision=precision,
@@ -63,7 +63,7 @@ def test_stopping_distance(solver, friction, distance, precision):
 @solvers
 def test_moving_floor_drags_and_carries(solver):
     """A conveyor's speed is reached after v / (mu g), and then kept."""
-    floor = ds.Ground(stiffness=1e4, friction=0.3, friction_speed=1e-3, path=lambda t: [1.5 * t, 0, 0])
+    floor = ds.Ground(stiffness=1e4, width=0.01, friction=0.3, friction_speed=1e-3, path=lambda t: [1.5 * t, 0, 0])
     scene = points(tetrahedron(resting_gap(G)), floor, terms=[ds.Gravity(-G)])
     frames = ds.Rollout(solver(scene, dt=1e-3), 1000, save_every=50).forward()
     expected = np.minimum(0.3 * G * frames.times, 1.5)
@@ -78,7 +78,7 @@ def test_friction_never_adds_energy(solver, speed):
     for sign in (1, -1):
         scene = points(
             tetrahedron(resting_gap(G)),
-            ds.Ground(stiffness=1e4, friction=0.8, friction_speed=1e-3),
+            ds.Ground(stiffness=1e4, width=0.01, friction=0.8, friction_speed=1e-3),
             terms=[ds.Gravity(-G)],
             initial_velocities=[sign * speed, 0, 0.3 * speed],
         )
@@ -95,7 +95,7 @@ def test_friction_work_is_what_the_energy_loses(solver):
     """mu N times the way that was slid, while kinetic energy falls by as much."""
     scene = points(
         tetrahedron(resting_gap(G)),
-        ds.Ground(stiffness=1e4, friction=0.25, friction_speed=1e-4),
+        ds.Ground(stiffness=1e4, width=0.01, friction=0.25, friction_speed=1e-4),
         terms=[ds.Gravity(-G)],
         initial_velocities=[1.2, 0, -0.5],
     )
@@ -109,7 +109,9 @@ def test_friction_work_is_what_the_energy_loses(solver):
 def test_static_and_sliding_are_one_continuous_law(solver):
     """Row 46: the velocity after friction is C1 in the velocity before: no jump in gradients where sticking ends."""
     scene = points(
-        tetrahedron(resting_gap(G)), ds.Ground(stiffness=1e4, friction=0.5, friction_speed=0.05), terms=[ds.Gravity(-G)]
+        tetrahedron(resting_gap(G)),
+        ds.Ground(stiffness=1e4, width=0.01, friction=0.5, friction_speed=0.05),
+        terms=[ds.Gravity(-G)],
     )
     rollout = ds.Rollout(solver(scene, dt=2e-3), 1 if solver.order == 1 else 2, gradients=["initial_velocities"])
     found, ends = [], []
@@ -130,10 +132,10 @@ def test_static_and_sliding_are_one_continuous_law(solver):
 @solvers
 def test_two_rough_walls_act_one_after_the_other(solver):
     """In a corner both frictions hold; a vertex that rests in it does not move."""
-    wall = ds.HalfSpace([-resting_gap(5.0), 0, 0], [1, 0, 0], stiffness=1e4, friction=0.6)
+    wall = ds.HalfSpace([-resting_gap(5.0), 0, 0], [1, 0, 0], stiffness=1e4, width=0.01, friction=0.6)
     scene = points(
         tetrahedron(resting_gap(G)),
-        [ds.Ground(stiffness=1e4, friction=0.6), wall],
+        [ds.Ground(stiffness=1e4, width=0.01, friction=0.6), wall],
         terms=[ds.Gravity([-5.0, -G, 2.0])],
         fixed=[1, 2, 3],
     )

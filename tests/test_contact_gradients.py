@@ -183,7 +183,7 @@ def bounces(solver, speed: float):
         ds.LinearElastic(1e-6, 0.0),
         4 / one.volume,
         fixed=np.arange(3, 4 * n, 4),
-        terms=[ds.Ground(stiffness=1e4)],
+        terms=[ds.Ground(stiffness=1e4, width=0.01)],
         initial_velocities=[0, -speed, 0],
     )
     return scene

@@ -79,7 +79,7 @@ def test_without_friction_and_damping_energy_stays(solver):
     across = np.linalg.svd(rail[None])[2][1:]
     scene = points(
         mesh,
-        ds.Ground(stiffness=1e5),
+        ds.Ground(stiffness=1e5, width=0.01),
         initial_velocities=0.5 * rail,
         precision="f64",
         fixed=dict(beads=across, apex="xyz"),

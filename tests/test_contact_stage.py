@@ -128,7 +128,7 @@ def test_a_few_rounds_find_the_root(solver, precision, monkeypatch):
         explicit_kernels.cache_clear()
         for gap, speed, damping in ((0.0088, 0.0, 1.0), (0.0088, 0.0, 0.005), (0.02, 1.0, 0.005), (0.02, 4.0, 1.0)):
             mesh = ds.TetrahedralMesh.create_box(3, size=0.2, origin=(0, gap, 0))
-            law, terms = ds.StableNeoHookean(1e5, 0.3), [ds.Gravity(), ds.Drag(5.0), ds.Ground()]
+            law, terms = ds.StableNeoHookean(1e5, 0.3), [ds.Gravity(), ds.Drag(5.0), ds.Ground(width=0.01)]
             scene = ds.Scene(mesh, law, terms=terms, initial_velocities=(0, -speed, 0), precision=precision)
             ends.append(ds.Rollout(solver(scene, dt=1e-3, contact_damping=damping), 150).forward().positions[-1])
     explicit_kernels.cache_clear()
@@ -141,7 +141,9 @@ def test_no_speed_is_too_large(solver, dt):
     """The table of speeds that a force cannot hold beyond 3.7 m/s, and at long steps not at all: the damped stage can."""
     for speed in (1.0, 4.0, 16.0):
         scene = points(
-            tetrahedron(0.3 * speed * dt + 0.03), ds.Ground(stiffness=1e4), initial_velocities=[0.1, -speed, 0]
+            tetrahedron(0.3 * speed * dt + 0.03),
+            ds.Ground(stiffness=1e4, width=0.01),
+            initial_velocities=[0.1, -speed, 0],
         )
         own = solver(scene, dt=dt, contact_damping=1.0, allow_unstable=True)
         frames = ds.Rollout(own, max(3, int(0.1 / speed / dt)), save_every=1).forward()
@@ -214,7 +216,7 @@ def test_at_rest_friction_holds_what_coulomb_holds(solver, damping):
     mesh = tetrahedron(resting_gap(G * np.cos(angle)))
     mesh = ds.TetrahedralMesh(mesh.vertices @ turn.T, mesh.tetrahedra)
     for friction, slides in ((0.52, False), (0.48, True)):
-        plane = ds.HalfSpace(normal=n, stiffness=1e4, friction=friction, friction_speed=1e-4)
+        plane = ds.HalfSpace(normal=n, stiffness=1e4, width=0.01, friction=friction, friction_speed=1e-4)
         scene = points(mesh, plane, terms=[ds.Gravity(-G)])
         frames = ds.Rollout(solver(scene, dt=1e-3, contact_damping=damping), 1000).forward()
         way = (frames.positions[-1] - frames.positions[0])[:3] @ down
@@ -337,7 +339,7 @@ def test_every_shape(name):
     ],
 )
 def test_refused(options, message):
-    scene = points(tetrahedron(0.1), ds.Ground(stiffness=1e4))
+    scene = points(tetrahedron(0.1), ds.Ground(stiffness=1e4, width=0.01))
     with pytest.raises(ValueError, match=message):
         ds.SemiImplicitSolver(scene, dt=1e-3, **options)
 
@@ -345,7 +347,7 @@ def test_refused(options, message):
 def test_options_go_along():
     """A solver made anew for another scene keeps how it treats contact."""
     force = with_options(ds.VelocityVerletSolver, contact="force")(
-        points(tetrahedron(0.1), ds.Ground(stiffness=1e4)), dt=1e-3
+        points(tetrahedron(0.1), ds.Ground(stiffness=1e4, width=0.01)), dt=1e-3
     )
     assert ds.VelocityVerletSolver(force.scene, dt=1e-3).stages_contact and not force.stages_contact
     rollout = ds.Rollout(ds.SemiImplicitSolver(force.scene, dt=1e-3, contact_damping=0.7), 2).with_scene(

@@ -37,6 +37,13 @@ def test_an_old_argument_is_the_new_one(function, old, new):
         function(**{old: "rope", new: "rope"})
 
 
+def test_a_backend_was_an_arch():
+    with pytest.warns(DeprecationWarning, match="init: argument 'arch' is called 'backend';") as caught:
+        with pytest.raises(ValueError, match="backend must be one of cpu, cuda, vulkan, got 'metal'"):
+            ds.init(arch="metal")
+    assert caught[0].filename == __file__
+
+
 def test_an_obstacle_of_users_may_say_its_kernels_by_the_old_name():
     with pytest.warns(DeprecationWarning, match="Ball.twin is called counterpart;") as caught:
 

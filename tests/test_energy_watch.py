@@ -92,7 +92,7 @@ WORK = {
         ],
         ABOVE,
     ),
-    "a belt": lambda: body([ds.Gravity(), ds.Ground(0.0, 2e3, friction=0.5, path=PLATE)], ABOVE),
+    "a belt": lambda: body([ds.Gravity(), ds.Ground(0.0, 2e3, width=0.01, friction=0.5, path=PLATE)], ABOVE),
 }
 
 
@@ -130,7 +130,9 @@ def test_what_a_steady_muscle_makes_unstable_is_a_gain(kind):
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_obstacles_as_a_force_count_too(friction):
     run = simulator(
-        body([ds.Gravity(), ds.Ground(0.0, 2e3, friction=friction, path=PLATE)], ABOVE), 0.15, contact="force"
+        body([ds.Gravity(), ds.Ground(0.0, 2e3, width=0.01, friction=friction, path=PLATE)], ABOVE),
+        0.15,
+        contact="force",
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -141,7 +143,9 @@ def test_obstacles_as_a_force_count_too(friction):
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_a_bounce_at_the_usual_step_is_not_blamed(precision):
-    scene = body([ds.Gravity(), ds.Ground(0.0, None)], ABOVE, precision=precision, initial_velocities=[0.5, -2, 0])
+    scene = body(
+        [ds.Gravity(), ds.Ground(0.0, None, width=0.01)], ABOVE, precision=precision, initial_velocities=[0.5, -2, 0]
+    )
     run = simulator(scene, 0.7)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -168,7 +172,7 @@ def test_what_is_done_between_steps_is_outside_the_balance():
 
 
 def test_looks_change_no_bit():
-    scene = body([ds.Gravity(), ds.Ground(0.0, None, friction=0.3), ds.Drag(1.0)], ABOVE, precision="f32")
+    scene = body([ds.Gravity(), ds.Ground(0.0, None, width=0.01, friction=0.3), ds.Drag(1.0)], ABOVE, precision="f32")
     ends = []
     for every in (20, 10**9):
         run = simulator(scene, 0.7, every=every)
@@ -204,7 +208,7 @@ def test_self_contact_is_counted():
         ds.TetrahedralMesh.joined(blocks),
         SOFT,
         1000.0,
-        [ds.Gravity(), ds.Ground(0.0, 200.0), ds.SelfContact(200.0, 0.01)],
+        [ds.Gravity(), ds.Ground(0.0, 200.0, width=0.01), ds.SelfContact(200.0, 0.01)],
         initial_velocities=[0, -1, 0],
         precision="f64",
     )
@@ -241,14 +245,17 @@ SWINGING = dict(initial_velocities=0.3 * np.sin(20 * MESH.vertices[:, [1, 2, 0]]
 ALONE = dict(  # terms and options of scenes in which energy is taken or given in one way
     free=([], SWINGING),
     drag=([ds.Drag(5.0)], SWINGING),
-    friction=([ds.Gravity(), ds.Ground(-0.004, friction=0.5, stiffness_per_area=1e6)], SLIDING),
+    friction=([ds.Gravity(), ds.Ground(-0.004, friction=0.5, stiffness_per_area=1e6, width=0.01)], SLIDING),
     fluid=([ds.SurfaceDrag(500.0)], SLIDING),
     traction=([ds.Traction((50.0, 0, 0), "xmax")], dict(fixed="xmin")),
     pressure=([ds.Pressure(lambda t: 1e4 * t)], dict(fixed="xmin")),
     muscle=([ds.Muscle((1, 0, 0), 2e3, lambda t: min(1, 20 * t))], {}),
     supports=([ds.Gravity()], dict(fixed="xmin", motion=lambda t: (0, 0.01 * np.sin(60 * t), 0))),
     rollers=([ds.Gravity()], dict(fixed={"xmin": "x"}, motion=lambda t: (0.01 * np.sin(60 * t), 0, 0))),
-    wall=([ds.HalfSpace((0, -0.02, 0), (0, 1, 0), stiffness_per_area=1e6, path=lambda t: (0, 0.5 * t, 0))], {}),
+    wall=(
+        [ds.HalfSpace((0, -0.02, 0), (0, 1, 0), stiffness_per_area=1e6, width=0.01, path=lambda t: (0, 0.5 * t, 0))],
+        {},
+    ),
 )
 ALL_AT_ONCE = "drag friction traction muscle supports"
 LARGEST_DRIFT = {  # share of the energy that moves, of substeps of 1e-4 s, and of 1e-3 s in implicit steps

@@ -79,7 +79,7 @@ def test_it_does_not_matter_where_a_scene_is(kind, place, vertices_alone):
 
 
 def test_near_the_origin_nothing_is_taken_from_places():
-    made = scene(ds.Ground(-0.5, stiffness=1.0), mesh=MESH.translated((5.0, 0.0, -5.0)))
+    made = scene(ds.Ground(-0.5, stiffness=1.0, width=0.01), mesh=MESH.translated((5.0, 0.0, -5.0)))
     assert not made.origin.any() and made.inputs.derive(made.inputs.values).parameters[0] == -0.5
     assert not moved(made.replace(precision="f64"), FAR).origin.any()
 
@@ -136,15 +136,20 @@ SINGLE, SINGLE_TENSOR = (np.float32, np.float64), (torch.float32, torch.float64)
 # what makes it, and from what: what float32 does not resolve, and the remedy
 CASES = {
     "a start far from the mesh": (lambda o: scene(initial_positions=THERE.vertices, **o), *F32),
-    "the earth": (lambda o: scene(ds.Sphere([0, -6.4e6 - 0.1, 0], 6.4e6, stiffness=1.0), **o), *F32),
+    "the earth": (lambda o: scene(ds.Sphere([0, -6.4e6 - 0.1, 0], 6.4e6, stiffness=1.0, width=0.01), **o), *F32),
     "a rail": (
-        lambda o: scene(ds.Cylinder(BELOW - [1e6, 0, 0], BELOW + [1e6, 0, 0], 1.0, stiffness=1.0), mesh=THERE, **o),
+        lambda o: scene(
+            ds.Cylinder(BELOW - [1e6, 0, 0], BELOW + [1e6, 0, 0], 1.0, stiffness=1.0, width=0.01), mesh=THERE, **o
+        ),
         *F32,
     ),
-    "a turn": (lambda c: scene(ds.Box(BELOW, path=STILL, about=c, stiffness=1.0), mesh=THERE), None, BELOW),
+    "a turn": (lambda c: scene(ds.Box(BELOW, path=STILL, about=c, stiffness=1.0, width=0.01), mesh=THERE), None, BELOW),
     "a shape of one's own": (lambda o: scene(Ring(BELOW, 0.1, 0.05, stiffness=1.0), mesh=THERE, **o), *F32),
     "a start": (lambda kind: scene(mesh=THERE, initial_positions=THERE.vertices.astype(kind)), *SINGLE),
-    "a sphere": (lambda kind: scene(ds.Sphere(BELOW.astype(kind), 1.0, stiffness=1.0), mesh=THERE), *SINGLE),
+    "a sphere": (
+        lambda kind: scene(ds.Sphere(BELOW.astype(kind), 1.0, stiffness=1.0, width=0.01), mesh=THERE),
+        *SINGLE,
+    ),
     "an anchor": (
         lambda kind: scene(ds.Spring(0, ds.Anchor(torch.tensor(BELOW, dtype=kind)), 1.0), mesh=THERE),
         *SINGLE_TENSOR,

@@ -344,7 +344,7 @@ def test_a_block_dropped_on_the_ground_comes_to_rest_above_it(solver, precision)
     scene = ds.Scene(
         mesh,
         ds.StableNeoHookean(1e5, 0.4),
-        terms=[ds.Gravity(), ds.Ground(stiffness=1e5), ds.Drag(1.0)],
+        terms=[ds.Gravity(), ds.Ground(stiffness=1e5, width=0.01), ds.Drag(1.0)],
         precision=precision,
     )
     frames = ds.Rollout(solver(scene, dt=1e-2), 150, save_every=1).forward()

@@ -570,6 +570,22 @@ def test_names_that_are_refused():
             ds.Ground(-1.0, stiffness=1e4, name=name)
 
 
+def test_an_input_of_a_term_with_a_name_is_answered_by_that_name():
+    of = scene(terms=[ds.Ground(-1.0, stiffness=1e4, name="floor"), ds.Gravity()])
+    said = "'ground_height' is here called 'floor.height', for a term has the name 'floor'"
+    rollout = ds.Rollout(ds.SemiImplicitSolver(of, dt=1e-4), 1)
+    for call in (
+        lambda: rollout.forward(ground_height=0.0),
+        lambda: ds.Rollout(rollout.solver, 1, gradients=["ground_height"]),
+        lambda: rollout.field("ground_height"),
+        lambda: ds.Batch(rollout.solver, 1, scenes=2).forward(ground_height=[0.0, 1.0]),
+    ):
+        with pytest.raises(ValueError, match=said):
+            call()
+    with pytest.raises(ValueError, match="no input named 'grund_height'; this rollout has [^:]*$"):
+        rollout.forward(grund_height=0.0)
+
+
 def test_names_without_and_with():
     """A term with a name does not count among those that are numbered."""
     of = scene(

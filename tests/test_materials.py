@@ -555,8 +555,8 @@ def test_numbers_may_be_uniform_per_tetrahedron_or_per_set():
         (lambda: StableNeoHookean(), r"got \(nothing\)"),
         (lambda: StableNeoHookean(E, 0.3, mu=1.0, lam=1.0), r"needs exactly one of"),
         (lambda: StableNeoHookean(E, 0.3, E=2.0), r"youngs_modulus is given twice"),
-        (lambda: StableNeoHookean(E, 0.3, 0.4), r"at most two numbers"),
-        (lambda: StableNeoHookean(E, nuu=0.3), r"no parameter is called 'nuu'"),
+        (lambda: StableNeoHookean(E, 0.3, 0.4), r"StableNeoHookean takes at most 2 arguments without a name, got 3"),
+        (lambda: StableNeoHookean(E, nuu=0.3), r"StableNeoHookean has no argument 'nuu'; did you mean 'nu'\?"),
         (lambda: StableNeoHookean(mu=-1.0, lam=1.0), r"mu must be > 0"),
         (lambda: StableNeoHookean(mu=3.0, lam=-2.5), r"bulk modulus lam \+ 2/3 mu must be > 0"),
         (lambda: StableNeoHookean(E, 0.3, J_floor=0.0), r"J_floor must lie in \(0, 1\), got 0"),
@@ -572,7 +572,7 @@ def test_numbers_may_be_uniform_per_tetrahedron_or_per_set():
     ],
 )
 def test_wrong_numbers_are_refused_with_rule_value_and_remedy(build, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((ValueError, TypeError), match=words):
         build()
 
 

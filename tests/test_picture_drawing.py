@@ -191,7 +191,7 @@ def test_the_nearer_triangle_is_seen_and_colours_are_linear_in_space():
 
 
 def test_obstacles_of_a_scene_by_type(cube):
-    floor, ball = ds.Ground(-0.25, stiffness=1e4), ds.Sphere((0, 0, 0), 0.5)
+    floor, ball = ds.Ground(-0.25, stiffness=1e4, width=0.01), ds.Sphere((0, 0, 0), 0.5)
     scene = SimpleNamespace(terms=[ds.Gravity(), floor, ball], mesh=cube)
     assert obstacles.floor_of(scene) == -0.25
     ((points, _),) = obstacles.obstacle_surfaces(scene)

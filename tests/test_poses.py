@@ -30,7 +30,7 @@ def slid(solver, path, frames, normal=(0, 1, 0), velocity=None) -> tuple[np.ndar
     mesh = ds.TetrahedralMesh(
         rotations.turned(rotations.quaternion(turn), mesh.vertices) + gap * np.array(normal), mesh.tetrahedra
     )
-    floor = ds.HalfSpace((0, 0, 0), normal, stiffness=k, friction=MU, friction_speed=CREEP, path=path)
+    floor = ds.HalfSpace((0, 0, 0), normal, stiffness=k, width=0.01, friction=MU, friction_speed=CREEP, path=path)
     start = np.zeros((4, 3))
     if velocity is not None:
         start[:3] = velocity(mesh.vertices[:3])
@@ -161,7 +161,7 @@ def test_a_pose_that_does_not_turn_is_a_displacement():
         ("path", lambda t: [0.5 * t, -0.2 * t, 0]),
     ):
         mesh = ds.TetrahedralMesh.create_box(2, 0.1)
-        terms = [ds.Gravity(), ds.Ground(-0.004, stiffness_per_area=2e6, friction=0.4, path=path)]
+        terms = [ds.Gravity(), ds.Ground(-0.004, stiffness_per_area=2e6, width=0.01, friction=0.4, path=path)]
         scene = ds.Scene(
             mesh, ds.StableNeoHookean(1e5, 0.3), terms=terms, precision="f64", initial_velocities=(0.3, -1, 0)
         )
@@ -208,7 +208,7 @@ def test_keyframes():
 def test_obstacles_are_drawn_turned():
     mesh = ds.TetrahedralMesh.create_box(2, 0.1, origin=(0, 1, 0))
     floor = ds.Ground(path=lambda t: [0, 0, 0, 0, 0, t])
-    box = ds.Box((-4.0, 0, 0), 0.1, stiffness=1.0, path=lambda t: [0, t, 0, 0, 0, t], about=(1.0, 0, 0))
+    box = ds.Box((-4.0, 0, 0), 0.1, stiffness=1.0, width=0.01, path=lambda t: [0, t, 0, 0, 0, t], about=(1.0, 0, 0))
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), box, floor])
     (solid, _), (square, _) = obstacle_surfaces(scene, np.pi / 2)
     assert np.abs(square[:, 0]).max() < 1e-12 and np.abs(square[:, 1]).max() > 0.1
@@ -253,7 +253,9 @@ def test_a_tensor_of_poses_has_gradients_and_is_drawn():
     torch = pytest.importorskip("torch")
     from diffsim_ti.torch_bridge.rollout_node import rollout_frames
 
-    floor = ds.Ground(-0.009, stiffness_per_area=2e5, friction=0.4, path=lambda t: [0, 0, 0, 1, 0, 0, 0], name="floor")
+    floor = ds.Ground(
+        -0.009, stiffness_per_area=2e5, width=0.01, friction=0.4, path=lambda t: [0, 0, 0, 1, 0, 0, 0], name="floor"
+    )
     mesh = ds.TetrahedralMesh.create_box(2, 0.1)
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), floor], precision="f64")
     run = ds.Rollout(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=4), 20)

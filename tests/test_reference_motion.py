@@ -631,7 +631,7 @@ def test_weight_at_rest_on_the_ground(solver, mass, gap):
         mesh,
         ds.StableNeoHookean(E, 0.3),
         3 * mass / mesh.volume,
-        terms=[ds.Gravity(-G), ds.Drag(20.0), ds.Ground(stiffness=1e4)],
+        terms=[ds.Gravity(-G), ds.Drag(20.0), ds.Ground(stiffness=1e4, width=0.01)],
     )
     dt = 0.3 * solver(scene, dt=1e-9).stable_dt().dt
     end = ds.Rollout(solver(scene, dt=dt, allow_unstable=True), int(4 / dt)).forward()
@@ -648,7 +648,7 @@ def test_barrier_bounce(solver, v, d_min, omega):
         mesh,
         ds.LinearElastic(1e-6, 0.0),
         4 / mesh.volume,
-        terms=[ds.Ground(stiffness=1e4)],
+        terms=[ds.Ground(stiffness=1e4, width=0.01)],
         initial_velocities=[0, -v, 0],
     )
     dt = 0.05 / omega
@@ -677,7 +677,9 @@ def test_block_bounces_without_losing_energy(solver):
 
 
 def test_energy_adds_up():
-    scene = oscillator(0.3, terms=[ds.Gravity(), ds.Ground(stiffness=1e4, height=-1.0)], initial_velocities=[0.5, 0, 0])
+    scene = oscillator(
+        0.3, terms=[ds.Gravity(), ds.Ground(stiffness=1e4, width=0.01, height=-1.0)], initial_velocities=[0.5, 0, 0]
+    )
     energy = ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-3)).compute_energy()
     m, mu, volume = masses(scene)[3], E / 2.6, scene.mesh.volume
     assert energy.parts["kinetic"] == pytest.approx(0.5 * m * 0.25, rel=1e-14)

@@ -76,7 +76,7 @@ def test_use_before_init_starts_the_stated_default():
 def test_init_refuses_what_is_not_there():
     out = python("""
         import diffsim_ti as ds
-        for arguments in (dict(arch="metal"), dict(precision="half"), dict(default_fp=1)):
+        for arguments in (dict(backend="metal"), dict(precision="half"), dict(default_fp=1)):
             try:
                 ds.init(**arguments)
             except ValueError as error:
@@ -88,7 +88,7 @@ def test_init_refuses_what_is_not_there():
             print(error)
     """)
     lines = out.splitlines()
-    assert lines[0] == "arch must be one of cpu, cuda, vulkan, got 'metal'"
+    assert lines[0] == "backend must be one of cpu, cuda, vulkan, got 'metal'"
     assert lines[1] == "precision must be 'f32' or 'f64', got 'half'"
     assert lines[2].startswith("default_fp cannot be chosen: diffsim_ti needs default_fp=f64")
     assert lines[3].startswith("the cuda backend is not available here (available: cpu")

@@ -93,7 +93,7 @@ REFUSED = {
     "two self-contacts": (lambda: scene(terms=[ds.SelfContact()] * 2), "a scene takes one SelfContact"),
     "gravity's shape": (
         lambda: ds.Gravity([1, 2]),
-        r"acceleration must be a number \(along y\) or 3 numbers, got shape \(2,\)",
+        r"acceleration must be a number \(along up\) or 3 numbers, got shape \(2,\)",
     ),
     "gravity nan": (lambda: ds.Gravity(np.nan), "Gravity: gravity must be finite"),
     "drag negative": (lambda: ds.Drag(-1.0), r"Drag: rate must be one number >= 0 \[1/s\], got -1"),

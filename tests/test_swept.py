@@ -165,7 +165,7 @@ def test_distances_of_faces_are_those_of_geometry():
         exact = distance_to_segment(t, start, end).min() - radius
         if exact <= 0.002:
             continue
-        scene = ds.Scene(mesh, SOFT, terms=[ds.Capsule(start, end, radius, stiffness=1e3)], precision="f64")
+        scene = ds.Scene(mesh, SOFT, terms=[ds.Capsule(start, end, radius, stiffness=1e3, width=0.01)], precision="f64")
         solver = ds.ImplicitEulerSolver(scene)
         way = CollisionDetection(solver.workspace(solver.start_values()).arrays, False)
         u, places = np.zeros((mesh.num_vertices, 3)), np.zeros((1, 3))
@@ -193,7 +193,11 @@ def test_a_state_from_outside_is_looked_at_between_its_vertices():
 
 def test_errors_name_the_step_of_the_simulator():
     scene = ds.Scene(
-        cube(2), SOFT, terms=[ds.Ground(-0.03, stiffness=1e4)], initial_velocities=(0, -1, 0), precision="f64"
+        cube(2),
+        SOFT,
+        terms=[ds.Ground(-0.03, stiffness=1e4, width=0.01)],
+        initial_velocities=(0, -1, 0),
+        precision="f64",
     )
     simulator = ds.Simulator(ds.ImplicitEulerSolver(scene, dt=1e-2, substeps=2, max_iterations=1))
     with pytest.raises(ds.NotConverged) as error:

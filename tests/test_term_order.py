@@ -262,7 +262,7 @@ def test_kernels_of_a_state_do_not_know_what_else_acts():
     """Energies, forces and distances of a law before a floor are the same kernels whatever else moves the body."""
     mesh, floor = (
         ds.TetrahedralMesh.create_box(2, 0.1).translated([0, 0.004, 0]),
-        ds.Ground(stiffness=1e3, friction=0.3),
+        ds.Ground(stiffness=1e3, width=0.01, friction=0.3),
     )
     others = [], [ds.Gravity()], [ds.Drag(0.5), ds.Gravity(), ds.Muscle((0, 1, 0), 1e3, np.ones(3))]
     found = []
@@ -288,8 +288,8 @@ ALONE = {
     "fluid": lambda: dict(terms=[ds.SurfaceDrag(1000.0)], initial_velocities=(1.0, 0, 0)),
     "rotating frame": lambda: dict(terms=[ds.RotatingFrame((0, 3.0, 0))]),
     "self-contact": lambda: dict(terms=[ds.SelfContact(stiffness=10.0, width=1e-3)]),
-    "floor": lambda: dict(terms=[ds.Ground(-0.005, stiffness=100.0, friction=0.2)]),
-    "moving floor": lambda: dict(terms=[ds.Ground(-0.005, stiffness=100.0, path=KEYS)]),
+    "floor": lambda: dict(terms=[ds.Ground(-0.005, stiffness=100.0, width=0.01, friction=0.2)]),
+    "moving floor": lambda: dict(terms=[ds.Ground(-0.005, stiffness=100.0, width=0.01, path=KEYS)]),
     "clamp": lambda: dict(fixed="xmin"),
     "rollers": lambda: dict(fixed={"xmin": "x"}),
     "moving clamp": lambda: dict(fixed="xmin", motion=KEYS),

@@ -607,7 +607,7 @@ def test_wrong_shapes_and_types_name_expected_and_got():
         (lambda: simulator(E=-1.0), "(?i)young"),
         (lambda: simulator(nu=0.5), "(?i)poisson"),
         (lambda: simulator(density=torch.tensor(-1.0)), "density must be > 0"),
-        (lambda: simulator(contact="floor"), "contact must be None, False or a DifferentiableBarrierContact"),
+        (lambda: simulator(contact="floor"), 'contact must be "ground", False or a DifferentiableBarrierContact'),
         (lambda: simulator(dt=0.0), "dt must be > 0"),
         (lambda: simulator(damping=1.5), "damping is the share of velocity kept"),
         (lambda: DifferentiableMaterial(1e5, 0.3, E=1e5), "exactly one of its spellings"),

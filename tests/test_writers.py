@@ -197,7 +197,7 @@ def test_results_of_a_rollout_are_written(tmp_path):
     scene = ds.Scene(
         TetrahedralMesh.create_cube(3),
         ds.StableNeoHookean(1e5, 0.3),
-        terms=[ds.Gravity(), ds.Ground(-0.005, 1e4)],
+        terms=[ds.Gravity(), ds.Ground(-0.005, 1e4, width=0.01)],
         precision="f64",
     )
     named = [ds.ContactForce(scene.terms[1], per_vertex=True), ds.ContactForce(scene.terms[1], name="sum"), ds.Stress()]

@@ -13,9 +13,12 @@ from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeAdapter
 from diffsim_ti.common.checked import as_numbers, instance, whole
 from diffsim_ti.common.copies import made_again
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import positions_of
+from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mesh.collision_surface import BOWED
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
@@ -27,7 +30,7 @@ from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
 
 
-class Batch:
+class Batch(metaclass=Public):
     """`scenes` runs of a solver's scene simultaneously, with numbers of their own where they are given with a leading axis.
 
     solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.
@@ -118,7 +121,7 @@ class Batch:
 
     # ---- forward -----------------------------------------------------------------------------------------------------
 
-    def forward(self, raise_errors: bool = False, **inputs: ArrayLike) -> BatchFrames:
+    def forward(self, raise_errors: bool = False, **inputs: InputValue) -> BatchFrames:
         """Run all scenes, with some inputs replaced. raise_errors: raise what stopped the first one that died."""
         inputs = spread_shape(inputs, self.one.values)
         inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
@@ -223,7 +226,11 @@ class Batch:
     # ---- gradients ---------------------------------------------------------------------------------------------------
 
     def vjp(
-        self, frames: BatchFrames, positions: ArrayLike | None = None, velocities: ArrayLike | None = None, **seeds
+        self,
+        frames: BatchFrames,
+        positions: ArrayLike | None = None,
+        velocities: ArrayLike | None = None,
+        **seeds: ArrayLike | None,
     ) -> dict[str, np.ndarray]:
         """Gradients of a loss by every wanted input, from its gradients by outputs of all scenes, (scenes, ...)."""
         instance("Batch.vjp", "frames", frames, BatchFrames, "what forward returned")
@@ -231,7 +238,7 @@ class Batch:
         given = {name: as_numbers(f"gradient by the frames' {name}", x) for name, x in seeds.items() if x is not None}
         for name, x in given.items():
             if name not in self.outputs:
-                raise ValueError(f"no output named {name!r}; this batch has {', '.join(self.outputs)}")
+                raise ValueError(no_such("output", name, self.outputs, "this batch"))
             shape = (self.num_scenes, *self.outputs[name].shape(self.num_frames))
             if x.shape != shape:
                 raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {x.shape}")
@@ -304,13 +311,13 @@ class Batch:
 
     # ---- tangents ----------------------------------------------------------------------------------------------------
 
-    def tangents(self, frames: BatchFrames, **tangents: ArrayLike) -> dict[str, np.ndarray]:
+    def tangents(self, frames: BatchFrames, **tangents: InputValue) -> dict[str, np.ndarray]:
         """Changes of all outputs, (scenes, ...), for changes of inputs, to first order, float64; zero, with a warning, of
         scenes that did not come to their end."""
         tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
-            raise ValueError(f"tangents: no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
+            raise ValueError(f"tangents: {self.scene.inputs.no_input(unknown[0], 'this batch', self.inputs)}")
         instance("Batch.tangents", "frames", frames, BatchFrames, "what forward returned")
         zero = {name: np.zeros_like(value_of(frames.values[name], 0)) for name in tangents}
         tangents, _ = spread_given(self.scene, tangents, zero, self.num_scenes)

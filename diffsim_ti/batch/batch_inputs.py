@@ -26,7 +26,7 @@ def checked_values(one: Rollout, given: dict, scenes: int) -> dict:
     inputs, out = one.scene.inputs, BatchValues(one.values)
     unknown = [name for name in given if name not in one.inputs]
     if unknown:
-        raise ValueError(f"no input named {unknown[0]!r}; this batch has {', '.join(one.inputs)}")
+        raise ValueError(one.scene.inputs.no_input(unknown[0], "this batch", one.inputs))
     for name, value in given.items():
         inputs.warn_if_coarse(name, value)
         if isinstance(value, Own) or _is_own(one, name, value := as_numbers(name, value), scenes):

@@ -1,13 +1,15 @@
 """Saved states of many scenes."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import as_numbers
+from diffsim_ti.common.names import no_such
+from diffsim_ti.common.public import Public
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.watch import ContactResolution
@@ -37,7 +39,7 @@ class LazyFrames(Sequence):
         return list, (list(self),)
 
 
-class BatchFrames(Sequence):
+class BatchFrames(Sequence, metaclass=Public):
     """Saved states of many scenes: positions [m], velocities [m/s], displacements [m], (scenes, frames, n, 3).
 
     `frames[b]` are those of scene b (`Frames`), `frames["name"]` any output of all scenes, (scenes, ...). alive: (scenes,),
@@ -76,12 +78,21 @@ class BatchFrames(Sequence):
         own += [f"outputs={brief(self.outputs)}"] * bool(self.outputs) + [f"{dead} stopped before the end"] * bool(dead)
         return f"BatchFrames({', '.join(own)})"
 
+    @overload
+    def __getitem__(self, key: str) -> np.ndarray: ...
+
+    @overload
+    def __getitem__(self, key: int) -> Frames: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> Sequence[Frames]: ...
+
     def __getitem__(self, key):
         if isinstance(key, str):
             known = dict(positions=self.positions, velocities=self.velocities, displacements=self.displacements)
             known |= self.outputs
             if key not in known:
-                raise KeyError(f"no output named {key!r}; there are {', '.join(known)}")
+                raise KeyError(no_such("output", key, known, "this run"))
             return known[key]
         return self._frames[key]
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -83,6 +84,16 @@ def as_numbers(name: str, value) -> np.ndarray:
         return array.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be numbers, got {shown(value)}") from None
+
+
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+def upwards(owner: str, up: Up) -> tuple[int, int]:
+    """(axis, sign) of the direction that points up."""
+    if not isinstance(up, str) or up not in get_args(Up):
+        raise ValueError(f"{owner}: up must be one of {', '.join(map(repr, get_args(Up)))}, got {shown(up)}")
+    return "xyz".index(up[-1]), -1 if up[0] == "-" else 1
 
 
 def wholes(name: str, value) -> np.ndarray:

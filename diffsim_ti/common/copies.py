@@ -2,13 +2,15 @@
 
 from collections.abc import Mapping
 
+from diffsim_ti.common.public import Public
+
 
 def made_again(kind: type, arguments: dict):
     """kind(**arguments)"""
     return kind(**arguments)
 
 
-class MadeAgain:
+class MadeAgain(metaclass=Public):
     """What is copied by the `arguments` of its constructor, in its precision. Raises TypeError for functions that another
     process cannot import."""
 
@@ -33,7 +35,7 @@ def check_functions(owner: str, **given) -> None:
                 )
 
 
-class CarriesMore(Exception):
+class CarriesMore(Exception, metaclass=Public):
     """An error or warning whose constructor takes more than its message."""
 
     def __reduce__(self):

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.public import Public, public
+
 
 @dataclass
 class TaylorResult:
@@ -40,6 +42,7 @@ class TaylorResult:
         return float(max(np.min(rates[k : k + 3]) for k in range(max(len(rates) - 2, 1))))
 
 
+@public
 def taylor_test(
     f: Callable[[np.ndarray], float],
     x: ArrayLike,
@@ -75,7 +78,7 @@ def _taylor(epsilons: np.ndarray, values: list[float], f0: float, slope: float) 
     return TaylorResult(np.asarray(epsilons), remainders, floor)
 
 
-class CentralDifferences:
+class CentralDifferences(metaclass=Public):
     """f'(0) by central differences extrapolated in the square of their steps, and how far off the value may be.
 
     uncertainty: the sum of `spread`, the largest distance of the value to its three neighbours in Neville's table, where the
@@ -220,6 +223,7 @@ class CentralDifferences:
         return float("inf") if is_linear else found.best_rate
 
 
+@public
 def central_difference(f: Callable[[float], float], scale: float = 1.0) -> tuple[float, float]:
     """(f'(0), how far off it may be): central differences, extrapolated, until they are known to 1e-9.
 

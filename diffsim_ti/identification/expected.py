@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import public
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Experiment, Problem, is_experiment
@@ -37,6 +38,7 @@ class Expectation:
         return 0.5 * float(np.linalg.slogdet(self.information.covariance)[1])
 
 
+@public
 def expected(
     rollout: Experiment | Iterable[Experiment],
     data: Any,
@@ -69,6 +71,7 @@ def _complete(data, rollout: Experiment):
     return data
 
 
+@public
 def compare(
     rollout: Experiment, choices: dict, unknowns: dict, noise: ArrayLike | None = None, prior: dict | None = None
 ) -> dict[str, Expectation]:

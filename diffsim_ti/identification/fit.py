@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import shown
 from diffsim_ti.common.progress import progress as progress_bar
+from diffsim_ti.common.public import public
 from diffsim_ti.identification.descent import l_bfgs_b, torch_descent
 from diffsim_ti.identification.levenberg_marquardt import DENSE, levenberg_marquardt
 from diffsim_ti.identification.measurements import measurements
@@ -26,6 +27,7 @@ FAR, AT_MOST = 3.0, 4  # residuals over the noise beyond which further starts ar
 METHODS = {"Levenberg-Marquardt": levenberg_marquardt, "L-BFGS-B": l_bfgs_b}
 
 
+@public
 def identify(
     rollout: Rollout | ModalTest | Iterable[Rollout | ModalTest],
     data: Any,

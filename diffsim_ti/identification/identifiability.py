@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.common.public import public
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Rollout
 
 
@@ -35,8 +37,9 @@ class Identifiability:
     __repr__ = __str__
 
 
+@public
 def identifiability(
-    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values
+    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values: InputValue
 ) -> Identifiability:
     """Which inputs can be recovered from the frames' positions: eigenvalues and directions of the Fisher matrix J^T J.
 
@@ -52,7 +55,8 @@ def identifiability(
     columns, labels = [], []
     for name in names:
         if name not in frames.inputs:
-            raise ValueError(f"identifiability: no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
+            said = rollout.scene.inputs.no_input(name, "this rollout", rollout.inputs)
+            raise ValueError(f"identifiability: {said}")
         value = np.asarray(frames.inputs[name])
         if not np.any(value):
             raise ValueError(f"identifiability: {name} is zero, so that relative changes of it mean nothing")

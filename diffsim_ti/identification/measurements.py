@@ -5,12 +5,14 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import numbers, wholes
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import rounding_of
+from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.rollout import Frames, Rollout
 
 
-class Measurement:
+class Measurement(metaclass=Public):
     """Values d of an output y of a rollout, with independent normal noise of standard deviation `noise`.
 
     output: "positions", "velocities", "displacements" or the name of one of the rollout's outputs. values: NaN where a
@@ -55,7 +57,7 @@ class Measurement:
     def check(self, rollout: Rollout) -> None:
         """Raise ValueError unless this is a measurement of that rollout."""
         if self.output not in rollout.outputs:
-            raise ValueError(f"data: no output named {self.output!r}; this rollout has {', '.join(rollout.outputs)}")
+            raise ValueError("data: " + no_such("output", self.output, rollout.outputs, "this rollout"))
         shape = list(rollout.outputs[self.output].shape(rollout.num_frames))
         if self.at is not None:
             shape[1] = len(self.at)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.common.checked import instance, whole
+from diffsim_ti.common.public import Public
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.scene import Scene
 
@@ -19,7 +21,7 @@ class _Frequencies:
         return (self.k,)
 
 
-class ModalTest:
+class ModalTest(metaclass=Public):
     """An experiment for `identify` whose data are the k lowest frequencies [Hz] of small vibrations about the rest shape.
 
         r_i = (f_i(x) - d_i) / noise,        df = phi . (dK - lambda dM) phi / (8 pi^2 f)    (`modes`, in float64)
@@ -55,7 +57,7 @@ class ModalTest:
     def __repr__(self) -> str:
         return f"ModalTest({self.scene!r}, {self.k})"
 
-    def forward(self, **values) -> Modes:
+    def forward(self, **values: InputValue) -> Modes:
         """The modes with some of the scene's numbers replaced."""
         return modes(self.scene, self.k, **values)
 
@@ -71,7 +73,7 @@ class ModalTest:
             rows[group[0]] = found.gradients(by)
         return rows[group[0]]
 
-    def tangents(self, found: Modes, **changes) -> dict[str, np.ndarray]:
+    def tangents(self, found: Modes, **changes: InputValue) -> dict[str, np.ndarray]:
         """{"frequencies": their change}, shape (k,), for changes of inputs; of a group that coincides its mean's."""
         out = np.zeros(self.k)
         for group in found.groups:

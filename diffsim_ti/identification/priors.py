@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.identification.unknowns import Free
 from diffsim_ti.mesh.geometry import inner_faces, triangle_normals
 
 
 @dataclass(frozen=True)
-class Normal:
+class Normal(metaclass=Public):
     """t is normal around t(mean) with this deviation: relative where an unknown is a logarithm (0.1 for ten per cent).
 
     Tarantola, Inverse Problem Theory, 2005, sec. 3.2, doi:10.1137/1.9780898717921.
@@ -24,7 +25,7 @@ class Normal:
 
 
 @dataclass(frozen=True)
-class Smooth:
+class Smooth(metaclass=Public):
     """Jumps of t across inner faces, weighted by the square root of the face's area over the mean, are normal.
 
     edges=True: total variation, smoothed: a jump costs 2 (sqrt(1 + z^2) - 1), z = jump / deviation, so that sharp edges

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import Public
 from diffsim_ti.identification.problem import Problem
 
 
@@ -86,7 +87,7 @@ class MeshCheck:
 
 
 @dataclass(repr=False)
-class Identification:
+class Identification(metaclass=Public):
     """What `identify` returns.
 
     estimates: {unknown: number or array}; covariance: of the numbers, in the order of `labels`, to first order;

@@ -7,12 +7,13 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import numbers, shape_of, shown
+from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
 
 TIME_OFFSET = "time_offset"  # of measurements with times of their own [s]
 
 
-class Unknown:
+class Unknown(metaclass=Public):
     """Numbers x of an input, found through free variables t in which no bound exists:
 
         logarithm  x = start exp(t)                      (default where start > 0)
@@ -82,8 +83,8 @@ class Free:
         if self.input == TIME_OFFSET:
             return np.zeros((), int)
         if self.input not in rollout.inputs:
-            known = ", ".join(rollout.inputs)
-            raise ValueError(f"{self.label}: no input named {self.input!r}; this rollout has {known}")
+            said = rollout.scene.inputs.no_input(self.input, "this rollout", rollout.inputs)
+            raise ValueError(f"{self.label}: {said}")
         if regions is None:
             shape = rollout.values[self.input].shape
             each = self.unknown.start.ndim > 0 and self.unknown.start.shape == shape

@@ -2,9 +2,20 @@
 
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.consistent_mass import ConsistentMass, Mass, diagonal_of, kinetic_energy
-from diffsim_ti.inputs.description import NOT_NEGATIVE, POSITIVE, Input, Range, RunSize
+from diffsim_ti.inputs.description import NOT_NEGATIVE, POSITIVE, Input, InputValue, Range, RunSize
 from diffsim_ti.inputs.inputs import Derived, Inputs
 from diffsim_ti.inputs.rest_shape import StressPoints, ratios_at_corners
 
-__all__ = ["Chain", "ConsistentMass", "Derived", "RunSize", "Input", "Inputs", "Link", "Mass", "NOT_NEGATIVE"]
+__all__ = [
+    "Chain",
+    "ConsistentMass",
+    "Derived",
+    "RunSize",
+    "Input",
+    "InputValue",
+    "Inputs",
+    "Link",
+    "Mass",
+    "NOT_NEGATIVE",
+]
 __all__ += ["POSITIVE", "Range", "StressPoints", "diagonal_of", "kinetic_energy", "ratios_at_corners"]

@@ -6,11 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import as_numbers, numbers
+from diffsim_ti.common.public import Public
 
 # lengths: numbers, or "vertices", "tetrahedra" of the mesh, "steps", "steps + 1" of a run
 Shape = tuple[int | str, ...]
+# of an input in the place of the scene's own: numbers of its shape, or {named set: number}
+InputValue = TypeAliasType("InputValue", ArrayLike | Mapping[str, ArrayLike])
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ NOT_NEGATIVE = Range("one number >= 0", _not_negative, in_runs=False)  # differe
 
 
 @dataclass(frozen=True, eq=False)
-class Input:
+class Input(metaclass=Public):
     """An input of a scene: a number or an array that a gradient can be asked for.
 
     name: of the argument that gives it. plain: the input's name where its term has none; default `name`.

@@ -1,12 +1,13 @@
 """The inputs of a scene: names, values, and what kernels read of them, with derivatives both ways."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import FAR, ROUNDING, far_part, warn_of_rounding
 from diffsim_ti.common.rows import Rows
 from diffsim_ti.inputs import links
@@ -80,7 +81,18 @@ class Inputs:
 
     `values`: dict of float64 arrays, read-only. Names: initial_positions, initial_velocities, the material's own inputs,
     density, rest_positions, and those of the terms. prescribed_motion and paths of obstacles join per run, sampled at its
-    steps. `described`: {name: Input}, those too.
+    steps. `described`: {name: Input}, those too. Going through it gives the names; printed it is a table of names, shapes,
+    units and, of single numbers, values.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3)).inputs
+    initial_positions   (8, 3)  m
+    initial_velocities  (8, 3)  m/s
+    youngs_modulus      ()      Pa      100000
+    poissons_ratio      ()      -       0.3
+    density             ()      kg/m^3  1000
+    rest_positions      (8, 3)  m
     """
 
     def __init__(
@@ -115,6 +127,21 @@ class Inputs:
         self.away = self._away()
         self.keyed = [(named[term][term.plain], term) for term in scene.ordered_terms if term.keyed]
         self.chain = Chain(self._links(named), self.described)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.described)
+
+    def __repr__(self) -> str:
+        rows = []
+        for name, i in self.described.items():
+            value = self.values.get(name)
+            shape = value.shape if value is not None else i.shapes[0]
+            words = f"({', '.join(map(str, shape))})"
+            rows.append(
+                (name, words, i.unit or "-", f"{float(value):g}" if value is not None and value.size == 1 else "")
+            )
+        wide = [max(len(row[k]) for row in rows) for k in range(3)]
+        return "\n".join("  ".join([*(x.ljust(n) for x, n in zip(row, wide)), row[3]]).rstrip() for row in rows)
 
     def _of_body(self, density, positions, velocities) -> list[Input]:
         """What every scene has: its start, its material's numbers, its density."""
@@ -231,6 +258,14 @@ class Inputs:
         """{own name: name here} of the inputs of term k of the scene's list."""
         return dict(self._names[k])
 
+    def no_input(self, name: str, owner: str, names: Iterable[str]) -> str:
+        """What to say of a name that no input of `owner` has; a term that has a name gives its inputs others."""
+        own = [(of[name], term.name) for of, term in zip(self._names, self.scene.terms) if term.name and name in of]
+        if not own:
+            return no_such("input", name, names, owner)
+        others = " or ".join(f"{new!r}, for a term has the name {word!r}" for new, word in own)
+        return f"no input named {name!r}; {owner} has {', '.join(names)}: {name!r} is here called {others}"
+
     def at_times(self, times: ArrayLike) -> dict[str, np.ndarray]:
         """The values of a run, with those that are sampled at its times [s]."""
         scene = self.scene
@@ -258,7 +293,7 @@ class Inputs:
         """Float64 arrays of the right shapes, or ValueError naming expected and got."""
         unknown = [name for name in values if name not in self.described]
         if unknown:
-            raise ValueError(f"no input named {unknown[0]!r}; this scene has {', '.join(self.described)}")
+            raise ValueError(self.no_input(unknown[0], "this scene", self.described))
         return {name: self.described[name].checked(name, value, self.sizes) for name, value in values.items()}
 
     def warn_if_coarse(self, name: str, given) -> None:

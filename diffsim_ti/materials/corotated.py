@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from diffsim_ti.materials.calculus.strains import StrainLaw
 from diffsim_ti.materials.linear_elastic import LinearElasticLaw as Small
-from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.two_moduli import TwoModuli
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class CorotatedLaw(StrainLaw):
     psi, slopes, curvature = Small.psi, Small.slopes, Small.curvature
 
 
-class Corotated(Material):
+class Corotated(TwoModuli):
     """psi = mu |S - I|^2 + lam/2 tr(S - I)^2, F = R S [J/m^3]; P = 2 mu (F - R) + lam tr(S - I) R [Pa].
 
     R is a rotation (det +1) for every F, so that inverted states are pushed back. The stress is finite everywhere; where

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.differentiation import exp, where
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.materials.sum_law import SumLaw
 from diffsim_ti.runtime import traced
 
@@ -79,7 +78,7 @@ class FibreReinforced(Around):
 
     takes_moduli = False
 
-    def __init__(self, matrix: Material, k1: ArrayLike | dict, k2: ArrayLike | dict, fibre: ArrayLike | dict):
+    def __init__(self, matrix: Material, k1: PerTetrahedron, k2: PerTetrahedron, fibre: PerTetrahedron):
         families = sum(name.split("_")[0] == "k1" for name in getattr(matrix, "inputs", ()))
         names = [f"{name}_{families + 1}" if families else name for name in UNITS]
         self.units, self.shapes = dict(zip(names, UNITS.values())), {names[2]: (3,)}

@@ -8,7 +8,7 @@ from diffsim_ti.differentiation import x_minus_log1p
 from diffsim_ti.materials.calculus.isochoric import isochoric
 from diffsim_ti.materials.calculus.tensor import invariants
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,9 @@ class Gent(Material):
     spellings = (("mu", "limit", "bulk_modulus"),)
     units = {"limit": "-"}
     to_lame = np.array([[1.0, 0, 0], [-2 / 3, 0, 1]])
+
+    def __init__(self, mu: PerTetrahedron, limit: PerTetrahedron, bulk_modulus: PerTetrahedron):
+        super().__init__(mu, limit, bulk_modulus)
 
     def check(self, values):
         super().check(values)

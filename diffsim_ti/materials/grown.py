@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import add_to_diagonal, inner
 from diffsim_ti.materials.law import Law
-from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.runtime import let, traced
 
 
@@ -90,7 +89,7 @@ class Grown(Around):
     units = {"growth": "-"}
     takes_moduli = False
 
-    def __init__(self, material: Material, growth: ArrayLike | dict):
+    def __init__(self, material: Material, growth: PerTetrahedron):
         if "growth" in getattr(material, "inputs", ()):
             raise ValueError(f"Grown: {material.name} has a growth already; take a material without")
         self._surround(material, dict(growth=growth))

@@ -3,12 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.green import SIX, green_strain, green_strain_differential, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.materials.sum_law import SumLaw
 from diffsim_ti.runtime import traced
 
@@ -157,9 +156,9 @@ class KelvinVoigt(Around):
     def __init__(
         self,
         material: Material,
-        time: ArrayLike | dict | None = None,
-        shear_viscosity: ArrayLike | dict | None = None,
-        bulk_viscosity: ArrayLike | dict | None = None,
+        time: PerTetrahedron | None = None,
+        shear_viscosity: PerTetrahedron | None = None,
+        bulk_viscosity: PerTetrahedron | None = None,
     ):
         given = dict(viscous_time=time, shear_viscosity=shear_viscosity, bulk_viscosity=bulk_viscosity)
         given = {name: number for name, number in given.items() if number is not None}

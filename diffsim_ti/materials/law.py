@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.runtime import number_type, traced
 
 
 @dataclass(frozen=True)
-class Law:
+class Law(metaclass=Public):
     """A constitutive formula: Taichi functions of one displacement gradient H = grad u (F = I + H), a `Tensor`.
 
     `p` is a list of the K coefficients named by `coefficient_names`: moduli [Pa], exponents, components of a direction.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.materials.calculus.strains import StrainLaw
-from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.two_moduli import TwoModuli
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class LinearElasticLaw(StrainLaw):
         return p[1]
 
 
-class LinearElastic(Material):
+class LinearElastic(TwoModuli):
     """psi = mu |e|^2 + lam/2 tr(e)^2 with e = sym(grad u) [J/m^3]; P = 2 mu e + lam tr(e) I [Pa].
 
     Not frame indifferent: a rotation of the body strains it. For rotations use any of the other materials.

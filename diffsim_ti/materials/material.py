@@ -1,17 +1,27 @@
 """A material: a law with its numbers."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
+from diffsim_ti.common.answers import answered
+from diffsim_ti.common.names import nearest
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.materials import moduli
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.sets import values_of_sets
 
+# one number, an array with one per tetrahedron, or {tetrahedron set: number}
+PerTetrahedron = TypeAliasType("PerTetrahedron", ArrayLike | Mapping[str, ArrayLike])
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
 
 
-class Material(ABC):
+@answered
+class Material(metaclass=Public):
     """A law and its numbers, in one of these spellings, never two at once:
 
     (E, nu) or youngs_modulus= or E= [Pa], > 0, and poissons_ratio= or nu= [-], in (-1, 0.5): those of small strains,
@@ -40,13 +50,13 @@ class Material(ABC):
     to_lame: np.ndarray | None = None
     from_own: np.ndarray | None = None  # None: the coefficients are the numbers themselves
 
-    def __init__(self, *numbers, J_floor: float | None = None, **named):
+    def __init__(self, *numbers: PerTetrahedron | None, J_floor: float | None = None, **named: PerTetrahedron | None):
         if J_floor is not None and not 0 < J_floor < 1:
             raise ValueError(
                 f"J_floor must lie in (0, 1), got {J_floor}: 0.01 continues the energy below 1 % of the volume"
             )
         self.J_floor = None if J_floor is None else float(J_floor)
-        self._numbers = self._spell(numbers, named)
+        self._numbers = self._spell(numbers, {key: number for key, number in named.items() if number is not None})
         self._extra = ""
         self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
 
@@ -57,11 +67,13 @@ class Material(ABC):
         if len(numbers) > most:
             count = "two numbers go without a name (E, nu)" if most == 2 else f"{most} numbers go without a name"
             raise ValueError(f"{self.name}: at most {count}, got {len(numbers)}; use {usage}")
-        given = dict(zip(self.spellings[0], numbers))
+        given = {name: number for name, number in zip(self.spellings[0], numbers) if number is not None}
         for key, number in named.items():
             name = _ALIASES.get(key, key)
             if not any(name in names for names in self.spellings):
-                raise ValueError(f"{self.name}: no parameter is called {key!r}; use {usage}")
+                near = nearest(key, [*(x for names in self.spellings for x in names), *_ALIASES])
+                meant = f" or did you mean {near!r}?" if near else ""
+                raise ValueError(f"{self.name}: no parameter is called {key!r}; use {usage}{meant}")
             if name in given:
                 raise ValueError(f"{self.name}: {name} is given twice; keep one")
             given[name] = number
@@ -313,35 +325,11 @@ def _all_values(name: str, number, shape: tuple) -> np.ndarray:
 
 def _on_mesh(name: str, number, mesh, shape: tuple) -> np.ndarray:
     if isinstance(number, dict):
-        return _from_sets(name, number, mesh, shape)
+        return values_of_sets(name, number, mesh, shape)
     value, whole = _number(name, number, shape), (mesh.num_tetrahedra, *shape)
     if value.shape not in (shape, whole):
         one = f"{shape[0]} numbers or {shape[0]}" if shape else "one number or one"
         raise ValueError(f"{name}: expected {one} per tetrahedron, shape {whole}, got shape {value.shape}")
-    return value
-
-
-def _from_sets(name: str, numbers: dict, mesh, shape: tuple) -> np.ndarray:
-    value = np.full((mesh.num_tetrahedra, *shape), np.asarray(numbers.get("default", np.nan), np.float64))
-    owner = np.zeros(mesh.num_tetrahedra, np.int64)  # 1 + number of the set that a tetrahedron took its value from
-    names = [key for key in numbers if key != "default"]
-    for rank, key in enumerate(names, 1):
-        if key not in mesh.tetrahedron_sets:
-            known = ", ".join(map(repr, mesh.tetrahedron_sets)) or "none"
-            raise ValueError(f"{name}: the mesh has no tetrahedron set {key!r} (it has: {known})")
-        members = np.asarray(mesh.tetrahedron_sets[key])
-        if np.any(owner[members]):
-            first = int(members[np.argmax(owner[members] > 0)])
-            other = names[owner[first] - 1]
-            raise ValueError(f"{name}: tetrahedron {first} is in both {other!r} and {key!r}; make the sets disjoint")
-        owner[members] = rank
-        value[members] = np.asarray(numbers[key], np.float64)
-    if "default" not in numbers and not owner.all():
-        left_out = np.flatnonzero(owner == 0)
-        raise ValueError(
-            f"{name}: {left_out.size} tetrahedra are in none of the sets {names} (first: {left_out[0]}); "
-            'add a number for "default"'
-        )
     return value
 
 

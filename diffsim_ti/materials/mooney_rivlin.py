@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti.materials.calculus import logarithm
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
-from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,26 @@ class MooneyRivlin(Material):
     spellings = (*Material.spellings, ("c10", "c01", "bulk_modulus"))
     to_lame = np.array([[2.0, 2, 0], [0, 0, 1]])
 
-    def __init__(self, *numbers, c01_share: float | None = None, J_floor: float = 0.01, **named):
+    def __init__(
+        self,
+        youngs_modulus: PerTetrahedron | None = None,
+        poissons_ratio: PerTetrahedron | None = None,
+        *,
+        E: PerTetrahedron | None = None,
+        nu: PerTetrahedron | None = None,
+        mu: PerTetrahedron | None = None,
+        lam: PerTetrahedron | None = None,
+        c10: PerTetrahedron | None = None,
+        c01: PerTetrahedron | None = None,
+        bulk_modulus: PerTetrahedron | None = None,
+        c01_share: float | None = None,
+        J_floor: float = 0.01,
+    ):
         self.c01_share = 0.2 if c01_share is None else float(c01_share)
         if not 0 <= self.c01_share < 1:
             raise ValueError(f"c01_share must lie in [0, 1), got {c01_share}: 0 is neo-Hookean, rubber has 0.1 to 0.3")
-        super().__init__(*numbers, J_floor=J_floor, **named)
+        numbers = dict(E=E, nu=nu, mu=mu, lam=lam, c10=c10, c01=c01, bulk_modulus=bulk_modulus)
+        super().__init__(youngs_modulus, poissons_ratio, **numbers, J_floor=J_floor)
         own = self.inputs == self.spellings[-1]
         if own and c01_share is not None:
             raise ValueError("c01_share goes with E and nu or mu and lam; c10 and c01 already say it: leave it out")

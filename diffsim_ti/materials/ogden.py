@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.differentiation import expm1_minus_x
@@ -11,7 +10,7 @@ from diffsim_ti.materials.calculus.isochoric import isochoric
 from diffsim_ti.materials.calculus.stretches import sum_over_stretches
 from diffsim_ti.materials.calculus.tensor import invariants
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, check_range, summed
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range, summed
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Ogden(Material):
     spellings = (("moduli", "exponents", "bulk_modulus"),)
     units = {"exponents": "-"}
 
-    def __init__(self, moduli: ArrayLike | dict, exponents: ArrayLike | dict, bulk_modulus: ArrayLike | dict):
+    def __init__(self, moduli: PerTetrahedron, exponents: PerTetrahedron, bulk_modulus: PerTetrahedron):
         firsts = [next(iter(x.values())) if isinstance(x, dict) and x else x for x in (moduli, exponents)]
         of_terms = [shape_of(name, x) for name, x in zip(("moduli", "exponents"), firsts)]
         if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:

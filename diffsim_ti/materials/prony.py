@@ -3,14 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.differentiation import exp
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.green import SIX, green_strain, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.materials.sum_law import SumLaw
 
 
@@ -78,7 +77,7 @@ class Prony(Around):
 
     units = {"prony_shares": "-", "prony_times": "s"}
 
-    def __init__(self, material: Material, shares: ArrayLike | dict, times: ArrayLike | dict):
+    def __init__(self, material: Material, shares: PerTetrahedron, times: PerTetrahedron):
         firsts = [next(iter(x.values())) if isinstance(x, dict) and x else x for x in (shares, times)]
         of_terms = [shape_of(name, x) for name, x in zip(("shares", "times"), firsts)]
         if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:

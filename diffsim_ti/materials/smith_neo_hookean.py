@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti.differentiation.functions import x_minus_log1p_value
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
-from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.two_moduli import TwoModuli
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class SmithNeoHookeanLaw(InvariantLaw):
         return 4 * h + p[1], 2 * h, h
 
 
-class SmithNeoHookean(Material):
+class SmithNeoHookean(TwoModuli):
     """psi = m/2 (I_C - 3) + l/2 (J - alpha)^2 - m/2 log(I_C + 1) + constant, alpha = 1 + 3 m / (4 l), psi(I) = 0 [J/m^3];
     P = m (1 - 1/(I_C + 1)) F + (l (J - 1) - 3/4 m) cof F [Pa].
 

@@ -6,7 +6,7 @@ import taichi as ti
 
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
 from diffsim_ti.materials.calculus.tensor import add_to_diagonal, inner
-from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.two_moduli import TwoModuli
 from diffsim_ti.runtime import let, traced
 
 
@@ -46,7 +46,7 @@ class StVenantKirchhoffLaw(InvariantLaw):
         return 4 * k, 2 * k, k
 
 
-class StVenantKirchhoff(Material):
+class StVenantKirchhoff(TwoModuli):
     """psi = mu |E|^2 + lam/2 tr(E)^2 with E = (F^T F - I) / 2 [J/m^3]; P = F (2 mu E + lam tr(E) I) [Pa].
 
     Good for large rotations with small strains. Under compression it softens and gives way (at 58 % of its length in one

@@ -6,7 +6,7 @@ import taichi as ti
 
 from diffsim_ti.materials.calculus import logarithm
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
-from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.material import Material, PerTetrahedron
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,18 @@ class StableNeoHookean(Material):
     [40000.0, 40000.0]
     """
 
-    def __init__(self, *numbers, J_floor: float = 0.01, **named):
-        super().__init__(*numbers, J_floor=J_floor, **named)
+    def __init__(
+        self,
+        youngs_modulus: PerTetrahedron | None = None,
+        poissons_ratio: PerTetrahedron | None = None,
+        *,
+        E: PerTetrahedron | None = None,
+        nu: PerTetrahedron | None = None,
+        mu: PerTetrahedron | None = None,
+        lam: PerTetrahedron | None = None,
+        J_floor: float = 0.01,
+    ):
+        super().__init__(youngs_modulus, poissons_ratio, E=E, nu=nu, mu=mu, lam=lam, J_floor=J_floor)
 
     def law(self, precision: str) -> StableNeoHookeanLaw:
         return StableNeoHookeanLaw(precision, self.J_floor)

@@ -7,7 +7,7 @@ import numpy as np
 from diffsim_ti.materials.calculus.isochoric import isochoric
 from diffsim_ti.materials.calculus.tensor import invariants
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,9 @@ class Yeoh(Material):
 
     spellings = (("c10", "c20", "c30", "bulk_modulus"),)
     to_lame = np.array([[2.0, 0, 0, 0], [-4 / 3, 0, 0, 1]])
+
+    def __init__(self, c10: PerTetrahedron, c20: PerTetrahedron, c30: PerTetrahedron, bulk_modulus: PerTetrahedron):
+        super().__init__(c10, c20, c30, bulk_modulus)
 
     def check(self, values):
         super().check(values)

@@ -33,7 +33,9 @@ class Exchange:
         return cls(vertices, tetrahedra, **sets, fix_orientation=fix_orientation)
 
     @classmethod
-    def from_file(cls, path: str | PathLike, fix_orientation: bool = False, drop_orphans: bool = False) -> "Self":
+    def from_file(
+        cls, path: str | PathLike, fix_orientation: bool = False, drop_orphans: bool = False, device: str | None = None
+    ) -> "Self":
         """Load tetrahedra from any format that meshio reads: Gmsh .msh (1, 2.2, 4.x), .vtu, .vtk, MEDIT .mesh, .inp ...
         Surfaces, of .stl, .obj, .ply and .off, are filled (`from_surface`).
 
@@ -41,13 +43,15 @@ class Exchange:
         or points the vertex sets of their vertices, and those triangles that lie on the surface a surface set too; integer
         tags without a name become "tag_<n>", except 0 and a tag that all tetrahedra share. Other triangles, lines and
         points are ignored. Ten-node tetrahedra keep their mid-edge vertices, and edges that are curved.
-        drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn.
+        drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn. device: as
+        for `create_cube`.
 
         Raises FileNotFoundError, ImportError where meshio needs a further package (h5py for XDMF, CGNS and MED, netCDF4 for
         Exodus), and ValueError for an unreadable file, one without tetrahedra or with both kinds, other cells
         beside tetrahedra (cell types are named), and whatever the constructor refuses.
         """
         instance("from_file", "path", path, str | PathLike, "that of a mesh file")
+        runtime.use_device(device)
         try:
             return cls._of_parts(read_mesh(path), fix_orientation, drop_orphans)
         except ValueError as error:
@@ -56,8 +60,7 @@ class Exchange:
     @classmethod
     def load_from_msh(cls, path: str | PathLike, device: str | None = None) -> "Self":
         """`from_file(path)` in the seeds' spelling; device as for `create_cube`."""
-        runtime.use_device(device)
-        return cls.from_file(path)
+        return cls.from_file(path, device=device)
 
     def save(self, path: str | PathLike) -> None:
         """Write the mesh through meshio, in the format that the suffix names.

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.mesh.geometry import triangle_normals
@@ -13,6 +14,9 @@ from diffsim_ti.mesh.sets import array_of, checked_sets, chosen_indices, rows_of
 
 if TYPE_CHECKING:
     from diffsim_ti.mesh.tetrahedral_mesh import TetrahedralMesh
+
+# of a mesh: the name of a set, several, indices or a Boolean mask
+SetOrIndices = TypeAliasType("SetOrIndices", str | ArrayLike | Iterable[str])
 
 
 class NamedSets:
@@ -35,7 +39,7 @@ class NamedSets:
 
     # Choosing
 
-    def vertex_indices(self, chosen: str | ArrayLike | Iterable[str]) -> np.ndarray:
+    def vertex_indices(self, chosen: SetOrIndices) -> np.ndarray:
         """Sorted indices from a set's name, several names, indices, or a Boolean mask over the vertices.
 
         A surface set of a name that no vertex set has stands for its vertices.
@@ -43,11 +47,11 @@ class NamedSets:
         of_surface = {name: np.unique(self.surface_triangles[rows]) for name, rows in self._surface_sets.items()}
         return chosen_indices(chosen, of_surface | self._vertex_sets, self.num_vertices, "vertex")
 
-    def tetrahedron_indices(self, chosen: str | ArrayLike | Iterable[str]) -> np.ndarray:
+    def tetrahedron_indices(self, chosen: SetOrIndices) -> np.ndarray:
         """Sorted indices from a set's name, several names, indices, or a Boolean mask over the tetrahedra."""
         return chosen_indices(chosen, self._tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
 
-    def surface_indices(self, chosen: str | ArrayLike | Iterable[str] | None) -> np.ndarray:
+    def surface_indices(self, chosen: SetOrIndices | None) -> np.ndarray:
         """Sorted indices of rows of `surface_triangles` from a surface set's name, several names, indices, a Boolean mask
         over the rows, or triangles as vertex indices in any order, shape (k, 3); None means the whole surface.
 
@@ -69,7 +73,7 @@ class NamedSets:
                 )
         return chosen_indices(chosen, self._surface_sets, count, "surface")
 
-    def faces_of(self, chosen: str | ArrayLike | Iterable[str] | None) -> np.ndarray:
+    def faces_of(self, chosen: SetOrIndices | None) -> np.ndarray:
         """Whole faces of the surface, as vertex indices, shape (k, 3), or (k, 6) of ten-node tetrahedra; chosen as in
         `surface_indices`, in the order of these.
 
@@ -111,15 +115,15 @@ class NamedSets:
 
     # Naming
 
-    def with_vertex_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
+    def with_vertex_set(self, name: str, chosen: SetOrIndices) -> "TetrahedralMesh":
         """A mesh that has this vertex set too (or instead of one of that name); `chosen` as in `vertex_indices`."""
         return self._with_set("vertex", name, self.vertex_indices(chosen), self.num_vertices)
 
-    def with_tetrahedron_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
+    def with_tetrahedron_set(self, name: str, chosen: SetOrIndices) -> "TetrahedralMesh":
         """A mesh that has this tetrahedron set too (or instead of one of that name)."""
         return self._with_set("tetrahedron", name, self.tetrahedron_indices(chosen), self.num_tetrahedra)
 
-    def with_surface_set(self, name: str, chosen: str | ArrayLike | Iterable[str] | Callable) -> "TetrahedralMesh":
+    def with_surface_set(self, name: str, chosen: SetOrIndices | Callable) -> "TetrahedralMesh":
         """A mesh that has this surface set too (or instead of one of that name), for loads and supports to name.
 
         chosen: as in `surface_indices`, or a predicate as in `surface_where`:

@@ -1,5 +1,7 @@
 """Named sets of vertices, of tetrahedra and of surface triangles: their numbers, checked, joined, renumbered."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from diffsim_ti.common.checked import shape_of
@@ -62,37 +64,37 @@ def indices_of(chosen, count: int, what: str) -> np.ndarray:
     return chosen
 
 
-def join_sets(parts: list[dict], firsts: np.ndarray) -> dict[str, np.ndarray]:
-    """Sets of several bodies as sets of all, and each body's members as "body_<k>", those of a set that others have too as
-    "body_<k>_<name>"; those of body k begin at firsts[k]."""
-    out = {}
-    for k in range(len(parts)):
-        name = f"body_{k}"
-        if any(name in other for other in parts):
-            raise ValueError(f"joined names the bodies body_0, body_1, ..., but a mesh has a set {name!r}: rename it")
-        out[name] = np.arange(firsts[k], firsts[k + 1])
-    return out | _merged([{name: rows + first for name, rows in sets.items()} for sets, first in zip(parts, firsts)])
+def join_sets(parts: list[dict], firsts: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Sets of several bodies as sets of all, and each body's members by its name, those of a set that others have too as
+    "<body>_<name>"; those of body k begin at firsts[k]."""
+    merged = _merged([{name: rows + first for name, rows in sets.items()} for sets, first in zip(parts, firsts)], names)
+    for name in names:
+        if name in merged:
+            few = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+            raise ValueError(f"joined names the bodies {few}, but a mesh has a set {name!r}: rename it")
+    return {name: np.arange(firsts[k], firsts[k + 1]) for k, name in enumerate(names)} | merged
 
 
-def _merged(parts: list[dict]) -> dict[str, np.ndarray]:
+def _merged(parts: list[dict], names: Sequence[str]) -> dict[str, np.ndarray]:
     """The sets of all bodies by name, and of a name that several have also each body's part of it."""
     out = {}
     for name in dict.fromkeys(name for sets in parts for name in sets):
-        own = {k: sets[name] for k, sets in enumerate(parts) if name in sets}
-        out |= {part_of(name, k): rows for k, rows in own.items()} if len(own) > 1 else {}
+        own = {body: sets[name] for body, sets in zip(names, parts) if name in sets}
+        out |= {part_of(name, body): rows for body, rows in own.items()} if len(own) > 1 else {}
         out[name] = np.concatenate([*own.values()])
     return out
 
 
-def part_of(name: str, body: int) -> str:
+def part_of(name: str, body: str) -> str:
     """The name of what one body has of a set whose name several bodies of a joined mesh have."""
-    return f"body_{body}_{name}"
+    return f"{body}_{name}"
 
 
-def parts_of_joined(sets: dict, name: str) -> list[str]:
-    """The names of the parts of a set that several bodies had before they were joined; empty for others."""
-    bodies = range(sum(key.startswith("body_") and key[5:].isdigit() for key in sets))
-    return [part for k in bodies if (part := part_of(name, k)) in sets]
+def parts_of_joined(mesh, name: str) -> list[str]:
+    """The names of the parts of a vertex set that several bodies had before they were joined; empty for others."""
+    sets, bodies = mesh.vertex_sets, mesh.tetrahedron_sets
+    parts = [part for body in bodies if body in sets and (part := part_of(name, body)) in sets]
+    return parts if name in sets and sum(len(sets[part]) for part in parts) == len(sets[name]) else []
 
 
 def places_of_triangles(triangles: np.ndarray, among: np.ndarray) -> np.ndarray:
@@ -134,7 +136,7 @@ def rows_on_surface(sets: dict | None, surface: np.ndarray, faces: np.ndarray) -
     return out
 
 
-def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict]:
+def join(meshes: list, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, dict]:
     """(vertices, elements, sets by arguments of TetrahedralMesh) of several bodies, one after the other."""
     orders = [mesh.order for mesh in meshes]
     if len(set(orders)) > 1:
@@ -146,17 +148,45 @@ def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict]:
     firsts = np.cumsum([0, *(mesh.num_vertices for mesh in meshes)])
     first_tets = np.cumsum([0, *(mesh.num_tetrahedra for mesh in meshes)])
     triangles = [
-        {f"body_{k}": mesh.surface_triangles + first}
+        {body: mesh.surface_triangles + first}
         | {name: mesh.surface_triangles[rows] + first for name, rows in mesh.surface_sets.items()}
-        for k, (mesh, first) in enumerate(zip(meshes, firsts))
+        for body, mesh, first in zip(names, meshes, firsts)
     ]
     sets = dict(
-        vertex_sets=join_sets([mesh.vertex_sets for mesh in meshes], firsts),
-        tetrahedron_sets=join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets),
-        surface_sets=_merged(triangles),
+        vertex_sets=join_sets([mesh.vertex_sets for mesh in meshes], firsts, names),
+        tetrahedron_sets=join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets, names),
+        surface_sets=_merged(triangles, names),
     )
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     return vertices, np.concatenate([mesh.elements + first for mesh, first in zip(meshes, firsts)]), sets
+
+
+def values_of_sets(name: str, numbers: dict, mesh, shape: tuple = ()) -> np.ndarray:
+    """One value per tetrahedron, of `shape`, from {tetrahedron set: value}; "default" serves those in none of the sets.
+
+    Raises ValueError for an unknown set, sets that overlap, and tetrahedra left out.
+    """
+    value = np.full((mesh.num_tetrahedra, *shape), np.asarray(numbers.get("default", np.nan), np.float64))
+    owner = np.zeros(mesh.num_tetrahedra, np.int64)  # 1 + number of the set that a tetrahedron took its value from
+    names = [key for key in numbers if key != "default"]
+    for rank, key in enumerate(names, 1):
+        if key not in mesh.tetrahedron_sets:
+            known = ", ".join(map(repr, mesh.tetrahedron_sets)) or "none"
+            raise ValueError(f"{name}: the mesh has no tetrahedron set {key!r} (it has: {known})")
+        members = np.asarray(mesh.tetrahedron_sets[key])
+        if np.any(owner[members]):
+            first = int(members[np.argmax(owner[members] > 0)])
+            other = names[owner[first] - 1]
+            raise ValueError(f"{name}: tetrahedron {first} is in both {other!r} and {key!r}; make the sets disjoint")
+        owner[members] = rank
+        value[members] = np.asarray(numbers[key], np.float64)
+    if "default" not in numbers and not owner.all():
+        left_out = np.flatnonzero(owner == 0)
+        raise ValueError(
+            f"{name}: {left_out.size} tetrahedra are in none of the sets {names} (first: {left_out[0]}); "
+            'add a number for "default"'
+        )
+    return value
 
 
 def without_unused(vertices: np.ndarray, tetrahedra: np.ndarray, sets: dict, triangles: dict) -> tuple:

@@ -2,8 +2,9 @@
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import instance, listed
 from diffsim_ti.common.origin import warn_of_rounding
+from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.elements import Elements
@@ -18,6 +20,7 @@ from diffsim_ti.mesh.exchange import Exchange
 from diffsim_ti.mesh.grid import box
 from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
+from diffsim_ti.mesh.seed_names import SeedNames
 from diffsim_ti.mesh.sets import checked_sets, frozen, join, pieces, rows_on_surface
 from diffsim_ti.mesh.ten_nodes import edges_of
 
@@ -26,7 +29,7 @@ CONNECTIVITY = (  # what stays when vertices move
 )
 
 
-class TetrahedralMesh(Exchange, NamedSets, Elements):
+class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public):
     """Tetrahedra of four or ten nodes at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
 
     vertices: positions [m], shape (num_vertices, 3).
@@ -80,7 +83,11 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
 
     @classmethod
     def create_cube(
-        cls, resolution: int = 5, size: float = 1.0, pattern: str = "kuhn", device: str | None = None
+        cls,
+        resolution: int = 5,
+        size: float = 1.0,
+        pattern: Literal["kuhn", "five"] = "kuhn",
+        device: str | None = None,
     ) -> "TetrahedralMesh":
         """The cube [0, size]^3 [m], all of it filled; `resolution` counts vertices a side. See `create_box`.
 
@@ -91,7 +98,11 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
 
     @classmethod
     def create_box(
-        cls, resolution: ArrayLike = 5, size: ArrayLike = 1.0, pattern: str = "kuhn", origin: ArrayLike = (0, 0, 0)
+        cls,
+        resolution: ArrayLike = 5,
+        size: ArrayLike = 1.0,
+        pattern: Literal["kuhn", "five"] = "kuhn",
+        origin: ArrayLike = (0, 0, 0),
     ) -> "TetrahedralMesh":
         """A box on a regular grid, with vertex sets and surface sets xmin, xmax, ymin, ymax, zmin, zmax.
 
@@ -108,20 +119,30 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         return mesh._changed(_surface_sets=checked_sets(rows, len(corners), "surface"))
 
     @classmethod
-    def joined(cls, meshes: Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":
+    def joined(cls, meshes: Mapping[str, "TetrahedralMesh"] | Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":
         """Several bodies as one mesh of several pieces, one after the other.
 
-        Sets of the same name become one, and what each body has of them is "body_0_xmin", "body_1_xmin" ... too; each body's
-        vertices, tetrahedra and surface are sets "body_0", "body_1", ... A scene warns where the whole of such a set is a
-        support. ValueError for an empty list, and for meshes that have a set of such a name already.
+        meshes: {"ball": ball, "left": finger}, which names them, or a list: "body_0", "body_1", ... Each body's vertices,
+            tetrahedra and surface are sets of its name, which densities, laws, supports, friction and results take:
+            `Scene(mesh, law, density={"ball": 900, "left": 1100})`, `CenterOfMass("ball")`.
+        Sets of the same name become one, and what each body has of them is "ball_xmin", "left_xmin" ... too. A scene warns
+        where the whole of such a set is a support. ValueError for no meshes, for a name that is no word, and for meshes
+        that have a set of such a name already.
+
+        >>> import diffsim_ti as ds
+        >>> cube = ds.TetrahedralMesh.create_cube(resolution=2)
+        >>> mesh = ds.TetrahedralMesh.joined({"ball": cube, "left": cube.translated((2, 0, 0))})
+        >>> len(mesh.vertex_sets["left"]), mesh.vertex_indices("left_xmin").tolist()
+        (8, [8, 9, 10, 11])
         """
-        meshes = [
+        named = isinstance(meshes, Mapping)
+        parts = [
             instance("joined", "each of the meshes", mesh, TetrahedralMesh, "a TetrahedralMesh")
-            for mesh in listed("meshes", meshes, "TetrahedralMesh")
+            for mesh in (meshes.values() if named else listed("meshes", meshes, "TetrahedralMesh"))
         ]
-        if not meshes:
+        if not parts:
             raise ValueError("joined needs at least one mesh, got none")
-        vertices, tetrahedra, sets = join(meshes)
+        vertices, tetrahedra, sets = join(parts, list(meshes) if named else [f"body_{k}" for k in range(len(parts))])
         return cls(vertices, tetrahedra, **sets)
 
     # What it consists of
@@ -145,11 +166,6 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
     def num_tetrahedra(self) -> int:
         """How many tetrahedra, of four or ten nodes, there are."""
         return len(self._tetrahedra)
-
-    @property
-    def num_elements(self) -> int:
-        """Another name of num_tetrahedra, used by the seeds."""
-        return self.num_tetrahedra
 
     @property
     def surface_triangles(self) -> np.ndarray:
@@ -215,6 +231,18 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         """Lowest and highest corner [m], shape (2, 3)."""
         return frozen(np.stack([self.vertices.min(0), self.vertices.max(0)]))
 
+    @cached_property
+    def body_size(self) -> float:
+        """Longest side of the box around a body [m]; of several pieces, of the smallest."""
+        used = np.delete(np.arange(self.num_vertices), self.unused_vertices)
+        if self.num_pieces == 1:
+            return float(np.ptp(self.vertices[used], 0).max())
+        piece = pieces(self)[used]
+        order = np.argsort(piece, kind="stable")
+        first = np.flatnonzero(np.diff(piece[order], prepend=-1))
+        x = self.vertices[used[order]]
+        return float((np.maximum.reduceat(x, first) - np.minimum.reduceat(x, first)).max(1).min())
+
     # Points
 
     def locate(self, points: ArrayLike, nearest: bool = False) -> LocatedPoints:
@@ -264,9 +292,6 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
     def content_hash(self) -> str:
         """SHA-256 of vertices and tetrahedra, 64 hexadecimal digits; sets do not count. The same on every machine."""
         return content_hash(self)
-
-    def _compute_rest_state(self) -> None:
-        """Does nothing: the rest state is always ready. The seeds call it."""
 
     def _changed(self, **parts) -> "TetrahedralMesh":
         new = copy.copy(self)

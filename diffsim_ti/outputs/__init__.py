@@ -1,5 +1,6 @@
 """Outputs, which losses use like positions: functions of a run's frames, one file each, and their interface for others."""
 
+from diffsim_ti.outputs.center_of_mass import CenterOfMass
 from diffsim_ti.outputs.chamber_pressure import ChamberPressure
 from diffsim_ti.outputs.contact_force import ContactForce
 from diffsim_ti.outputs.contact_traction import ContactTraction
@@ -14,6 +15,15 @@ from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
 from diffsim_ti.outputs.work import WorkOfLoads
 
-__all__ = ["ChamberPressure", "Change", "ContactForce", "ContactTraction", "Displacements", "ElasticEnergy"]
-__all__ += ["EnclosedVolume", "KineticEnergy", "Length", "MaterialPoints", "Output", "Positions", "Reaction"]
+__all__ = ["CenterOfMass", "ChamberPressure", "Change", "ContactForce", "ContactTraction", "Displacements"]
+__all__ += [
+    "ElasticEnergy",
+    "EnclosedVolume",
+    "KineticEnergy",
+    "Length",
+    "MaterialPoints",
+    "Output",
+    "Positions",
+    "Reaction",
+]
 __all__ += ["SelfContactForce", "Strain", "Stress", "Tension", "Velocities", "WorkOfLoads"]

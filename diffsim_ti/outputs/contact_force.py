@@ -1,7 +1,7 @@
 """Forces and moments of obstacles on the body."""
 
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +22,8 @@ class ContactForce(Output):
 
     obstacle: its name, or the term as the scene lists it. part: "normal" is what its barrier pushes with, "friction" what
         drags, "total" both. per_vertex: of each vertex instead of the sum. name: how a loss calls it.
+    on: the vertices whose sum or moment is taken, by a vertex set's name, indices, a mask or a list of names, such as a body
+        of a joined mesh; None: all.
     about: the moment [N m] about this point [m], 3 numbers, instead: sum (x_i - about) x f_i, x being the frame's positions.
 
     A frame holds the mean over the time T since the frame before it, zero in the first:
@@ -44,16 +46,20 @@ class ContactForce(Output):
     def __init__(
         self,
         obstacle: Term | str,
-        part: str = "total",
+        part: Literal["total", "normal", "friction"] = "total",
         name: str = "contact_force",
         per_vertex: bool = False,
         about: ArrayLike | None = None,
+        on: str | ArrayLike | None = None,
     ):
         if part not in PARTS:
             raise ValueError(f"ContactForce: part must be {', '.join(PARTS[:-1])} or {PARTS[-1]}, got {part!r}")
         if about is not None and per_vertex:
             raise ValueError("ContactForce: a moment is of all vertices: give about= or per_vertex=True, not both")
+        if on is not None and per_vertex:
+            raise ValueError("ContactForce: give on=, a set whose sum is taken, or per_vertex=True, of all vertices")
         self.obstacle, self.part, self.name, self.per_vertex = obstacle, part, name, bool(per_vertex)
+        self.on = on
         self.about = None if about is None else np.array(about, np.float64)
         if self.about is not None and (self.about.shape != (3,) or not np.all(np.isfinite(self.about))):
             raise ValueError(f"ContactForce: about must be 3 finite numbers [m], got {about!r}")
@@ -64,6 +70,8 @@ class ContactForce(Output):
     def settled(self, scene: "Scene") -> "ContactForce":
         out = copy(self)
         out.place, out.num_vertices = scene.place_of(self.obstacle), scene.mesh.num_vertices
+        n = out.num_vertices
+        out.vertices = np.arange(n) if self.on is None else scene.mesh.vertex_indices(self.on)
         out.sides = {"total": slice(0, 2), "normal": slice(0, 1), "friction": slice(1, 2)}[self.part]
         return out
 
@@ -71,25 +79,30 @@ class ContactForce(Output):
         return (num_frames, self.num_vertices, 3) if self.per_vertex else (num_frames, 3)
 
     def _of(self, forces: np.ndarray) -> np.ndarray:
-        """On each vertex."""
-        return forces[:, self.place, self.sides].sum(1)
+        """On each vertex that counts."""
+        return forces[:, self.place, self.sides].sum(1)[:, self.vertices]
 
     def value(self, frames: "Frames") -> np.ndarray:
         f = self._of(frames.contact_forces)
         if self.about is not None:
-            return moments(frames.positions, self.about, f)
+            return moments(frames.positions[:, self.vertices], self.about, f)
         return f if self.per_vertex else f.sum(1)
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
-        df = np.zeros(frames.positions.shape) if change.contact_forces is None else self._of(change.contact_forces)
+        x, dx = frames.positions[:, self.vertices], change.positions
+        df = np.zeros(x.shape) if change.contact_forces is None else self._of(change.contact_forces)
         if self.about is not None:
-            return moments_jvp(frames.positions, self.about, self._of(frames.contact_forces), change.positions, df)
+            dx = None if dx is None else dx[:, self.vertices]
+            return moments_jvp(x, self.about, self._of(frames.contact_forces), dx, df)
         return df if self.per_vertex else df.sum(1)
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
-        out, positions = np.zeros(frames.contact_forces.shape), None
-        by_vertex = seed if self.per_vertex else np.repeat(seed[:, None], self.num_vertices, 1)
+        by_forces, positions = np.zeros(frames.contact_forces.shape), None
+        by_vertex = np.zeros(frames.positions.shape)
+        by_vertex[:, self.vertices] = seed if self.per_vertex else seed[:, None]
         if self.about is not None:
-            positions, by_vertex = moments_vjp(frames.positions, self.about, self._of(frames.contact_forces), seed)
-        out[:, self.place, self.sides] = by_vertex[:, None]
-        return Change(positions=positions, contact_forces=out)
+            positions, x = np.zeros(by_vertex.shape), frames.positions[:, self.vertices]
+            own = moments_vjp(x, self.about, self._of(frames.contact_forces), seed)
+            positions[:, self.vertices], by_vertex[:, self.vertices] = own
+        by_forces[:, self.place, self.sides] = by_vertex[:, None]
+        return Change(positions=positions, contact_forces=by_forces)

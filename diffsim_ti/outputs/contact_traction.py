@@ -1,7 +1,7 @@
 """Traction of obstacles on the surface: contact force per area, vertex by vertex."""
 
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -44,7 +44,12 @@ class ContactTraction(Output):
 
     reads_contact_forces, unit = True, "Pa"
 
-    def __init__(self, obstacle: Term | str, part: str = "total", name: str = "contact_traction"):
+    def __init__(
+        self,
+        obstacle: Term | str,
+        part: Literal["total", "normal", "friction"] = "total",
+        name: str = "contact_traction",
+    ):
         self._given, self.name = ContactForce(obstacle, part, name, per_vertex=True), name
 
     def __repr__(self) -> str:

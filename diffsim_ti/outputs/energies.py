@@ -5,10 +5,10 @@ from copy import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import ConsistentMass
 from diffsim_ti.materials.evaluate import evaluate
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.patch_pressure import PatchPressure
@@ -30,7 +30,7 @@ class ElasticEnergy(Output):
 
     reads_law_state = True
 
-    def __init__(self, sets: Sequence[str | ArrayLike] | None = None, name: str = "elastic_energy"):
+    def __init__(self, sets: Sequence[SetOrIndices] | None = None, name: str = "elastic_energy"):
         self.sets, self.name = None if sets is None else list(sets), name
 
     def settled(self, scene: "Scene") -> "ElasticEnergy":
@@ -119,7 +119,7 @@ class KineticEnergy(Output):
     The gradient is exact by all inputs. Goldstein, Classical Mechanics, 3rd ed., 2002, sec. 1.2.
     """
 
-    def __init__(self, sets: Sequence[str | ArrayLike] | None = None, name: str = "kinetic_energy"):
+    def __init__(self, sets: Sequence[SetOrIndices] | None = None, name: str = "kinetic_energy"):
         self.sets, self.name = None if sets is None else list(sets), name
 
     def settled(self, scene: "Scene") -> "KineticEnergy":

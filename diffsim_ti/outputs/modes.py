@@ -7,7 +7,9 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.checked import shown
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.inputs import StressPoints
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.outputs.body_forces import BodyForces
@@ -17,7 +19,7 @@ SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to whic
 
 
 @dataclass(eq=False, repr=False)
-class Modes:
+class Modes(metaclass=Public):
     """frequencies [Hz], ascending, shape (k,), negative where the state is unstable (lambda < 0: -sqrt(-lambda) / 2 pi);
     eigenvalues lambda = (2 pi f)^2 [1/s^2]; shapes [1/sqrt(kg)], (k, num_vertices, 3), with shapes_i . M shapes_j = 1 where
     i = j, else 0; groups: lists of modes whose frequencies coincide, whose mean alone has a gradient;
@@ -136,7 +138,8 @@ def free_directions(scene: Scene):
     return out
 
 
-def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values) -> Modes:
+@public
+def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values: InputValue) -> Modes:
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
 
     K: `scene.stiffness_matrix(displacements)`, of the body's stress, springs, cables and foundations at displacements [m]

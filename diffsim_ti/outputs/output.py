@@ -1,11 +1,12 @@
 """An output, which losses use like positions: a function of a run's frames and inputs, with its derivatives beside it."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.terms import Growth
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Change:
             self.inputs[name] = self.inputs[name] + value if name in self.inputs else value
 
 
-class Output(ABC):
+class Output(metaclass=Public):
     """A function y(positions, velocities, inputs) of a run's frames, for `Rollout(..., outputs=[...])`.
 
     Write one outside the package by giving it `name`, `shape`, `value`, `jvp` and `vjp`, in NumPy and float64; it is then

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.applied_loads import AppliedLoads
 from diffsim_ti.outputs.body_forces import BodyForces
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
@@ -53,7 +54,7 @@ class Reaction(Output):
 
     def __init__(
         self,
-        support: str | ArrayLike | None = None,
+        support: SetOrIndices | None = None,
         name: str = "reaction",
         about: ArrayLike | None = None,
         per_vertex: bool = False,

@@ -1,7 +1,7 @@
 """Forces of surfaces that press and slide on each other: what a soft hand does to what it holds."""
 
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.curved_pairs import pairs_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.state.arrays import SceneArrays
@@ -49,8 +50,8 @@ class SelfContactForce(Output):
 
     def __init__(
         self,
-        on: str | ArrayLike | None = None,
-        part: str = "total",
+        on: SetOrIndices | None = None,
+        part: Literal["total", "normal", "friction"] = "total",
         name: str = "self_contact_force",
         per_vertex: bool = False,
         about: ArrayLike | None = None,

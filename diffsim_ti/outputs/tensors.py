@@ -2,11 +2,12 @@
 
 from abc import abstractmethod
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointInterpolation, PointMeans
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
@@ -20,7 +21,8 @@ class _Tensors(Output):
     """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means of what the tetrahedra around have there; or
     material points X [m], shape (k, 3), each with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is the
     mean over its points, by their volumes; at X and at its nodes it is the linear function of place that these four make,
-    which is more accurate than the tensor of the displacements there. of: tetrahedra that count alone at their vertices.
+    which is more accurate than the tensor of the displacements there. of: the tetrahedra that are meant: only these have a
+    tensor, or count alone at their vertices.
     numbers: what of them is given instead, a name in deformation.NUMBERS, or None. name: how a loss calls it.
     Barlow 1976, Optimal stress locations in finite element models, doi:10.1002/nme.1620100202; Hinton, Campbell 1974, Local
     and global smoothing of discontinuous finite element functions, doi:10.1002/nme.1620080305."""
@@ -37,20 +39,21 @@ class _Tensors(Output):
         self.name, self.at, self.of, self.numbers = name, at, of, asked[0] if asked else None
         if isinstance(at, str) and at not in ("tetrahedra", "vertices"):
             raise ValueError(f'{type(self).__name__}: at must be "tetrahedra", "vertices" or points, got {at!r}')
-        if of is not None and not self._at_vertices:
+        if of is not None and not isinstance(at, str):
             raise ValueError(
-                f'{type(self).__name__}: of= says which tetrahedra count at their vertices; it goes with at="vertices"'
+                f'{type(self).__name__}: of= says which tetrahedra are meant; it goes with at="tetrahedra" or "vertices"'
             )
 
     def settled(self, scene: "Scene") -> "Output":
         out, mesh = copy(self), scene.mesh
         out.scene, out.num_vertices, out.means, out.points = scene, mesh.num_vertices, None, mesh.reference.num_points
-        every = isinstance(self.at, str)
+        every, of = isinstance(self.at, str), [] if self.of is None else mesh.tetrahedron_indices(self.of)
         located = None if every else mesh.locate(self.at)
         out.chosen = np.arange(mesh.num_tetrahedra) if every else located.tetrahedra
+        if every and self.of is not None and not self._at_vertices:
+            out.chosen = of
         out.read, out.count = out.chosen, len(out.chosen)  # read: whose deformation is looked at
         if self._at_vertices:
-            of = [] if self.of is None else mesh.tetrahedron_indices(self.of)
             out.means, out.count = PointMeans.of_vertices(mesh, of), mesh.num_vertices
             out.alike = out.points > 1
         elif out.points > 1 and not every:
@@ -153,7 +156,7 @@ class Strain(_Tensors):
         at: str | ArrayLike = "tetrahedra",
         principal: bool = False,
         stretches: bool = False,
-        of: str | ArrayLike | None = None,
+        of: SetOrIndices | None = None,
     ):
         super().__init__(name, at, of, principal=principal, stretches=stretches)
 
@@ -175,8 +178,9 @@ class Stress(_Tensors):
 
     kind: "cauchy" or "first_piola". at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", (frames, num_vertices,
         3, 3); or points X [m] of the rest shape, shape (k, 3). name: how a loss calls it.
-    of: tetrahedra, by a set's name, indices, a mask or a list of names, that count alone at their vertices: where two
-        materials meet and stress jumps, which side's stress is meant. Without it an interface has the mean of both sides.
+    of: tetrahedra, by a set's name, indices, a mask or a list of names: at tetrahedra only theirs is given, shape
+        (frames, k, 3, 3); at vertices they count alone: where two materials meet and stress jumps, which side's stress is
+        meant. Without it an interface has the mean of both sides.
 
     At a vertex it is the mean over the tetrahedra around of the stress that each has at the vertex, which in ten-node
     tetrahedra is the linear function through their four points, with volume="patches" too. Linear tetrahedra have one stress
@@ -211,9 +215,9 @@ class Stress(_Tensors):
         name: str = "stress",
         at: str | ArrayLike = "tetrahedra",
         principal: bool = False,
-        kind: str = "cauchy",
+        kind: Literal["cauchy", "first_piola"] = "cauchy",
         von_mises: bool = False,
-        of: str | ArrayLike | None = None,
+        of: SetOrIndices | None = None,
     ):
         if kind not in ("cauchy", "first_piola"):
             raise ValueError(f'Stress: kind must be "cauchy" or "first_piola", got {kind!r}')

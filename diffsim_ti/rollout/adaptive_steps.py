@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import instance, number, shown, whole
+from diffsim_ti.common.public import public
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
@@ -19,6 +20,7 @@ MOST = 4096  # substeps of a step
 LEVELS = 65  # from which that between fine and coarse steps is chosen
 
 
+@public
 def adaptive_steps(
     solver: Solver, steps: int, tolerance: float, of: str = "vertices", values: Mapping[str, ArrayLike] | None = None
 ) -> UnequalSteps:

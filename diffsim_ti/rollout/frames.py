@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Derived
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.scene import Scene
@@ -12,7 +13,7 @@ from diffsim_ti.state.watch import ContactResolution
 
 
 @dataclass(eq=False, repr=False)
-class Frames:
+class Frames(metaclass=Public):
     """Saved states of one run: positions [m] (far from the origin in float64), velocities [m/s], displacements from the rest
     shape [m] (which keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
 

@@ -1,15 +1,20 @@
 """Rollout: n steps of a solver as one differentiable operation."""
 
 from collections.abc import Callable, Iterable
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import as_numbers, instance, listed, shape_of, shown
 from diffsim_ti.common.copies import made_again
+from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import positions_of
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
@@ -18,12 +23,28 @@ from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
 from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeAdapter
+from diffsim_ti.scene.scene import SceneArguments
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
 from diffsim_ti.state.solve_report import SolveReport
 
 
-class Rollout:
+class RolloutOptions(TypedDict, total=False):
+    """What `Rollout` takes besides solver and steps: what `Rollout.on` replaces."""
+
+    save_every: int | None
+    checkpoint_every: int | None
+    memory: float | None
+    gradients: str | Iterable[str] | None
+    clip: float | None
+    truncate: int | None
+    health: bool
+    outputs: Output | Iterable[Output]
+    runs: int | None
+    raise_errors: bool
+
+
+class Rollout(metaclass=Public):
     """n steps of a solver from given inputs, with saved frames and gradients of everything that went in.
 
     solver: any solver; its scene names the inputs (`rollout.inputs`): initial_positions, initial_velocities,
@@ -135,11 +156,11 @@ class Rollout:
         own += [f"outputs {', '.join(self.computed)}"] if self.computed else []
         return f"Rollout({', '.join(own)}, gradients by {', '.join(self.wanted) or 'nothing'})"
 
-    def with_scene(self, **changes) -> "Rollout":
+    def with_scene(self, **changes: Unpack[SceneArguments]) -> "Rollout":
         """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
         return self.on(self.solver.for_scene(self.scene.replace(**changes)))
 
-    def on(self, solver: Solver, **options) -> "Rollout":
+    def on(self, solver: Solver, **options: Unpack[RolloutOptions]) -> "Rollout":
         """As many steps of another solver, with some of the options replaced."""
         steps = self.steps if self.schedule is None else self.schedule
         return Rollout(solver, steps, **self._options | options)
@@ -186,7 +207,7 @@ class Rollout:
 
     # ---- with arrays ------------------------------------------------------------------------------------------------
 
-    def forward(self, law_state: ArrayLike | None = None, **values) -> Frames:
+    def forward(self, law_state: ArrayLike | None = None, **values: InputValue) -> Frames:
         """Run from the scene's inputs, with some of them replaced, and return the saved frames.
 
         law_state: what the law remembers at the start, in the shape of `Simulator.law_state`; gradients are by all else.
@@ -223,7 +244,11 @@ class Rollout:
         return frames
 
     def vjp(
-        self, frames: Frames, positions: ArrayLike | None = None, velocities: ArrayLike | None = None, **seeds
+        self,
+        frames: Frames,
+        positions: ArrayLike | None = None,
+        velocities: ArrayLike | None = None,
+        **seeds: ArrayLike | None,
     ) -> dict[str, np.ndarray]:
         """Gradients of a loss by every wanted input, from its gradients by positions, velocities and other outputs.
 
@@ -249,7 +274,7 @@ class Rollout:
         out = Change()
         for name, seed in seeds.items():
             if name not in self.outputs:
-                raise ValueError(f"no output named {name!r}; this rollout has {', '.join(self.outputs)}")
+                raise ValueError(no_such("output", name, self.outputs, "this rollout"))
             if seed is not None:
                 seed = as_numbers(f"gradient by the frames' {name}", seed)
                 shape = tuple(self.outputs[name].shape(self.num_frames))
@@ -269,12 +294,12 @@ class Rollout:
                 out[name] = out[name] + direct
         return out
 
-    def jvp(self, frames: Frames, **tangents) -> tuple[np.ndarray, np.ndarray]:
+    def jvp(self, frames: Frames, **tangents: InputValue) -> tuple[np.ndarray, np.ndarray]:
         """Changes (positions, velocities) of the frames for changes of inputs, to first order, float64."""
         change = self._pushed_to_frames(frames, tangents)
         return change.positions, change.velocities
 
-    def tangents(self, frames: Frames, **tangents) -> dict[str, np.ndarray]:
+    def tangents(self, frames: Frames, **tangents: InputValue) -> dict[str, np.ndarray]:
         """Changes of all outputs, by name, for changes of inputs, to first order, float64."""
         change = self._pushed_to_frames(frames, tangents)
         return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
@@ -288,7 +313,7 @@ class Rollout:
         tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
-            raise ValueError(f"jvp: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+            raise ValueError(f"jvp: {self.scene.inputs.no_input(unknown[0], 'this rollout', self.inputs)}")
         values = instance("Rollout.tangents", "frames", frames, Frames, "what forward returned").inputs
         zero = {name: np.zeros_like(values[name]) for name in tangents}
         tangents, _ = spread_all(self.scene, zero, tangents, frames.sets)

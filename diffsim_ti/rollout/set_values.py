@@ -19,7 +19,7 @@ def rows_of_sets(scene: Scene, name: str, sets: Iterable[str]) -> Rows:
     unknown sets, and for sets that share tetrahedra."""
     mesh, described = scene.mesh, scene.inputs.described.get(name)
     if described is None:
-        raise ValueError(f"no input named {name!r}; this scene has {', '.join(scene.inputs.described)}")
+        raise ValueError(scene.inputs.no_input(name, "this scene", scene.inputs.described))
     _rule(scene, name)
     out, owner = {}, np.full(mesh.num_tetrahedra, -1)
     named = [key for key in sets if key != "default"]

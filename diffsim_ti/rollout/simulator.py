@@ -2,20 +2,26 @@
 
 import math
 import weakref
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.common.answers import answered
 from diffsim_ti.common.checked import instance, numbers, whole
 from diffsim_ti.common.origin import positions_of
+from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs.step_values import StepValues
+from diffsim_ti.materials import Material
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames
+from diffsim_ti.solvers import SemiImplicitSolver
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.substeps import MOST
 from diffsim_ti.state.bending import FacesBend
@@ -24,7 +30,8 @@ from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import ExternalForce
 
 
-class Simulator:
+@answered
+class Simulator(metaclass=Public):
     """Advances a scene step by step and shows its state.
 
     `Simulator(solver)`, or, for a solver made without a scene, `Simulator(mesh, material, solver)`. contact_forces: note in
@@ -45,13 +52,29 @@ class Simulator:
     0.01 s, -0.0981 m/s, 4905.0 J
     """
 
-    def __init__(self, *arguments, contact_forces: bool = False):
-        solver = arguments[-1] if arguments else None
-        if len(arguments) == 3:
-            solver.bind(arguments[0], arguments[1])
-        elif len(arguments) != 1:
+    @overload
+    def __init__(self, solver: Solver, *, contact_forces: bool = False): ...
+
+    @overload
+    def __init__(
+        self, mesh: TetrahedralMesh, material: Material, solver: SemiImplicitSolver, *, contact_forces: bool = False
+    ): ...
+
+    def __init__(
+        self,
+        mesh: TetrahedralMesh | Solver | None = None,
+        material: Material | None = None,
+        solver: Solver | None = None,
+        *,
+        contact_forces: bool = False,
+    ):
+        if material is None and solver is None:
+            mesh, solver = None, mesh
+        if solver is None or (mesh is None) != (material is None):
             raise TypeError("Simulator takes a solver, or a mesh, a material and a solver")
         instance("Simulator", "its last argument", solver, Solver, "a solver such as SemiImplicitSolver(scene)")
+        if mesh is not None:
+            solver.bind(mesh, material)
         if solver.scene is None:
             raise ValueError(
                 "the solver has no scene: use Simulator(mesh, material, solver), or a solver made from a Scene"

@@ -112,7 +112,7 @@ class Sweep:
             names = tuple(dict.fromkeys((*(name for name in names if name != "shape"), *MOVED)))
         unknown = [name for name in names if name not in self.inputs]
         if unknown:
-            raise ValueError(f"gradients: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+            raise ValueError(f"gradients: {self.scene.inputs.no_input(unknown[0], 'this rollout', self.inputs)}")
         return names
 
     @property
@@ -195,7 +195,7 @@ class Sweep:
         """All values of a run: copies of those given, for callers may change theirs, or what is loaded if it is the same."""
         unknown = [name for name in values if name not in self.inputs]
         if unknown:
-            raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+            raise ValueError(self.scene.inputs.no_input(unknown[0], "this rollout", self.inputs))
         known, kept, given = self._loaded or self.values, {}, {}
         for name, value in values.items():
             self.scene.inputs.warn_if_coarse(name, value)

@@ -75,7 +75,7 @@ class TapeAdapter:
                 self._fields[name] = self._filled(name, self._loaded(name))
                 self._warn_if_coarse(name, name)
             else:
-                raise ValueError(f"no input named {name!r}; this {self.word} has {', '.join(rollout.inputs)}")
+                raise ValueError(rollout.scene.inputs.no_input(name, f"this {self.word}", rollout.inputs))
         return self._fields[name]
 
     def _warn_if_coarse(self, name: str, of: str | None) -> None:

@@ -8,14 +8,18 @@ import os
 import shutil
 import tempfile
 import weakref
+from typing import Literal, TypedDict
 
 import numpy as np
 import taichi as ti
 from taichi._lib import core as _core
 from taichi.lang import impl
 from taichi.lang.misc import _SpecialConfig
+from typing_extensions import Unpack
 
 from diffsim_ti.common import ranks
+from diffsim_ti.common.deprecated import renamed_arguments
+from diffsim_ti.common.names import nearest
 from diffsim_ti.common.warn import warn
 from diffsim_ti.runtime.current_program import current_program
 from diffsim_ti.runtime.device import count_cards
@@ -30,6 +34,24 @@ _OF_TAICHI = "default_ip", "require_version", *vars(_SpecialConfig())  # options
 _settings = {"precision": "f32"}
 
 
+class TaichiOptions(TypedDict, total=False):
+    """Options of `ti.init` that are of use here; it takes its others, too."""
+
+    advanced_optimization: bool
+    debug: bool
+    device_memory_fraction: float
+    device_memory_GB: float
+    gdb_trigger: bool
+    kernel_profiler: bool
+    log_level: str
+    num_compile_threads: int
+    offline_cache: bool
+    offline_cache_file_path: str
+    print_ir: bool
+    random_seed: int
+    verbose: bool
+
+
 def available_archs() -> list[str]:
     """Names of the backends this machine and this Taichi build can run, always with "cpu"."""
     ti.set_logging_level(ti.ERROR)  # a missing driver is an answer here, not a warning
@@ -40,10 +62,17 @@ def _has_arch(name: str) -> bool:
     return {"cpu": lambda: True, "cuda": lambda: count_cards() > 0, "vulkan": _core.with_vulkan}[name]()
 
 
-def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, **options) -> None:
+@renamed_arguments(arch="backend")
+def init(
+    backend: Literal["cpu", "cuda", "vulkan"] = "cpu",
+    precision: Literal["f32", "f64"] = "f32",
+    threads: int | None = None,
+    **options: Unpack[TaichiOptions],
+) -> None:
     """Start Taichi for this process: a thin front of `ti.init`, and the only place that calls it.
 
-    arch: "cpu", "cuda" or "vulkan"; a backend that is not there is an error, never a fall-back.
+    backend: "cpu", "cuda" or "vulkan", as --backend of the command line; one that is not there is an error, never a
+    fall-back.
     precision: "f32" or "f64", what a Scene uses unless it says otherwise.
     threads: CPU threads, default all; of several ranks on one machine each takes its share.
     options: handed to `ti.init`. `fast_math` stays False because it erases NaNs before anyone can see them, and
@@ -53,25 +82,27 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
     Calling it again drops every array of earlier scenes; they say so when used.
     Raises ValueError for an unknown name, TypeError for an unknown option, RuntimeError for a backend that is not available.
     """
-    if arch not in _ARCHS:
-        raise ValueError(f"arch must be one of {', '.join(_ARCHS)}, got {arch!r}")
+    if backend not in _ARCHS:
+        raise ValueError(f"backend must be one of {', '.join(_ARCHS)}, got {backend!r}")
     check_precision(precision)
     ti.set_logging_level(ti.ERROR)
-    if not _has_arch(arch):
-        cardless = arch == "cuda" and _core.with_cuda()
+    if not _has_arch(backend):
+        cardless = backend == "cuda" and _core.with_cuda()
         raise RuntimeError(
-            f"the {arch} backend is not available here (available: {', '.join(available_archs())}"
+            f"the {backend} backend is not available here (available: {', '.join(available_archs())}"
             + ("; CUDA's driver is installed, but sees no card" if cardless else "")
             + "); pass one of those to diffsim_ti.init"
-            + ("" if cardless else f", or install the driver that {arch} needs")
+            + ("" if cardless else f", or install the driver that {backend} needs")
         )
     for name in options:
         if name in ("default_fp", "fast_math"):
             raise ValueError(f"{name} cannot be chosen: diffsim_ti needs default_fp=f64 and fast_math=False")
         if name not in _OF_TAICHI and not hasattr(impl.default_cfg(), name):
+            near = nearest(name, ["arch", "precision", "threads", *TaichiOptions.__annotations__])
+            meant = f" (did you mean {near!r}?)" if near else ""
             raise TypeError(
-                f"init has no argument {name!r}, and neither has ti.init: pass arch={', '.join(map(repr, _ARCHS))}, "
-                "precision, threads, or an option of ti.init such as debug=True"
+                f"init has no argument {name!r}, and neither has ti.init{meant}: pass "
+                f"backend={', '.join(map(repr, _ARCHS))}, precision, threads, or an option of ti.init such as debug=True"
             )
     options.setdefault("log_level", ti.ERROR)
     if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):
@@ -85,7 +116,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
         options["cpu_max_num_threads"] = int(threads)
     set_precision(precision)
     with LOCK, contextlib.redirect_stdout(io.StringIO()):
-        ti.init(arch=_ARCHS[arch], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
+        ti.init(arch=_ARCHS[backend], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
         materialize()  # in this thread, so that others can compile
 
 

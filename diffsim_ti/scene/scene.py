@@ -2,12 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 from copy import copy
+from typing import Literal, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
-from diffsim_ti.common.checked import as_numbers, instance, listed, numbers
+from diffsim_ti.common.checked import as_numbers, instance, listed, number, numbers
 from diffsim_ti.common.copies import MadeAgain
 from diffsim_ti.common.origin import middle_far_part, warn_of_coarse_places
 from diffsim_ti.inputs import ConsistentMass, Inputs
@@ -19,6 +21,7 @@ from diffsim_ti.mechanics.energy.assembled import body_stiffness
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.interactions import NUMBERS, interactions_of
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.sets import values_of_sets
 from diffsim_ti.scene.locking import LOCKING_RATIO, warn_if_locking
 from diffsim_ti.terms import Chamber, Drag, Gravity, Growth, Obstacle, SelfContact, Term
 from diffsim_ti.terms.mass_scaling import MassScaling
@@ -36,13 +39,42 @@ def _kind(term) -> tuple:
     return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
 
 
+def _density(given: ArrayLike | Mapping[str, float], mesh: TetrahedralMesh) -> ArrayLike:
+    """One number or one per tetrahedron, from those of sets too."""
+    if not isinstance(given, Mapping):
+        return given
+    if not given:
+        raise ValueError('density: the dict is empty; name tetrahedron sets, or give a number for "default"')
+    for name, value in given.items():
+        number(f"density[{name!r}]", value, unit="kg/m^3")
+    return values_of_sets("density", given, mesh)
+
+
+class SceneArguments(TypedDict, total=False):
+    """What `Scene` takes, by name: what `Scene.replace` and `Rollout.with_scene` replace."""
+
+    mesh: TetrahedralMesh
+    material: Material
+    density: ArrayLike | Mapping[str, float]
+    terms: Term | Iterable[Term]
+    fixed: Fixed | None
+    motion: Motion | Pose | Mapping[str, Motion | Pose] | None
+    initial_positions: ArrayLike | None
+    initial_velocities: ArrayLike | None
+    precision: Literal["f32", "f64"] | None
+    volume: Literal["tetrahedra", "patches"]
+    mass_scaling: float | None
+    reduced: Mapping[str, str | ArrayLike] | None
+
+
 class Scene(MadeAgain):
     """A body, its material and what acts on it. Frozen: build another scene instead of changing one.
 
     mesh: TetrahedralMesh, the rest shape.
     material: a law with its numbers (materials/).
-    density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4. Ten-node tetrahedra
-        have consistent masses and weight, lumped ones (HRZ) in explicit steps.
+    density [kg/m^3]: one number, one per tetrahedron, or {tetrahedron set: number}, such as bodies by name; vertices carry
+        the lumped mass sum rho V / 4. Ten-node tetrahedra have consistent masses and weight, lumped ones (HRZ) in explicit
+        steps.
     terms: loads, contacts, damping (terms/); gravity, drag, a rotating frame and self-contact at most once. What is not
         listed costs nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act
         one after the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs:
@@ -85,14 +117,14 @@ class Scene(MadeAgain):
         self,
         mesh: TetrahedralMesh,
         material: Material,
-        density: ArrayLike = 1000.0,
+        density: ArrayLike | Mapping[str, float] = 1000.0,
         terms: Term | Iterable[Term] = (),
         fixed: Fixed | None = None,
         motion: Motion | Pose | Mapping[str, Motion | Pose] | None = None,
         initial_positions: ArrayLike | None = None,
         initial_velocities: ArrayLike | None = None,
-        precision: str | None = None,
-        volume: str = "tetrahedra",
+        precision: Literal["f32", "f64"] | None = None,
+        volume: Literal["tetrahedra", "patches"] = "tetrahedra",
         mass_scaling: float | None = None,
         reduced: Mapping[str, str | ArrayLike] | None = None,
     ):
@@ -105,6 +137,7 @@ class Scene(MadeAgain):
         if volume not in ("tetrahedra", "patches"):
             raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
         self.volume = volume
+        density = _density(density, mesh)
         self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
@@ -147,9 +180,10 @@ class Scene(MadeAgain):
         weight, and no mass that was added for the sake of an explicit step."""
         if (self.mesh.order == 1 or self.consistent) and self.mass_scaling is None:
             return self
-        out, names = self._twin(), ("density", "initial_positions", "initial_velocities")
+        out, given = self._twin(), self.arguments
         out.consistent, out.mass_scaling = self.mesh.order > 1, None
-        out.inputs = Inputs(out, *(self.arguments[name] for name in names))
+        density = _density(given["density"], self.mesh)
+        out.inputs = Inputs(out, density, given["initial_positions"], given["initial_velocities"])
         return out
 
     def with_values(self, values: Mapping[str, ArrayLike]) -> "Scene":
@@ -176,7 +210,7 @@ class Scene(MadeAgain):
         count = next(iter(lengths.values()))
         return [self.with_values({name: x[b] for name, x in own.items()}) for b in range(count)]
 
-    def replace(self, **changes) -> "Scene":
+    def replace(self, **changes: Unpack[SceneArguments]) -> "Scene":
         """A scene with some arguments replaced."""
         return Scene(**self.arguments | changes)
 

@@ -1,21 +1,43 @@
 """Symplectic Euler, the seeds' semi-implicit solver."""
 
-from typing import overload
+from typing import Literal, TypedDict, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
-from diffsim_ti.common.checked import whole
+from diffsim_ti.common.answers import answered
+from diffsim_ti.common.checked import between, whole
 from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers.explicit.solver import ExplicitSolver, Weights
+from diffsim_ti.solvers.explicit.solver import CONTACT_DAMPING, ExplicitSolver, Weights
 from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.state.staged_steps import StagedSteps
 from diffsim_ti.state.viscous_stages import MOST, ViscousStages
-from diffsim_ti.terms import Gravity
+from diffsim_ti.terms import Drag, Gravity
 
 
+class SemiImplicitOptions(TypedDict, total=False):
+    """What SemiImplicitSolver takes by name, of a scene or of a mesh and a material."""
+
+    scene: Scene
+    mesh: TetrahedralMesh | None
+    material: Material | None
+    dt: float
+    substeps: int
+    density: ArrayLike
+    gravity: ArrayLike
+    damping: float
+    parallel: bool | None
+    allow_unstable: bool
+    check_start: bool
+    contact: Literal["stage", "force"]
+    contact_damping: float
+
+
+@answered
 class SemiImplicitSolver(ExplicitSolver):
     """Symplectic Euler: v' = (v + h f(x) / m) exp(-c h), x' = x + h v', with h = dt / substeps.
 
@@ -26,9 +48,12 @@ class SemiImplicitSolver(ExplicitSolver):
     the square of their number: strongly damped bodies (KelvinVoigt, damping ratio xi of the fastest motion) take steps that
     cost, with the best number, 1 / 2.1 as much at xi = 5, 1 / 4 at 20, 1 / 9 at 100, and no less at 1 (ViscousStages).
 
-    `SemiImplicitSolver(mesh, material, dt=...)`, or `SemiImplicitSolver(dt=...)` for `Simulator(mesh, material, solver)`,
-    makes the scene itself, with density [kg/m^3] and gravity [m/s^2, along y] and nothing else, and takes a number of
-    `substeps` as the least: it raises it to what stability asks for and says so.
+    `SemiImplicitSolver(scene, dt=...)` takes dt as it is and refuses an unstable one, as every explicit solver does.
+
+    `SemiImplicitSolver(mesh, material, dt=...)`, or `SemiImplicitSolver(dt=...)` for `Simulator(mesh, material, solver)`, is
+    for code that follows torch-diffsim's documents. It makes the scene itself, with density [kg/m^3], gravity [m/s^2, along
+    y], `damping`, the share of velocity kept over one dt (a Drag), and nothing else; `set_fixed_vertices` fixes some. It
+    takes `substeps` as the least number: it raises it to what stability asks for and says so.
     Raises ValueError for `viscous_stages` beyond 32, without viscosity, and with a FilledChamber or reduced sets.
     """
 
@@ -46,6 +71,9 @@ class SemiImplicitSolver(ExplicitSolver):
         parallel: bool | None = None,
         allow_unstable: bool = False,
         check_start: bool = True,
+        *,
+        contact: Literal["stage", "force"] = "stage",
+        contact_damping: float = CONTACT_DAMPING,
         viscous_stages: int = 1,
     ): ...
 
@@ -56,19 +84,26 @@ class SemiImplicitSolver(ExplicitSolver):
         material: Material | None = None,
         dt: float = 0.01,
         substeps: Substeps = "auto",
-        density=1000.0,
-        gravity=-9.8,
+        density: ArrayLike = 1000.0,
+        gravity: ArrayLike = -9.8,
+        damping: float = 1.0,
+        *,
         parallel: bool | None = None,
         allow_unstable: bool = False,
+        contact: Literal["stage", "force"] = "stage",
+        contact_damping: float = CONTACT_DAMPING,
+        viscous_stages: int = 1,
     ): ...
 
-    def __init__(self, *arguments, viscous_stages: int = 1, **options):
+    def __init__(self, *arguments, viscous_stages: int = 1, **options: Unpack[SemiImplicitOptions]):
         self.simulator = lambda: None
         self.viscous_stages = whole("viscous_stages", viscous_stages, 1)
         if self.viscous_stages > MOST:
             raise ValueError(f"viscous_stages must be at most {MOST}, got {viscous_stages}; take more substeps")
         self.kicks = ViscousStages(self.viscous_stages)
         if isinstance(arguments[0] if arguments else options.get("scene"), Scene):
+            if known := [name for name in ("mesh", "material", "density", "gravity", "damping") if name in options]:
+                raise TypeError(f"{type(self).__name__}: a scene has its own {' and '.join(known)}; give them to Scene")
             super().__init__(*arguments, **options)
             return
         self.scene = None
@@ -81,21 +116,41 @@ class SemiImplicitSolver(ExplicitSolver):
             self.bind(mesh, material)
 
     def _keep_for_later(
-        self, mesh=None, material=None, dt=0.01, substeps="auto", density=1000.0, gravity=-9.8, **options
+        self, mesh=None, material=None, dt=0.01, substeps="auto", density=1000.0, gravity=-9.8, damping=1.0, **options
     ) -> tuple:
         """What `bind` needs besides the mesh and the material, which are returned."""
-        self.dt, self.substeps = dt, substeps
-        self._density, self._gravity, self._options = density, gravity, options
+        self.dt, self.substeps, self._fixed = dt, substeps, None
+        kept = between("damping", damping, 0, 1, ends=True)
+        if kept == 0:
+            raise ValueError("damping is the share of velocity kept over one dt and must lie in (0, 1], got 0")
+        self._terms = [Gravity(gravity), *([Drag(-np.log(kept) / dt)] if kept < 1 else [])]
+        self._density, self._options = density, options
         return mesh, material
 
     def bind(self, mesh: TetrahedralMesh, material: Material) -> None:
         """Make the scene of a mesh and a material, and choose the substeps."""
         if self.scene is not None:
             raise ValueError("this solver already has a scene: use Simulator(solver)")
-        scene = Scene(mesh, material, self._density, Gravity(self._gravity))
+        scene = Scene(mesh, material, self._density, self._terms, self._fixed)
         super().__init__(scene, self.dt, self.substeps, **self._options, check_start=False)
         self.choose_substeps()
         self.check_start = True
+
+    def set_fixed_vertices(self, vertices: str | ArrayLike) -> None:
+        """Fix a vertex set's name, indices or a mask, of a solver that makes its scene itself, before a Simulator is made.
+
+        Raises ValueError for a solver made from a Scene, whose `fixed` says it, and RuntimeError where one runs already.
+        """
+        if not hasattr(self, "_terms"):
+            raise ValueError("set_fixed_vertices: this solver has a Scene of its own: give it fixed=vertices")
+        if self.simulator() is not None:
+            raise RuntimeError(
+                "set_fixed_vertices: a simulator runs this solver already: call it before Simulator(...)"
+            )
+        self._fixed = vertices
+        if self.scene is not None:
+            made, self.scene = self.scene, None
+            self.bind(made.mesh, made.material)
 
     @property
     def positions(self):

@@ -1,16 +1,17 @@
 """What every solver is: a scene, a step, and how the step is divided."""
 
 import math
-from abc import ABC
 from collections.abc import Mapping
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import number, shown
+from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.monitor import stability
@@ -22,7 +23,24 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-class Solver(ABC):
+class SolverOptions(TypedDict, total=False):
+    """What solvers take besides the scene; each takes those that its constructor names."""
+
+    dt: float
+    substeps: int
+    load_steps: int
+    parallel: bool | None
+    allow_unstable: bool
+    check_start: bool
+    contact: Literal["stage", "force"]
+    contact_damping: float
+    viscous_stages: int
+    tolerance: float
+    max_iterations: int
+    preconditioner: Literal["auto", "block_jacobi", "multigrid"]
+
+
+class Solver(metaclass=Public):
     """Advances a scene by steps of dt [s], each divided into `substeps` equal substeps.
 
     substeps: a number, or "auto" of explicit solvers: one where dt is stable at the start (`stable_dt`), else so many that
@@ -93,7 +111,7 @@ class Solver(ABC):
         own = dict(scene=self.scene) | {name: getattr(self, name) for name in self.arguments}
         return _on_schedule, (type(self), own, self._schedule)
 
-    def for_scene(self, scene: "Scene", **changes) -> "Solver":
+    def for_scene(self, scene: "Scene", **changes: Unpack[SolverOptions]) -> "Solver":
         """The same solver for another scene, with some arguments replaced."""
         return type(self)(scene, **{name: getattr(self, name) for name in self.arguments} | changes)
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from diffsim_ti.common.checked import instance
+from diffsim_ti.common.public import public
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.stability import StepLimit, element_limit, lanczos_limit
 from diffsim_ti.monitor.stiffest import stiffest
@@ -10,6 +11,7 @@ from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.semi_implicit import SemiImplicitSolver
 
 
+@public
 def stable_dt(scene: Scene, tight: bool = True) -> StepLimit:
     """Largest stable explicit step [s] of a scene at its start.
 

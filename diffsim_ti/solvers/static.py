@@ -1,6 +1,6 @@
 """Equilibria."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from diffsim_ti.mechanics.supports.mobility import free_motions
 from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
@@ -44,7 +44,7 @@ class StaticSolver(ImplicitSolver):
         max_iterations: int = 100,
         dt: float = 1.0,
         parallel: bool | None = None,
-        preconditioner: str = "auto",
+        preconditioner: Literal["auto", "block_jacobi", "multigrid"] = "auto",
     ):
         self.check_scene(scene)
         for x in scene.interactions:

@@ -8,17 +8,18 @@ r + 1. Pass j begins at the share `begin` of its step and ends at the share `end
 Rows may be arrays of any shape; nothing here says that they are three numbers.
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.common.public import Public
 from diffsim_ti.state.pass_table import FLOATS, INTS, add_between, between
 
 
-class Schedule(ABC):
+class Schedule(metaclass=Public):
     """Steps, each of equal passes; j may be a number or an array of passes, which may end one beyond the last.
 
     varies: whether passes may differ in length.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.copies import CarriesMore
 from diffsim_ti.common.progress import Steady
+from diffsim_ti.common.public import Public
 
 
 class Buckled(CarriesMore, UserWarning):
@@ -56,7 +57,7 @@ class StepReport:
         self.residuals = (self.residuals or []) + [list(solve.residuals)]
 
 
-class SolveReport:
+class SolveReport(metaclass=Public):
     """`steps`: a StepReport for each of the last 10 000 steps, empty for explicit solvers, which solve nothing; `seconds`
     and `substeps`, of all. Totals: `iterations`, `products`, `energies`, `cuts`, `blocked`, `indefinite`, `saddles`;
     `residual`: the largest with which a step ended. Of a Rollout's last forward run, or of a Simulator since its reset;

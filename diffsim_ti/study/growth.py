@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from diffsim_ti.common.public import public
 from diffsim_ti.materials import SmithNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
@@ -36,6 +37,7 @@ class Growth:
         return f"gradients grow to {self.sizes[:, -1].max():.3g} at rate {self.rate:.3g} 1/s; {until}"
 
 
+@public
 def growth(
     solver: Solver, steps: int, frames: int = 50, directions: int = 2, useful: float = 1e-2, seed: int = 0
 ) -> Growth:

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.copies import made_again
+from diffsim_ti.common.names import no_such
+from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 
@@ -51,7 +53,7 @@ class FrameLoss:
 
 
 @dataclass(frozen=True)
-class Problem:
+class Problem(metaclass=Public):
     """What is computed, over how long, and against what it is measured.
 
     scene(cells, pattern, precision, **element) -> Scene, on a mesh of so many cells across.
@@ -119,7 +121,7 @@ class Problem:
             raise ValueError(f"duration must be > 0 [s], got {duration:g}")
         origin = cls.of_scene, (scene, duration, name, frames, gradient)
         if gradient is not None and gradient not in scene.inputs.values:
-            raise ValueError(f"no input named {gradient!r}; this scene has {', '.join(scene.inputs.values)}")
+            raise ValueError(no_such("input", gradient, scene.inputs.values, "this scene"))
 
         def build(cells, pattern, precision, **element):
             return scene.replace(precision=precision, **element)

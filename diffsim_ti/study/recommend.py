@@ -5,12 +5,14 @@ from concurrent.futures import Executor
 
 import numpy as np
 
+from diffsim_ti.common.public import public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.study.recommendation import Recommendation
 from diffsim_ti.study.trials import Trials
 
 
+@public
 def recommend(
     scene: Scene,
     duration: float,

@@ -3,8 +3,10 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from typing_extensions import Unpack
 
 from diffsim_ti.rollout import Rollout
+from diffsim_ti.rollout.rollout import RolloutOptions
 from diffsim_ti.scene import Scene
 from diffsim_ti.study.alternatives import Alternative
 from diffsim_ti.study.elements import ElementTrial
@@ -57,7 +59,7 @@ class Recommendation:
     steps = property(lambda self: self.option.steps)
     seconds = property(lambda self: self.option.seconds)
 
-    def rollout(self, scene: Scene, frames: int = 1, **options) -> Rollout:
+    def rollout(self, scene: Scene, frames: int = 1, **options: Unpack[RolloutOptions]) -> Rollout:
         """The recommended run of the scene, `frames` times saved; options are Rollout's."""
         substeps = -(-self.steps // frames)
         solver = self.solver(scene.replace(precision=self.precision), dt=self.duration / frames, substeps=substeps)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.common.public import public
 from diffsim_ti.materials import KelvinVoigt, SmithNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.stability import Stiffness
@@ -15,6 +16,7 @@ from diffsim_ti.terms import Ground, Muscle, SelfContact, Term
 from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 
 
+@public
 def power_limit(scene: Scene, rounds: int = 3000, tolerance: float = 1e-7) -> float:
     """The explicit limit 2 / omega_max [s] at the scene's start, by plain power iteration on the assembled stiffness.
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import public
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
@@ -112,6 +113,7 @@ def kept_energy(solver: Solver, mass: np.ndarray, v: np.ndarray, du: np.ndarray,
     return float(-(h**2 / 8 * f * f / mass).sum())
 
 
+@public
 def boundary(scene: Scene, kind: type[Solver], steps: int = 2000, accuracy: float = 0.005) -> float:
     """Largest dt [s] at which the solver, its refusal overridden, stays bounded: by bisection around the limit.
 
@@ -180,6 +182,7 @@ SHARES = {
 }
 
 
+@public
 def stability_map(
     kind: type[Solver],
     axis: Axis,

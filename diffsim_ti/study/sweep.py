@@ -13,6 +13,7 @@ import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.progress import progress
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.monitor.stability import element_limit
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.rollout.set_values import split_name, spread_all
@@ -26,7 +27,7 @@ TURN = threading.Lock()  # workers of one process take turns, as Taichi does
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(metaclass=Public):
     """How a scene is run where no rollout is given: solver class, duration [s] and number of frames."""
 
     solver: type = VelocityVerletSolver
@@ -85,6 +86,7 @@ def largest_motion(frames: Frames) -> dict[str, float]:
     return out
 
 
+@public
 def sweep(
     make: Callable[..., Scene | Rollout] | Scene | Rollout,
     over: Mapping[str, Sequence[float]],

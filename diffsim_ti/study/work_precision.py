@@ -11,6 +11,7 @@ import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.progress import progress
+from diffsim_ti.common.public import public
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver, stable_dt
@@ -267,6 +268,7 @@ class Runs:
                 )
 
 
+@public
 def chart(
     problem: Problem,
     solvers: Sequence[type[Solver]] | None = None,

@@ -4,13 +4,13 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import POSITIVE, Input, Link
 from diffsim_ti.inputs.chambers import RestVolume
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.enclosure import Enclosure
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.gas_law import gas_law
 from diffsim_ti.terms.marks import pressing
@@ -84,7 +84,7 @@ class GasChamber(Chamber):
     def __init__(
         self,
         pressure: OverTime,
-        surface: str | ArrayLike | None = None,
+        surface: SetOrIndices | None = None,
         outside: float = ATMOSPHERE,
         exponent: float = 1.0,
         name: str | None = None,
@@ -121,5 +121,5 @@ class FilledChamber(Chamber):
 
     holds, row_names = True, ("volume", "rest")
 
-    def __init__(self, volume: OverTime, surface: str | ArrayLike | None = None, name: str | None = None):
+    def __init__(self, volume: OverTime, surface: SetOrIndices | None = None, name: str | None = None):
         super().__init__("volume", volume, "m^3", "chamber_volume", surface, name)

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.inputs.description import length
+from diffsim_ti.mesh import TetrahedralMesh
 
 
 def positive(argument: str, value: ArrayLike, unit: str, plain: str = "") -> Input:
@@ -23,3 +24,8 @@ def extent(argument: str, value: ArrayLike, plain: str) -> Input:
     """A size of an obstacle's shape: one number > 0 [m]."""
     present(argument, value)
     return Input(argument, value, ((),), "m", POSITIVE, plain=plain)
+
+
+def share_of_body(mesh: TetrahedralMesh, share: float) -> float:
+    """A share of the size of the smallest body [m], with three digits."""
+    return float(f"{share * mesh.body_size:.3g}")

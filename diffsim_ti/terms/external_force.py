@@ -8,6 +8,7 @@ from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import PerStep
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.marks import arrows
 from diffsim_ti.terms.term import Term
 
@@ -22,7 +23,7 @@ class ExternalForce(Term):
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
     """
 
-    def __init__(self, forces: ArrayLike, vertices: str | ArrayLike | None = None, name: str | None = None):
+    def __init__(self, forces: ArrayLike, vertices: SetOrIndices | None = None, name: str | None = None):
         present("forces", forces)
         shapes = (3,), ("k", 3), ("steps", "k", 3)
         super().__init__(Input("forces", forces, shapes, "N", plain="external_forces", label="forces"), name=name)

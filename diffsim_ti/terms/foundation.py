@@ -6,6 +6,7 @@ from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.foundation import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.lines import AT_LEAST_0
 from diffsim_ti.terms.marks import MOST, Points, spread
 from diffsim_ti.terms.term import OnMesh, OnSurface, Term
@@ -34,7 +35,7 @@ class ElasticFoundation(OnSurface, OnMesh, Term):
         self,
         normal: ArrayLike,
         tangential: ArrayLike = 0.0,
-        surface: str | ArrayLike | None = None,
+        surface: SetOrIndices | None = None,
         name: str | None = None,
     ):
         present("normal", normal), present("tangential", tangential)

@@ -1,14 +1,14 @@
 """Growth over time: what each tetrahedron's rest state has grown by, while a run goes on."""
 
-from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import Input, Link, Range
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.of_tetrahedra import OfTetrahedra
 from diffsim_ti.terms.over_time import OverTime
 from diffsim_ti.terms.term import Term, nonempty
@@ -46,8 +46,8 @@ class Growth(OfTetrahedra, Term):
     def __init__(
         self,
         growth: OverTime,
-        tetrahedra: str | Sequence[str] | ArrayLike | None = None,
-        per: str = "all",
+        tetrahedra: SetOrIndices | None = None,
+        per: Literal["all", "set", "tetrahedron"] = "all",
         name: str | None = None,
     ):
         present("growth", growth)

@@ -4,8 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import numbers, present
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.description import Range, length
 from diffsim_ti.inputs.lines import LineRows, Segments
@@ -24,7 +26,7 @@ def _at_least_0(x):
 AT_LEAST_0 = Range(">= 0", _at_least_0, in_runs=False)  # differences about 0 step below it
 
 
-class Anchor:
+class Anchor(metaclass=Public):
     """A point fixed in space, or several: position [m], shape (3,) or (k, 3). Springs and cables may end there.
 
     Raises ValueError for other shapes and what is not finite.
@@ -41,7 +43,7 @@ class Anchor:
         return f"Anchor({self.position.tolist()})"
 
 
-Point = int | str | ArrayLike | Anchor  # vertices, material points as places at rest, anchors
+Point = TypeAliasType("Point", int | str | ArrayLike | Anchor)  # vertices, material points as places at rest, anchors
 
 
 class LineTerm(OnMesh, Term):

@@ -1,11 +1,13 @@
 """Loads on surfaces and volumes: traction, pressure, body force."""
 
+from typing import Literal
+
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Link
 from diffsim_ti.inputs.loads import ConsistentShares, InTime, Spread, VertexAreas, VertexShares
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import arrows, pressing
 from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
@@ -57,7 +59,7 @@ class Traction(OnSurface, Load):
 
     shape = (3,)
 
-    def __init__(self, traction: OverTime, surface: str | ArrayLike | None = None, name: str | None = None):
+    def __init__(self, traction: OverTime, surface: SetOrIndices | None = None, name: str | None = None):
         super().__init__("traction", traction, "N/m^2", "traction", name)
         self.surface = surface
 
@@ -93,7 +95,11 @@ class BodyForce(Load):
     shape = (3,)
 
     def __init__(
-        self, force: OverTime, tetrahedra: str | ArrayLike | None = None, per: str = "volume", name: str | None = None
+        self,
+        force: OverTime,
+        tetrahedra: SetOrIndices | None = None,
+        per: Literal["volume", "mass"] = "volume",
+        name: str | None = None,
     ):
         if per not in ("volume", "mass"):
             raise ValueError(f'BodyForce: per must be "volume" [N/m^3] or "mass" [m/s^2], got {per!r}')
@@ -142,7 +148,7 @@ class Pressure(OnSurface, Load):
     doi:10.1017/CBO9780511755446.
     """
 
-    def __init__(self, pressure: OverTime, surface: str | ArrayLike | None = None, name: str | None = None):
+    def __init__(self, pressure: OverTime, surface: SetOrIndices | None = None, name: str | None = None):
         super().__init__("pressure", pressure, "Pa", "pressure", name)
         self.surface = surface
 

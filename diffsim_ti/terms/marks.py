@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import triangle_normals
 
@@ -30,7 +31,7 @@ class Moment:
 
 
 @dataclass(frozen=True, repr=False)
-class Arrows:
+class Arrows(metaclass=Public):
     """Arrows at points [m], shape (k, 3), of vectors of a unit, (k, 3). Those of one label have one scale in a picture,
     whose longest is named in its key. onto: which end at their point, as what pushes, (k,) of bool; others begin there.
     through: whether they are seen through bodies, as forces between two must be."""
@@ -45,7 +46,7 @@ class Arrows:
 
 
 @dataclass(frozen=True, repr=False)
-class Lines:
+class Lines(metaclass=Public):
     """Straight lines, such as springs: their two ends [m], shape (k, 2, 3)."""
 
     label: str
@@ -55,7 +56,7 @@ class Lines:
 
 
 @dataclass(frozen=True, repr=False)
-class Points:
+class Points(metaclass=Public):
     """Discs at points [m], shape (k, 3)."""
 
     label: str
@@ -67,6 +68,7 @@ class Points:
 Mark = Arrows | Lines | Points
 
 
+@public
 def arrows(
     label: str, mesh: TetrahedralMesh, positions: np.ndarray, vertices: ArrayLike, vectors: np.ndarray, most: int = MOST
 ) -> Arrows:

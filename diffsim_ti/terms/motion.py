@@ -4,11 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import numbers, shown
 
 # a function of time [s], or keyframes (times [s], displacements [m])
-Motion = Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike]
+Motion = TypeAliasType("Motion", Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike])
 
 
 def sampled(name: str, motion: Motion, times: ArrayLike, k: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Muscles: fibres in tetrahedra that pull along themselves as far as they are activated."""
 
-from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +11,7 @@ from diffsim_ti.inputs.lines import LineRows, Segments
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.inputs.muscles import MuscleTension
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.terms.lines import AT_LEAST_0, Cable
 from diffsim_ti.terms.marks import MOST, Lines, spread
@@ -44,8 +45,8 @@ class Muscle(OfTetrahedra, Cable):
         fibre: ArrayLike,
         stress: ArrayLike,
         activation: OverTime,
-        tetrahedra: str | Sequence[str] | ArrayLike | None = None,
-        per: str = "all",
+        tetrahedra: SetOrIndices | None = None,
+        per: Literal["all", "set", "tetrahedron"] = "all",
         name: str | None = None,
     ):
         amount, shape = self._take("activation", activation, "activation", tetrahedra, per)

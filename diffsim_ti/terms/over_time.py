@@ -4,12 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.inputs import Input
 
 # what holds all the time, one for each step, a function of time [s], or keyframes (times [s], values)
-OverTime = ArrayLike | Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike]
+OverTime = TypeAliasType("OverTime", ArrayLike | Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike])
 
 
 class GivenOverTime:

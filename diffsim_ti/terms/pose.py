@@ -7,12 +7,13 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common import rotations
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs.poses import between, quaternions
 from diffsim_ti.terms.motion import Motion, sampled
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class Pose(metaclass=Public):
     """A motion of fixed vertices as of a rigid body, c + t + R (x - c): a clamp that rotates.
 
     path: a function of time [s], or keyframes (times, poses), of 6 numbers, a displacement t [m] and a rotation vector

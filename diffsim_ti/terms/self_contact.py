@@ -11,8 +11,10 @@ from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.collision_surface import cuts_of
 from diffsim_ti.mesh.face_points import bow
-from diffsim_ti.terms.described import positive
+from diffsim_ti.terms.described import positive, share_of_body
 from diffsim_ti.terms.term import Term
+
+SHARE = 0.001  # of the body, the width of a barrier whose width is left to the scene
 
 
 class SelfContact(Term):
@@ -20,7 +22,8 @@ class SelfContact(Term):
 
     Energy of a pair at distance d: m b(d) with b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero
     beyond (barrier.py); m fades out edges that become parallel (proximity.py), with lengths as in the mesh.
-    Pairs that share a vertex do not count. stiffness [N/m], width [m].
+    Pairs that share a vertex do not count. stiffness [N/m]; width [m], None: 0.1 % of the smallest body (`mesh.body_size`),
+    which `scene.describe()` says.
     Where ten-node faces are curved by a tenth of the width or more, primitives are those of a finer surface on the curved
     faces (mesh/collision_surface.py), whose new vertices are in the sets that all of their nodes are in.
 
@@ -62,7 +65,7 @@ class SelfContact(Term):
     def __init__(
         self,
         stiffness: float = 1e4,
-        width: float = 1e-3,
+        width: float | None = None,
         name: str | None = None,
         friction: float | Mapping[tuple[str, str], float] = 0.0,
         friction_speed: float = 1e-3,
@@ -78,9 +81,10 @@ class SelfContact(Term):
         for described in (speed, mu):  # also of what is smooth
             described.check_value("SelfContact")
         self.has_friction = bool(np.any(mu.value > 0))
+        self.left_to_scene = ("self_contact_width",) * (width is None)
         super().__init__(
             positive("stiffness", stiffness, "N/m", "self_contact_stiffness"),
-            positive("width", width, "m", "self_contact_width"),
+            positive("width", 1.0 if width is None else width, "m", "self_contact_width"),
             *((speed, mu) if self.has_friction else ()),
             name=name,
         )
@@ -95,9 +99,18 @@ class SelfContact(Term):
                 both = f"{pair!r} and {pair[::-1]!r}"
                 raise ValueError(f"SelfContact: friction has {both}, which are one pair: name it once")
 
+    def _on(self, mesh: TetrahedralMesh) -> "SelfContact":
+        """With the width that a mesh asks for."""
+        left = "self_contact_width" in self.left_to_scene
+        return self.with_input("self_contact_width", value=share_of_body(mesh, SHARE)) if left else self
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "SelfContact":
+        return self._on(scene.mesh)
+
     def check(self, mesh: TetrahedralMesh) -> None:
-        width = float(self.values["self_contact_width"])
-        off = bow(mesh) / 4 ** cuts_of(mesh, self)  # so far faces may reach through
+        own = self._on(mesh)
+        width = float(own.values["self_contact_width"])
+        off = bow(mesh) / 4 ** cuts_of(mesh, own)  # so far faces may reach through
         if off > width:
             warn(
                 f"{type(self).__name__}: faces of this mesh are curved, and lie up to {off:.3g} m from the triangles that "

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import numbers, shown
 from diffsim_ti.common.warn import warn
@@ -15,7 +16,7 @@ from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.pose import Pose
 
 # a vertex set's name, several, indices or a mask: fixed wholly; or {name of a set: in which directions it is fixed}
-Fixed = str | ArrayLike | Mapping[str, str | ArrayLike]
+Fixed = TypeAliasType("Fixed", str | ArrayLike | Mapping[str, str | ArrayLike])
 AXES = {"x": 0, "y": 1, "z": 2}
 
 
@@ -146,7 +147,7 @@ def _warn_of_several_bodies(mesh: TetrahedralMesh, fixed: Fixed | None) -> None:
     """Say which sets hold several bodies because these had sets of one name before they were joined."""
     given = [fixed] if isinstance(fixed, str) else fixed if isinstance(fixed, Mapping | list | tuple) else ()
     for name in (name for name in given if isinstance(name, str)):
-        if parts := parts_of_joined(mesh.vertex_sets, name):
+        if parts := parts_of_joined(mesh, name):
             warn(
                 f"fixed: {name!r} contains {len(parts)} bodies, whose sets of this name were joined; name those that are "
                 f"meant: {', '.join(map(repr, parts))}"

@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.rows import indices
 from diffsim_ti.inputs import Input, Range
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.term import Term, nonempty
 
 
@@ -45,7 +46,7 @@ class SurfaceDrag(Term):
         normal: float = 1.0,
         tangential: float = 0.1,
         stream: ArrayLike = (0.0, 0.0, 0.0),
-        surface: str | ArrayLike | None = None,
+        surface: SetOrIndices | None = None,
         name: str | None = None,
     ):
         super().__init__(

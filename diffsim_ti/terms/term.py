@@ -1,6 +1,5 @@
 """What a term is: a load, a contact or a damping that a scene lists, inlined into the step at compile time."""
 
-from abc import ABC
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -9,6 +8,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.runtime import number_type
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-class Term(ABC):
+class Term(metaclass=Public):
     """A load, contact or damping: its inputs, in SI units and float64, and how kernels come to read them.
 
     name: a word that its inputs' names begin with, "floor.stiffness"; without one they have plain names,
@@ -35,6 +35,7 @@ class Term(ABC):
     path = None  # displacement over time, of an obstacle that moves
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
     variant: tuple = ()  # what else than its class decides about the kernels of a term
+    left_to_scene: tuple[str, ...] = ()  # plain names of the numbers that the scene chooses (`settled`)
     keyed = False  # whether its input is sampled at the ends of each run's steps (`rows`)
     stiffest = None  # np.max or np.min: which of what it is given over time asks for the shortest steps
 
@@ -58,10 +59,11 @@ class Term(ABC):
         """{plain name of an input: the tensor that it was given as}"""
         return {i.plain: i.given for i in self.described if i.given is not None}
 
-    def with_input(self, plain: str, **changes) -> "Term":
-        """A copy in which the input of a plain name has another value, shapes ..."""
+    def with_input(self, plain: str, **changes: object) -> "Term":
+        """A copy in which the input of a plain name has another value, shapes ..., fields of `Input`."""
         out = copy(self)
         out.described = tuple(replace(i, **changes) if i.plain == plain else i for i in self.described)
+        out.left_to_scene = tuple(name for name in self.left_to_scene if name != plain)
         return out
 
     @property
@@ -127,7 +129,8 @@ class Term(ABC):
     def __repr__(self) -> str:
         named = [] if self.name is None else [f"name={self.name!r}"]
         short = lambda x: f"array{x.shape}" if x.size > 3 else np.array2string(x, separator=", ", precision=6)  # noqa: E731
-        numbers = [f"{name}={short(value)}" for name, value in self.values.items()]
+        left = {name: "chosen by the scene" for name in self.left_to_scene}
+        numbers = [f"{name}={left.get(name) or short(value)}" for name, value in self.values.items()]
         return f"{type(self).__name__}({', '.join(named + numbers)})"
 
 
@@ -161,7 +164,7 @@ class OnSurface:
 
 
 @dataclass(frozen=True)
-class VertexForce(ABC):
+class VertexForce(metaclass=Public):
     """Device counterpart of a term: Taichi functions of one vertex, at rest position X, displacement u, velocity v.
 
     Vectors have four components, the last zero. Equal counterparts share compiled kernels, and those of one scene a loop.

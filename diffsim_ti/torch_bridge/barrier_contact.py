@@ -1,11 +1,12 @@
 """PyTorch interface: contact with a floor as a torch formula, and as the core's term with the same numbers."""
 
+from diffsim_ti.common.public import Public
 from diffsim_ti.terms import Ground
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.torch_bridge.autograd import torch
 
 
-class DifferentiableBarrierContact:
+class DifferentiableBarrierContact(metaclass=Public):
     """Smooth ground contact by a barrier; a plain torch formula, differentiable as often as wanted.
 
     b(d) = -kappa (d - d_hat)^2 log(d / d_hat) for d < d_hat [J], zero beyond, C2; below d_hat / 1000 its Taylor polynomial.

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffsim_ti.common import ranks
+from diffsim_ti.common.public import Public
 
 if TYPE_CHECKING:
     import torch
 
 
-class Ensemble:
+class Ensemble(metaclass=Public):
     """Members (rollouts, batches, experiments, of any meshes) that the ranks of `torch.distributed` share among them.
 
     members: one after the other; with make, what it makes them from: `make(member)` is called where the member is worked on,

@@ -3,10 +3,12 @@ only ours."""
 
 import numpy as np
 
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
 
 
+@public
 def conjugate_gradient(A, b: torch.Tensor, x0: torch.Tensor | None = None, max_iters: int = 100, atol: float = 1e-6):
     """Solve A x = b for a symmetric positive definite operator given by products A(v); |b - A x| <= atol.
 
@@ -83,7 +85,7 @@ class _Implicit(torch.autograd.Function):
         return None, None, None, *(next(grads) if p.requires_grad else None for p in params)
 
 
-class ImplicitDifferentiation:
+class ImplicitDifferentiation(metaclass=Public):
     """Gradients through a solution by the implicit function theorem: dx*/dp = -(dF/dx)^-1 dF/dp."""
 
     @staticmethod

@@ -7,6 +7,7 @@ import numpy as np
 from diffsim_ti.batch import Batch
 from diffsim_ti.common.brief import brief
 from diffsim_ti.common.origin import START_NEARER, warn_of_rounding
+from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.rollout.shape import spread_shape
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
@@ -23,7 +24,7 @@ class _States(NamedTuple):
     displacements: torch.Tensor
 
 
-class TorchFrames(_States):
+class TorchFrames(_States, metaclass=Public):
     """Saved states as tensors of shape (frames, num_vertices, 3): positions [m] (far from the origin in float64), velocities
     [m/s], displacements [m].
 

@@ -1,7 +1,7 @@
 """Drawing: frame after frame of one body, with the same camera, colours, floor, obstacles and legend, by either back end."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,6 +53,17 @@ def held_along(mesh: TetrahedralMesh, vertices: np.ndarray, held: np.ndarray) ->
         clear = np.abs(along) > 1e-6 * np.abs(away).max()
         axes = np.where((clear & (along < 0))[:, None], -axes, axes)
     return vertices[rank == 3], vertices[which], axes
+
+
+class Look(TypedDict, total=False):
+    """How a body is seen; `Drawing` says what each means and is where it is left out."""
+
+    camera: Camera | None
+    azimuth: float
+    elevation: float
+    fixed: ArrayLike | None
+    held: ArrayLike | None
+    wireframe: bool
 
 
 class Drawing:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
@@ -23,7 +24,7 @@ from diffsim_ti.visual.scene_marks import marks_of
 
 
 @dataclass(repr=False)
-class Setting:
+class Setting(metaclass=Public):
     """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand.
 
     held: of fixed vertices the projectors onto the directions in which each is fixed, shape (len(fixed), 3, 3), where some
@@ -46,7 +47,7 @@ class Setting:
 
 
 @dataclass(repr=False)
-class Frame:
+class Frame(metaclass=Public):
     """A moment of a run.
 
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
@@ -97,8 +98,8 @@ class Frame:
         return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
 
     @classmethod
-    def of(cls, simulator: Simulator, outputs: Iterable[Output] = (), last: Simulator | None = None, **more) -> "Frame":
-        """The present state of a simulator, in its scene's precision. more: further arguments of the class.
+    def of(cls, simulator: Simulator, outputs: Iterable[Output] = (), last: Simulator | None = None) -> "Frame":
+        """The present state of a simulator, in its scene's precision.
 
         outputs: become fields as in `of_run`; last: the simulator that took the last step to this state, if another did.
         """
@@ -112,7 +113,7 @@ class Frame:
         by = last or simulator
         shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)
         shown |= _loads(scene, x, simulator.step_count, simulator.values_of_step)
-        return cls(simulator.time, x, u, v, fields | shown, moved, **dict(marks=drawn, units=units) | more)
+        return cls(simulator.time, x, u, v, fields | shown, moved, marks=drawn, units=units)
 
 
 def _strained(scene: Scene, frames: Frames, k: int) -> dict[str, np.ndarray]:

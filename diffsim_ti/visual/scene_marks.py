@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.common.public import public
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms.marks import Arrows, Mark, Moment, arrows
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 OF_A_RESULT = 200  # arrows that are drawn of one
 
 
+@public
 def marks_of(
     scene: Scene, positions: np.ndarray, time: float = 0.0, step: int = 0, values: Mapping | None = None
 ) -> list[Mark]:

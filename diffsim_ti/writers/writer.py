@@ -1,10 +1,11 @@
 """What writes the frames of a run, chosen by the suffix of the file: one class per format, registered by its suffixes."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.rollout import Frames
 from diffsim_ti.scene import Scene
 from diffsim_ti.visual.camera import Camera
@@ -16,7 +17,7 @@ WRITERS: dict[str, type["Writer"]] = {}
 
 
 @dataclass(frozen=True)
-class View:
+class View(metaclass=Public):
     """How a run is shown, for formats that draw it.
 
     colour: a name in visual/fields.py; None for von Mises stress where frames hold it, else displacement. fps: frames per
@@ -59,7 +60,7 @@ class View:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
 
 
-class Writer(ABC):
+class Writer(metaclass=Public):
     """Writes the frames of a run to `path`: made before anything runs, then `open`, `write` each frame, `close`.
 
     A format of one's own: a subclass with `suffixes` and these methods, given to `register`. The constructor raises what
@@ -103,6 +104,7 @@ def register(kind: type[Writer]) -> type[Writer]:
     return kind
 
 
+@public
 def writer_for(path: str | Path, view: View | None = None) -> Writer:
     """The writer for a file, by its suffix. Raises ValueError for one that is not known, naming those that are."""
     suffix = Path(path).suffix.lower()
@@ -111,6 +113,7 @@ def writer_for(path: str | Path, view: View | None = None) -> Writer:
     return WRITERS[suffix](path, view)
 
 
+@public
 def open_writer(path: str | Path, scene: Scene, view: View | None = None) -> Writer:
     """The writer for a file, opened for runs of a scene: `with open_writer("run.mp4", scene) as out: out.write(...)`."""
     writer = writer_for(path, view)

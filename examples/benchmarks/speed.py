@@ -86,7 +86,7 @@ def batch_work(resolution: int, scenes: int, precision: str, contact: bool) -> t
     n, rng = one.scene.mesh.num_vertices, np.random.default_rng(0)
     values = {"mu": one.sweep.values["mu"] * rng.uniform(0.9, 1.1, scenes)}
     if contact:
-        floor, forces = ds.Ground(-0.011, friction=0.3), ds.ExternalForce(np.zeros((n, 3)))
+        floor, forces = ds.Ground(-0.011, width=0.01, friction=0.3), ds.ExternalForce(np.zeros((n, 3)))
         one = one.with_scene(terms=[*one.scene.terms, floor, forces], initial_positions=one.scene.mesh.vertices)
         values["external_forces"] = rng.normal(size=(scenes, n, 3)) / n
     rollout = ds.Rollout(one.solver, BATCH_STEPS, gradients=["mu", "lam", "initial_positions"])

@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from diffsim_ti import TetrahedralMesh
-from diffsim_ti.diff_physics import DifferentiableMaterial
-from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+import diffsim_ti as ds
 from diffsim_ti.film import save_film
 from diffsim_ti.obstacles import ball
 from diffsim_ti.optimization import Optimization
@@ -31,20 +29,20 @@ class Arm:
     """A block that stands on its fixed base, with a tendon along each upright edge."""
 
     def __init__(self):
-        self.mesh = TetrahedralMesh.create_box([2, 7, 2], [WIDTH, HEIGHT, WIDTH], origin=(-WIDTH / 2, 0.0, -WIDTH / 2))
+        self.mesh = ds.TetrahedralMesh.create_box(
+            [2, 7, 2], [WIDTH, HEIGHT, WIDTH], origin=(-WIDTH / 2, 0.0, -WIDTH / 2)
+        )
         x = self.mesh.vertices
         edges = [(sx * WIDTH / 2, sz * WIDTH / 2) for sx in (1, -1) for sz in (1, -1)]
         along = [np.nonzero(np.all(np.abs(x[:, ::2] - edge) < 1e-9, axis=1))[0] for edge in edges]
         self.tendons = torch.from_numpy(np.stack([line[np.argsort(x[line, 1])] for line in along]))
         self.tip = torch.from_numpy(np.nonzero(x[:, 1] > HEIGHT - 1e-9)[0])
-        material = DifferentiableMaterial(1e5, 0.3, requires_grad=False)
-        solver = DifferentiableSolver(dt=0.02, gravity=-9.8, damping=0.85, substeps=20)
-        options = dict(density=500.0, fixed_vertices="ymin", contact=False)
-        self.simulator = DifferentiableSimulator(self.mesh, material, solver, **options)
+        terms = [ds.Gravity(-9.8), ds.Drag(8.0), ds.ExternalForce(np.zeros((self.mesh.num_vertices, 3)))]
+        scene = ds.Scene(self.mesh, ds.StableNeoHookean(1e5, 0.3), 500.0, terms, fixed="ymin", precision="f32")
+        self.step = ds.Rollout(ds.SemiImplicitSolver(scene, dt=0.02, substeps=20), 1)  # a step is a node of the graph
 
-    def forces(self, tensions: torch.Tensor) -> torch.Tensor:
+    def forces(self, x: torch.Tensor, tensions: torch.Tensor) -> torch.Tensor:
         """Pulls of the tendons on their vertices [N]: each piece draws its two ends together."""
-        x = self.simulator.positions
         line = x[self.tendons]
         pull = tensions[:, None, None] * torch.nn.functional.normalize(line[:, 1:] - line[:, :-1], dim=2)
         out = torch.zeros_like(x)
@@ -53,17 +51,19 @@ class Arm:
 
     def reach(self, controller, target) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance of the tip from the target in the last half of the time, and the mean squared activation."""
-        self.simulator.reset()
+        rest = torch.tensor(self.mesh.vertices, dtype=torch.float32)
+        u, v = torch.zeros_like(rest), torch.zeros_like(rest)
         target, distances, effort, self.seen = torch.tensor(target), [], 0.0, []
         for step in range(STEPS):
-            place = self.simulator.positions[self.tip].mean(0)[::2]
-            speed = self.simulator.velocities[self.tip].mean(0)[::2]
+            place, speed = (y[self.tip].mean(0)[::2] for y in (rest + u, v))
             activation = torch.sigmoid(controller(torch.cat([target / 0.1, place / 0.1, speed])))
-            self.simulator.step(self.forces(STRONGEST * activation))
-            self.seen.append((self.simulator.positions.detach().numpy(), activation.detach().numpy()))
+            pull = self.forces(rest + u, STRONGEST * activation)
+            frames = ds.rollout_frames(self.step, initial_displacements=u, initial_velocities=v, external_forces=pull)
+            u, v = frames.displacements[-1], frames.velocities[-1]
+            self.seen.append(((rest + u).detach().numpy(), activation.detach().numpy()))
             effort = effort + activation.square().mean() / STEPS
             if step >= STEPS // 2:
-                distances.append((self.simulator.positions[self.tip].mean(0)[::2] - target).norm())
+                distances.append(((rest + u)[self.tip].mean(0)[::2] - target).norm())
         return torch.stack(distances).mean(), effort
 
 

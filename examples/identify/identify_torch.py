@@ -14,16 +14,15 @@ from pathlib import Path
 
 import torch
 
-from diffsim_ti import TetrahedralMesh, verify
-from diffsim_ti.diff_physics import TorchMaterial
-from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+import diffsim_ti as ds
+from diffsim_ti import verify
 from diffsim_ti.optimization import Optimization
 from diffsim_ti.optimization_picture import OptimizationPicture
 
 TRUE_E, TRUE_NU = 8e4, 0.4
 
 
-class LogMaterial(TorchMaterial):
+class LogModuli(torch.nn.Module):
     """E = exp(log_E) and nu = 0.49 sigmoid(raw_nu) stay in range whatever an optimiser does."""
 
     def __init__(self, E: float, nu: float, learn_nu: bool = False):
@@ -41,25 +40,31 @@ class LogMaterial(TorchMaterial):
     def nu(self):
         return 0.49 * torch.sigmoid(self.raw_nu)
 
+    def forward(self) -> dict:
+        """What a rollout takes."""
+        return dict(youngs_modulus=self.E, poissons_ratio=self.nu)
+
+
+def falling_or_held(held: bool) -> ds.Rollout:
+    """A fifth of a second of a cube that falls on a floor, or that hangs from one of its faces."""
+    mesh = ds.TetrahedralMesh.create_cube(resolution=4, size=0.5)
+    terms = [ds.Gravity(-9.8), ds.Drag(2.0)]
+    if not held:
+        terms.append(ds.Ground(height=-0.01, stiffness=1e4, width=0.01))
+    law, fixed = ds.StableNeoHookean(TRUE_E, TRUE_NU), "xmin" if held else None
+    scene = ds.Scene(mesh, law, terms=terms, fixed=fixed, precision="f64")
+    return ds.Rollout(ds.SemiImplicitSolver(scene, dt=0.01, substeps=12), 20, save_every=1)
+
 
 def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e5, TRUE_NU)) -> dict:
     """Recover the material from the motion of a cube that carries the true one."""
-    mesh = TetrahedralMesh.create_cube(resolution=4, size=0.5)
-
-    def simulator(material):
-        solver = DifferentiableSolver(dt=0.01, gravity=-9.8, damping=0.98, substeps=12)
-        options = dict(fixed_vertices="xmin", contact=False) if held else {}
-        return DifferentiableSimulator(mesh, material, solver, **options)
-
+    rollout = falling_or_held(held)
+    mesh = rollout.scene.mesh
     with torch.no_grad():
-        target = simulator(LogMaterial(TRUE_E, TRUE_NU)).rollout(20, save_every=1)
-    material = LogMaterial(*start, learn_nu=learn_nu)
-    moving, size = (
-        simulator(material),
-        (target.displacements - target.displacements.mean(1, keepdim=True)).square().mean(),
-    )
-
-    end = mesh.vertices + target.displacements[-1].numpy()
+        target = ds.rollout_frames(rollout, **LogModuli(TRUE_E, TRUE_NU)()).displacements
+    material = LogModuli(*start, learn_nu=learn_nu)
+    size = (target - target.mean(1, keepdim=True)).square().mean()
+    end = mesh.vertices + target[-1].numpy()
     picture = OptimizationPicture(
         mesh,
         end,
@@ -70,10 +75,9 @@ def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e
     seen = {}
 
     def loss():
-        moving.reset()
-        u = moving.rollout(20, save_every=1).displacements
+        u = ds.rollout_frames(rollout, **material()).displacements
         seen.update(E=material.E.item(), nu=material.nu.item(), u=u[-1].detach().numpy())
-        return (u - target.displacements).square().mean() / size
+        return (u - target).square().mean() / size
 
     def note(value):
         picture.add(value, {"E [Pa]": seen["E"]} | ({"nu": seen["nu"]} if learn_nu else {}), mesh.vertices + seen["u"])
@@ -96,7 +100,7 @@ def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e
     if learn_nu:
         result |= dict(nu=material.nu.item(), nu_error=abs(material.nu.item() / TRUE_NU - 1))
     print(f"{name}: " + ", ".join(f"{key} {value:.5g}" for key, value in result.items()))
-    told = verify.identifiability(moving.last_rollout, ["youngs_modulus", "density"])
+    told = verify.identifiability(rollout, ["youngs_modulus", "density"])
     print(f"{name}: with E and density both free, directions not seen: {told.num_singular} of 2\n{told}")
     result["unseen"] = told.num_singular
     if folder:

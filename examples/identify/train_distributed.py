@@ -14,8 +14,6 @@ from pathlib import Path
 import torch
 
 import diffsim_ti as ds
-from diffsim_ti.diff_physics import DifferentiableMaterial, TorchMaterial
-from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
 from diffsim_ti.optimization import Optimization
 from diffsim_ti.picture import save_picture
 
@@ -23,7 +21,7 @@ TRUE_E, TRUE_NU = 8e4, 0.35
 THROWS = [(3, 0), (3, 1), (4, 2), (2, 3)]  # vertices along an edge of the body, seed of its velocity
 
 
-class LogMaterial(TorchMaterial):
+class LogModuli(torch.nn.Module):
     def __init__(self, E: float, nu: float):
         super().__init__()
         self.log_E = torch.nn.Parameter(torch.tensor(E, dtype=torch.float64).log())
@@ -33,6 +31,10 @@ class LogMaterial(TorchMaterial):
     def E(self):
         return self.log_E.exp()
 
+    def forward(self) -> dict:
+        """What a rollout takes."""
+        return dict(youngs_modulus=self.E, poissons_ratio=self.nu)
+
 
 class Throw:
     """A body held at its left, with a velocity of its own, and how it moved."""
@@ -41,24 +43,22 @@ class Throw:
         self.mesh = ds.TetrahedralMesh.create_cube(resolution, 0.4)
         random = torch.Generator().manual_seed(seed)
         self.velocity = torch.randn(3, generator=random, dtype=torch.float64) * torch.tensor(self.mesh.vertices[:, :1])
-        solver = DifferentiableSolver(dt=0.01, gravity=-9.8, damping=0.97, substeps=8)
-        true = DifferentiableMaterial(torch.tensor(TRUE_E, dtype=torch.float64), TRUE_NU)
-        options = dict(fixed_vertices="xmin", contact=False)
-        real, self.ours = (DifferentiableSimulator(self.mesh, m, solver, **options) for m in (true, material))
+        law, terms = ds.StableNeoHookean(TRUE_E, TRUE_NU), [ds.Gravity(-9.8), ds.Drag(3.0)]
+        scene = ds.Scene(self.mesh, law, terms=terms, fixed="xmin", precision="f64")
+        self.rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=0.01, substeps=8), 15, save_every=5)
+        self.material = material
         with torch.no_grad():
-            self.target = self.motion(real)
+            self.target = self.motion({})
 
-    def motion(self, simulator=None) -> torch.Tensor:
-        simulator = simulator or self.ours
-        simulator.reset(velocities=self.velocity)
-        return simulator.rollout(15, save_every=5).displacements
+    def motion(self, moduli: dict) -> torch.Tensor:
+        return ds.rollout_frames(self.rollout, initial_velocities=self.velocity, **moduli).displacements
 
     def loss(self) -> torch.Tensor:
-        return (self.motion() - self.target).square().mean() / self.target.square().mean() / len(THROWS)
+        return (self.motion(self.material()) - self.target).square().mean() / self.target.square().mean() / len(THROWS)
 
 
 def main(folder="output", iterations: int = 80) -> dict:
-    material = LogMaterial(1.5e5, 0.25)
+    material = LogModuli(1.5e5, 0.25)
     ensemble = ds.Ensemble(THROWS, lambda throw: Throw(material, *throw), costs=[n**3 for n, _ in THROWS])
     path = folder and Path(folder) / "train_distributed.state"
     mesh = ds.TetrahedralMesh.create_cube(THROWS[0][0], 0.4)
@@ -82,7 +82,7 @@ def main(folder="output", iterations: int = 80) -> dict:
     if ensemble.is_first and folder:
         throw = ensemble.member(0)
         with torch.no_grad():
-            u = throw.motion()[-1]
+            u = throw.motion(material())[-1]
         save_picture(
             Path(folder) / "train_distributed.png",
             throw.mesh,

@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.common.public import Public
 from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
 from diffsim_ti.mechanics.surfaces.buffers import branches, whole
 from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE
@@ -20,7 +21,7 @@ from diffsim_ti.terms.self_contact import SelfContact
 HELD = 4  # vertices that a pair is to stop, with what is behind it
 
 
-class Tunnelling(FloatingPointError):
+class Tunnelling(FloatingPointError, metaclass=Public):
     """In one pass, surfaces moved so far that they may have gone through each other. Of explicit steps it carries stable_dt
     [s], a substep that resolves the barrier, and stiffness [N/m], one that stops them, or None where theirs would do."""
 

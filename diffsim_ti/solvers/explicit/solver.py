@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -31,6 +32,9 @@ from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.pass_table import PassTable
 from diffsim_ti.terms import GasChamber, Growth, SelfContact
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -75,14 +79,24 @@ class ExplicitSolver(Solver):
     arguments = (*Solver.arguments, "contact", "contact_damping")
     check_bodies = staticmethod(check_bodies)
 
-    def __init__(self, *arguments, contact: str = "stage", contact_damping: float = CONTACT_DAMPING, **options):
+    def __init__(
+        self,
+        scene: "Scene",
+        dt: float = 0.01,
+        substeps: int = 1,
+        parallel: bool | None = None,
+        allow_unstable: bool = False,
+        check_start: bool = True,
+        *,
+        contact: Literal["stage", "force"] = "stage",
+        contact_damping: float = CONTACT_DAMPING,
+    ):
         if contact not in ("stage", "force"):
             raise ValueError(f'contact must be "stage" or "force", got {contact!r}')
         self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
-        scene = arguments[0] if arguments else options.get("scene")
         if getattr(scene, "reduced", False):
             self.check_bodies(scene, contact)
-        super().__init__(*arguments, **options)
+        super().__init__(scene, dt, substeps, parallel, allow_unstable, check_start)
 
     def check_contact_forces(self) -> None:
         if self.contact == "force" and any(term.acts_on_surface for term in self.scene.terms):

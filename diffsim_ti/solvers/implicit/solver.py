@@ -10,7 +10,7 @@ velocities by exp(-c h) in a stage of its own. Statics: no inertia, u* is where 
 """
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from diffsim_ti.common.checked import between, whole
 from diffsim_ti.solvers.implicit.adjoint import ImplicitAdjoint
@@ -55,7 +55,7 @@ class ImplicitSolver(Solver):
         tolerance: float = 1e-6,
         max_iterations: int = 50,
         parallel: bool | None = None,
-        preconditioner: str = "auto",
+        preconditioner: Literal["auto", "block_jacobi", "multigrid"] = "auto",
     ):
         if preconditioner not in ("auto", "block_jacobi", "multigrid"):
             raise ValueError(f"preconditioner must be auto, block_jacobi or multigrid, got {preconditioner!r}")

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
-from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
 
 
 def radial(g, r):
@@ -50,7 +51,13 @@ class Sphere(Obstacle):
     arguments it takes.
     """
 
-    def __init__(self, center: ArrayLike = (0.0, 0.0, 0.0), radius: float = 1.0, inside: bool = False, **options):
+    def __init__(
+        self,
+        center: ArrayLike = (0.0, 0.0, 0.0),
+        radius: float = 1.0,
+        inside: bool = False,
+        **options: Unpack[ObstacleOptions],
+    ):
         shape = place("center", center, "sphere_center"), extent("radius", radius, "sphere_radius")
         super().__init__(shape, **options)
         self.inside = bool(inside)
@@ -102,7 +109,7 @@ class Capsule(Obstacle):
 
     counterpart = CapsuleForce
 
-    def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options):
+    def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options: Unpack[ObstacleOptions]):
         ends = place("start", start, "capsule_start"), place("end", end, "capsule_end")
         super().__init__([*ends, extent("radius", radius, "capsule_radius")], **options)
         check_axis(self, "capsule_start", "capsule_end")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti.common.checked import numbers, shape_of
 from diffsim_ti.inputs import POSITIVE, Input
@@ -12,7 +13,7 @@ from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.ball import check_axis, radial
-from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
 
 
 @traced
@@ -83,7 +84,7 @@ class Box(Obstacle):
         center: ArrayLike = (0.0, 0.0, 0.0),
         size: ArrayLike = (1.0, 1.0, 1.0),
         rotation: ArrayLike = (0.0, 0.0, 0.0),
-        **options,
+        **options: Unpack[ObstacleOptions],
     ):
         size = np.broadcast_to(numbers("Box: size", size), (3,)) if shape_of("Box: size", size) == () else size
         turn = numbers("Box: rotation", rotation)
@@ -137,7 +138,7 @@ class Cylinder(Obstacle):
 
     counterpart = CylinderForce
 
-    def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options):
+    def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options: Unpack[ObstacleOptions]):
         ends = place("start", start, "cylinder_start"), place("end", end, "cylinder_end")
         super().__init__([*ends, extent("radius", radius, "cylinder_radius")], **options)
         check_axis(self, "cylinder_start", "cylinder_end")

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti.common.checked import present
 from diffsim_ti.common.origin import far_part
@@ -12,7 +13,7 @@ from diffsim_ti.inputs.links import NearestPoint
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
-from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,12 @@ class HalfSpace(Obstacle):
 
     counterpart = HalfSpaceForce
 
-    def __init__(self, point: ArrayLike = (0.0, 0.0, 0.0), normal: ArrayLike = (0.0, 1.0, 0.0), **options):
+    def __init__(
+        self,
+        point: ArrayLike = (0.0, 0.0, 0.0),
+        normal: ArrayLike = (0.0, 1.0, 0.0),
+        **options: Unpack[ObstacleOptions],
+    ):
         present("normal", normal)
         turn = Input("normal", normal, ((3,),), plain="half_space_normal")
         super().__init__([place("point", point, "half_space_point"), turn], **options)

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from diffsim_ti.common.checked import numbers, whole, wholes
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.common.warn import warn
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
-from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
 
 
 class MeshObstacle(Obstacle):
@@ -33,27 +34,40 @@ class MeshObstacle(Obstacle):
         triangles: ArrayLike,
         position: ArrayLike = (0.0, 0.0, 0.0),
         resolution: int = 48,
-        **options,
+        **options: Unpack[ObstacleOptions],
     ):
         super().__init__([place("position", position, "mesh_position")], **options)
-        if rounding_of(vertices) > OF_WIDTHS * self.values["barrier_width"]:
-            coarse = f"float32 resolves vertices to {rounding_of(vertices):.2g} m, too little for the barrier's width"
-            warn(f"MeshObstacle: {coarse}: give them in float64")
+        given = vertices
         vertices, triangles = numbers("MeshObstacle: vertices", vertices), wholes("MeshObstacle: triangles", triangles)
         check_closed(vertices, triangles)
-        resolution = whole("MeshObstacle: resolution", resolution, 4)
+        self.resolution = whole("MeshObstacle: resolution", resolution, 4)
+        self._surface, self._rounding = (vertices, triangles), rounding_of(given)
+        if "barrier_width" not in self.left_to_scene:
+            self._sample()
+
+    def _sample(self) -> None:
+        """Distances on the grid, which ends a width and two cells from the mesh."""
+        width, vertices = float(self.values["barrier_width"]), self._surface[0]
+        if self._rounding > OF_WIDTHS * width:
+            coarse = f"float32 resolves vertices to {self._rounding:.2g} m, too little for the barrier's width"
+            warn(f"MeshObstacle: {coarse}: give them in float64")
         low, high = vertices.min(0), vertices.max(0)
-        cell = (high - low).max() / resolution
-        pad = float(self.values["barrier_width"]) + 2 * cell
+        cell = (high - low).max() / self.resolution
+        pad = width + 2 * cell
         counts = np.ceil((high - low + 2 * pad) / cell).astype(int) + 1
         self._base = middle_far_part(vertices)
         self.origin, self.cell, self.counts = low - self._base - pad, float(cell), tuple(int(n) for n in counts)
-        self._surface = vertices, triangles
         axes = [self._base[d] + self.origin[d] + cell * np.arange(counts[d]) for d in range(3)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         from scipy.ndimage import spline_filter
 
         self.table = spline_filter(self._exact(points).reshape(self.counts), 3, mode="mirror").ravel()
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "MeshObstacle":
+        out = super().settled(scene, density, initial_positions, initial_velocities)
+        if "barrier_width" in self.left_to_scene:
+            out._sample()
+        return out
 
     def _exact(self, points: np.ndarray) -> np.ndarray:
         """Signed distance [m] to the mesh itself at position zero."""

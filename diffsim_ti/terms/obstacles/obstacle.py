@@ -1,6 +1,7 @@
 """What all obstacles share: a barrier of the distance, friction, a path, and every derivative of these."""
 
 from collections.abc import Sequence
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,7 +9,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common import deprecated
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
-from diffsim_ti.terms.described import place, positive
+from diffsim_ti.terms.described import place, positive, share_of_body
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
@@ -18,6 +19,20 @@ from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_pat
 from diffsim_ti.terms.term import Term
 
 PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
+SHARE = 0.01  # of the body, the width of a barrier whose width is left to the scene
+
+
+class ObstacleOptions(TypedDict, total=False):
+    """What every obstacle takes besides its shape; `Obstacle` says what it means and what it is where it is left out."""
+
+    stiffness: float | None
+    width: float | None
+    friction: float
+    friction_speed: float
+    path: Motion | None
+    name: str | None
+    stiffness_per_area: float | None
+    about: ArrayLike | None
 
 
 class Obstacle(Term):
@@ -33,7 +48,8 @@ class Obstacle(Term):
     strain that it makes), needs p / (1.2 width): it then stands half a width from the surface, where the barrier pushes
     with 1.19 k width. Or
     stiffness [N/m]: k of every vertex alike, however many there are.
-    width [m]: the distance at which the barrier begins to act.
+    width [m]: the distance at which the barrier begins to act. None: 1 % of the body (of the longest side of the smallest
+    one, `mesh.body_size`), which `scene.describe()` says.
     Faces of ten-node tetrahedra that are curved in the mesh, by 0.02 widths or more, are treated as curved as they move, by
     points on them (curved_faces.py). Friction there is, in explicit steps, a stage after those of the pushes.
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
@@ -72,7 +88,7 @@ class Obstacle(Term):
         self,
         shape: Sequence[Input] | dict,
         stiffness: float | None = None,
-        width: float = 0.01,
+        width: float | None = None,
         friction: float = 0.0,
         friction_speed: float = 1e-3,
         path: Motion | None = None,
@@ -83,7 +99,9 @@ class Obstacle(Term):
         if isinstance(shape, dict):  # {name: value}, with nothing more to say of them
             shape = [Input(plain, value) for plain, value in shape.items()]
         stiff = self._stiffness(stiffness, stiffness_per_area)
-        speed, felt = positive("friction_speed", friction_speed, "m/s"), positive("width", width, "m", "barrier_width")
+        self.left_to_scene = (PER_AREA,) * self.chooses_stiffness + ("barrier_width",) * (width is None)
+        felt = positive("width", 1.0 if width is None else width, "m", "barrier_width")
+        speed = positive("friction_speed", friction_speed, "m/s")
         friction_of = Input("friction", friction, ((),), range=NOT_NEGATIVE), speed
         for described in friction_of:  # also of what is smooth
             described.check_value(type(self).__name__)
@@ -144,12 +162,16 @@ class Obstacle(Term):
         return "friction" in self.values
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
-        """With the stiffness per area that the fall from the start, the start's velocity, motions over the first second, and
-        what presses on the body ask for."""
+        """With the width that the body asks for, and the stiffness per area that the fall from the start, the start's
+        velocity, motions over the first second, and what presses on the body ask for."""
+        out = self
+        if "barrier_width" in self.left_to_scene:
+            out = self.with_input("barrier_width", value=share_of_body(scene.mesh, SHARE))
         if not self.chooses_stiffness:
-            return self
+            return out
         gravity = scene.term(Gravity)
-        g = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
+        pull = gravity.values["gravity"] if gravity else np.zeros(3)
+        g, axis = float(np.linalg.norm(pull)), int(np.argmax(np.abs(pull) + [0, 1e-300, 0]))
         positions = scene.mesh.vertices if initial_positions is None else np.asarray(initial_positions, np.float64)
         start = np.zeros(3) if self.path is None else sampled_path(self.path_name, self.path, [0.0])[0]
         fall = max(float(self.gap(positions, start).min()), 0.0)
@@ -161,16 +183,16 @@ class Obstacle(Term):
         if self.path is not None:
             rows = over_time(lambda t: sampled_path(self.path_name, self.path, t))
             own = approach([self.gap(positions, row) for row in rows])
-        speed, width = float(np.sqrt(first**2 + 2 * g * fall)) + led + own, float(self.values["barrier_width"])
+        speed, width = float(np.sqrt(first**2 + 2 * g * fall)) + led + own, float(out.values["barrier_width"])
         mean, mesh = float(np.mean(density)), scene.mesh
         pressed = pressed_by(scene.terms, mesh, mean)
-        stiffness = stiffness_of_impact(mesh, scene.material, mean, g, speed, width, pressed)
+        stiffness = stiffness_of_impact(mesh, scene.material, mean, g, speed, width, pressed, axis)
         if not stiffness > 0:
             raise ValueError(
                 f"{type(self).__name__}: without gravity, velocity, motion and loads nothing says how stiff the barrier "
                 "must be; pass stiffness_per_area [N/m^3]"
             )
-        return self.with_input(PER_AREA, value=stiffness)
+        return out.with_input(PER_AREA, value=stiffness)
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         """Distance [m] of each position, shape (k, 3), to the obstacle as it was made; negative inside."""
