@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.materials import StableNeoHookean, moduli
 from diffsim_ti.materials.evaluate import evaluate
-from diffsim_ti.torch_bridge.autograd import first_order_only, torch
+from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_state, torch
 from diffsim_ti.torch_bridge.barrier_contact import DifferentiableBarrierContact
 from diffsim_ti.torch_bridge.implicit_differentiation import ImplicitDifferentiation, conjugate_gradient
 from diffsim_ti.torch_bridge.step_sizes import bounded, refuse_steps
@@ -37,13 +37,6 @@ class _EnergyDensity(torch.autograd.Function):
         P, by = ctx.saved_tensors
         by_coefficients = grad[:, None] * by
         return None, grad[:, None, None] * P, by_coefficients.sum(0) if ctx.uniform else by_coefficients
-
-
-def refuse_state(law, where: str, remedy: str) -> None:
-    """Raise ValueError for a law that remembers, where nothing says what."""
-    if law.state_names:
-        names = ", ".join(law.state_names)
-        raise ValueError(f"{type(law).__name__} has a state ({names}) that {where} does not support: {remedy}")
 
 
 class TorchMaterial(torch.nn.Module, metaclass=Public):
