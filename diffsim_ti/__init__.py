@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
-from diffsim_ti.common import answers, deprecated, interrupts
+from diffsim_ti.common import deprecated, interrupts
 
 interrupts.guard_import()
 
@@ -133,4 +133,4 @@ sys.meta_path.append(deprecated.MovedModules())
 if TYPE_CHECKING:  # type checkers report old names
     from diffsim_ti.torch_bridge.rollout_node import rollout_frames as rollout_frames
 else:
-    __getattr__ = answers.package_attribute
+    __getattr__ = deprecated.package_attribute

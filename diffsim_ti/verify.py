@@ -220,13 +220,13 @@ class _Pulled:
 @contextmanager
 def _solved_to(rollout: Rollout, tolerance: float):
     """The same Rollout, so with whatever its `vjp` is, solved to another tolerance meanwhile."""
-    kept = rollout.solver, rollout.sweep
+    kept = rollout.sweep
     other = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance))
-    rollout.solver, rollout.sweep = other.solver, other.sweep
+    rollout.sweep = other.sweep  # which has its solver
     try:
         yield
     finally:
-        rollout.solver, rollout.sweep = kept
+        rollout.sweep = kept
 
 
 @public

@@ -26,11 +26,11 @@ terms = [ds.Gravity(), ds.Ground(height=0.0, stiffness=2e4, width=0.01, friction
 scene = ds.Scene(mesh, material, density=1000.0, terms=terms)
 print(scene.describe())
 
-# %% A solver says how it goes on. The stable step of explicit solvers is known beforehand; beyond it is an error.
+# %% A solver says how it goes on. Explicit solvers know their stable step beforehand and divide dt by it.
 # Gradients through an impact want a third of it: a rollout warns where it has coarser ones, and says what it needs.
-limit = float(ds.stable_dt(scene))
-solver = ds.VelocityVerletSolver(scene, dt=0.01, substeps=int(np.ceil(0.01 / (limit / 3))))
-print(f"stable step {limit * 1e3:.2f} ms; {solver.substeps} substeps to a step of 10 ms")
+solver = ds.VelocityVerletSolver(scene, dt=0.01)
+print(f"stable step {solver.stable_dt(tight=True)}; {solver.substeps} substeps to a step of 10 ms")
+print(f"{solver.choose_substeps(share=1 / 3)} of a third of it")
 
 # %% Let it fall, step by step.
 simulator = ds.Simulator(solver)

@@ -68,7 +68,7 @@ def scene(**options) -> ds.Scene:
 
 
 def verlet(**options):
-    own = {name: options.pop(name) for name in ("contact", "substeps", "allow_unstable") if name in options}
+    own = {name: options.pop(name) for name in ("contact", "dt", "substeps", "allow_unstable") if name in options}
     return ds.VelocityVerletSolver(scene(**options), dt=own.pop("dt", 1e-3), **own)
 
 
@@ -229,12 +229,28 @@ FOLLOWED = {
         ),
     ),
     ("solvers/solver.py", "exceeds the stable step"): (
-        stiff,
-        lambda: (stiff(allow_unstable=True), stiff(substeps=int(advised(stiff)))),
+        lambda: stiff(substeps=1),
+        lambda: (stiff(allow_unstable=True), stiff(substeps=int(advised(lambda: stiff(substeps=1))))),
+    ),
+    ("solvers/substeps.py", "if they are meant"): (
+        lambda: stiff(dt=10.0),
+        lambda: stiff(dt=10.0, substeps=int(advised(lambda: stiff(dt=10.0)))),
     ),
     ("terms/of_tetrahedra.py", "names of sets"): (
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0], tetrahedra="left", per="set"),
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0, 1.0], tetrahedra=["left", "right"], per="set"),
+    ),
+    ("mesh/seed_names.py", "F varies within ten-node tetrahedra"): (
+        lambda: CUBE.quadratic().compute_deformation_gradient(CUBE.quadratic().vertices),
+        lambda: ds.Strain(stretches=True).settled(scene(mesh=CUBE.quadratic())),
+    ),
+    ("outputs/contact_force.py", "give on=, a set whose sum"): (
+        lambda: ds.ContactForce("floor", on="xmin", per_vertex=True),
+        lambda: (ds.ContactForce("floor", on="xmin"), ds.ContactForce("floor", per_vertex=True)),
+    ),
+    ("solvers/semi_implicit.py", "give it fixed=vertices"): (
+        lambda: ds.SemiImplicitSolver(scene(), dt=1e-4).set_fixed_vertices("ymin"),
+        lambda: ds.SemiImplicitSolver(scene(fixed="ymin"), dt=1e-4),
     ),
     ("runtime/start.py", "init has no argument"): (lambda: ds.init(device="cpu"), lambda: None),
     ("runtime/start.py", "cannot be chosen"): (lambda: ds.init("cpu", fast_math=True), lambda: None),
@@ -308,7 +324,11 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("monitor/guard.py", "reduce the substep to {} s"): "test_contact_crossing.py, battery_of_impacts.py",
     ("monitor/guard.py", "the barrier cannot stop it"): "test_contact_crossing.py, battery_of_impacts.py",
     ("monitor/guard.py", "the substep has outgrown"): "test_contact_crossing.py, battery_of_impacts.py",
-    ("monitor/guard.py", "reduce dt, raise substeps"): "test_step_limit.py",
+    ("monitor/guard.py", "take substeps of {} s ({}"): "test_step_limit.py",
+    ("monitor/guard.py", "pass substeps={}, or reduce dt"): "test_step_limit.py",
+    ("rollout/simulator.py", "for the same number from the start"): "test_step_limit.py",
+    ("inputs/step_values.py", "is a tensor with a graph"): "test_step_inputs.py",
+    ("solvers/solver.py", "the stable step of these values"): "test_step_limit.py",
     ("monitor/guard.py", "was stiffer than the substep"): "test_contact.py, test_contact_faces.py",
     ("rollout/sweep.py", "gradients through contacts"): "test_contact_gradients.py",
     ("rollout/sweep.py", "the adjoint grew"): "test_gradient_faults.py; a chaotic run has no better gradient",

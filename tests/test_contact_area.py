@@ -288,7 +288,7 @@ def test_the_scene_chooses_the_width_by_the_smallest_body():
         values = scene.inputs.values
         assert values["barrier_width"] == values["barrier_width_2"] == pytest.approx(0.01 * size, rel=1e-12)
         assert values["barrier_width_3"] == 0.5 and values["self_contact_width"] == pytest.approx(
-            1e-3 * size, rel=1e-12
+            0.01 * size, rel=1e-12
         )
         assert f"barrier_width={0.01 * size:g}" in scene.describe()
         given = ds.MeshObstacle(corners, closed, resolution=4, stiffness=1.0, width=0.01 * size)

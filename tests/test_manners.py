@@ -22,7 +22,7 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.monitor.quantities import TetrahedronFields
 from diffsim_ti.torch_bridge.rollout_node import rollout_frames
 from diffsim_ti.verify import GradientCheck, GradientReport
-from diffsim_ti.writers import WRITERS, Frame, Setting, View, open_writer
+from diffsim_ti.writers import WRITERS, Frame, Setting, View, open_writer, save_frames
 
 PACKAGE = Path(__file__).parent.parent / "diffsim_ti"
 
@@ -52,8 +52,8 @@ ds.Scene(mesh, soft, precision="f32", initial_positions=mesh.vertices + 1e6)  # 
 floor, above = ds.Ground(1e5, stiffness_per_area=1e6), mesh.vertices + [0, 100001, 0]
 ds.Scene(mesh, soft, terms=floor, precision="f32", initial_positions=above)  # float32
 ds.Measurement("positions", np.float32([[1e6]]), noise=1e-3)  # float32 rounds
-ds.MeshObstacle(np.float32(corners + 1e6), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # float32 resolves vertices
-solver = ds.SemiImplicitSolver(mesh, soft, dt=0.1)  # is divided into
+ds.MeshObstacle(np.float32(corners + 1e6), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], width=0.01)  # float32 resolves vertices
+ds.SemiImplicitSolver(mesh, soft, dt=0.1, substeps=1)  # is divided into
 conjugate_gradient(lambda v: -v, torch.ones(3))  # not positive definite
 conjugate_gradient(lambda v: v * torch.arange(1.0, 4.0), torch.ones(3), max_iters=1, atol=1e-12)  # did not converge
 bounded(torch.tensor(2.0), 0.0, 1.0, "nu")  # has left
@@ -209,3 +209,10 @@ def test_writers_work_with_their_defaults(objects, tmp_path, suffix):
     with open_writer(tmp_path / f"run{suffix}", objects["scene"], View()) as out:
         out.write(Frame.of_run(objects["scene"], objects["frames"]))
     assert out.count == 1 and (tmp_path / f"run{suffix}").stat().st_size > 100
+
+
+def test_a_run_is_saved_in_a_line(objects, tmp_path):
+    assert save_frames(tmp_path / "run.npz", objects["frames"]).count == 3
+    np.testing.assert_array_equal(np.load(tmp_path / "run.npz")["positions"], objects["frames"].positions)
+    with pytest.raises(ValueError, match="a copy by pickle has no scene: write each by open_writer"):
+        save_frames(tmp_path / "run.npz", objects["unpickled"])

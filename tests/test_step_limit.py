@@ -1,5 +1,6 @@
 """The stable step: bounds, the tight limit, refusals, and runs that go wrong (TORTURE.md 22-24, 28, 66)."""
 
+import pickle
 import re
 import warnings
 
@@ -447,3 +448,108 @@ def test_a_start_that_is_not_checked_is_checked_on_the_way(solver):
     assert not own.allow_unstable and own.for_scene(scene).dt == dt
     with pytest.raises(ds.Divergence, match="outgrown the stable step"):
         ds.Rollout(own, 1000).forward()
+
+
+# ---- substeps that are left to the solver --------------------------------------------------------------------------------
+
+
+@solvers
+def test_a_step_is_whole_where_it_is_stable_and_else_divided(solver):
+    """By 0.7 of the stable step, with the numbers of a solver that is given them."""
+    scene = block()
+    tight = any_step(scene, solver).stable_dt(tight=True).dt
+    for share, count in ((0.5, 1), (0.999, 1), (1.01, 2), (5.0, 8)):
+        chosen = solver(scene, dt=share * tight)
+        assert (chosen.substeps, chosen.choose_substeps(share=1.0)) == (count, count)
+        known = solver(scene, dt=share * tight, substeps=count)
+        runs = [
+            ds.Rollout(x, 3, save_every=1).forward(initial_velocities=0.1 * scene.mesh.vertices)
+            for x in (chosen, known)
+        ]
+        np.testing.assert_array_equal(runs[0].positions, runs[1].positions)
+    again = pickle.loads(pickle.dumps(chosen))
+    assert again.substeps == 8 and again.automatic and not known.automatic
+    assert chosen.for_scene(scene).substeps == 8 and chosen.for_scene(block(ds.LinearElastic)).automatic
+    softer, stiffer = (scene.replace(material=ds.StableNeoHookean(E, 0.3)) for E in (1e4, 4e5))
+    assert chosen.for_scene(softer).substeps == 8 and chosen.for_scene(stiffer).substeps == 15
+    assert list(ds.Rollout(chosen, [0.9 * tight, 2.0 * tight]).schedule.substeps) == [1, 3]
+    with pytest.raises(ValueError, match=r"would take \d+ substeps, .* pass substeps=(\d+) if they are meant"):
+        solver(scene, dt=1e4 * tight)
+    with pytest.raises(ValueError, match='substeps must be "auto" or a whole number >= 1'):
+        solver(scene, dt=tight, substeps="many")
+
+
+def test_implicit_solvers_take_auto_for_one():
+    assert ds.ImplicitEulerSolver(block(), dt=0.1, substeps="auto").substeps == 1
+
+
+@solvers
+def test_the_first_run_settles_the_substeps(solver):
+    """By its values, of a batch by the stiffest scene; a later run that needs more names the number, which works."""
+    scene = block()
+    E, tight = float(scene.inputs.values["youngs_modulus"]), any_step(scene, solver).stable_dt(tight=True).dt
+    own = solver(scene, dt=5 * tight)
+    rollout = ds.Rollout(own, 2)
+    rollout.forward(youngs_modulus=4 * E)
+    assert rollout.solver.substeps == 15 and own.substeps == 8  # twice as many
+    frames = rollout.forward(youngs_modulus=E)
+    known = ds.Rollout(solver(scene, dt=5 * tight, substeps=15), 2)
+    np.testing.assert_array_equal(frames.positions, known.forward().positions)
+    seed = np.random.default_rng(0).standard_normal(frames.positions.shape)
+    by_E = [one.vjp(one.forward(), positions=seed)["youngs_modulus"] for one in (rollout, known)]
+    np.testing.assert_array_equal(*by_E)  # gradients are of what was run
+    for grown in (2.0, 4.0, 6.0, 7.9):  # an optimisation in which E grows
+        rollout.forward(youngs_modulus=grown * E)
+    with pytest.raises(ValueError, match="stable step of these values") as caught:
+        rollout.forward(youngs_modulus=9 * E)
+    count = int(re.search(r"substeps=(\d+)", str(caught.value)).group(1))
+    ds.Rollout(solver(scene, dt=5 * tight, substeps=count), 2).forward(youngs_modulus=9 * E)
+    for lanes in (True, False):
+        batch = ds.Batch(own, 2, 3, lanes=lanes)
+        batch.forward(youngs_modulus=[E, 4 * E, 2 * E])
+        assert batch.solver.substeps == 15
+        with pytest.raises(ValueError, match=f"stable step of these values .*substeps={count}"):
+            batch.forward(youngs_modulus=[9 * E, E, E])
+    ds.Rollout(solver(scene, dt=0.9 * tight), 2).forward(youngs_modulus=1.2 * E)  # whole as long as it is stable
+
+
+def test_cables_over_time_are_counted_in_each_run():
+    """Whose tension makes the body stiffer in one run than in another."""
+    mesh = ds.TetrahedralMesh.create_cube(2)
+    rope = ds.Cable([0, ds.Anchor(mesh.vertices[0] - 0.01)], tension=1.0, name="rope")
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e3, 0.3), terms=rope, precision="f64")
+    slow = ds.Rollout(ds.SemiImplicitSolver(scene, dt=0.9 * ds.stable_dt(scene).dt), 2)
+    slow.forward()
+    fast = ds.Rollout(slow.solver, 2)
+    fast.forward(**{"rope.tension": np.array([1.0, 3e3])})
+    assert fast.solver.substeps > 2 * slow.solver.substeps
+    with pytest.raises(ValueError, match=f"make the solver with substeps={fast.solver.substeps}, or another Rollout"):
+        slow.forward(**{"rope.tension": np.array([1.0, 3e3])})
+
+
+def test_a_simulator_takes_more_substeps_where_the_body_stiffens():
+    """A plate presses a block: a simulator goes on and says so once, a rollout stops with the number."""
+    scene = block(fixed=["ymin", "ymax"])
+    top = np.isin(scene.fixed, scene.mesh.vertex_sets["ymax"])[:, None] * np.array([0, 1.0, 0])
+    tight = ds.stable_dt(scene).dt
+    end = 1500 * tight
+    scene = scene.replace(motion=([0.0, end], np.stack([0 * top, -0.8 * top])), terms=[ds.Drag(5.0)])
+    solver = ds.SemiImplicitSolver(scene, dt=4.3 * tight)
+    assert solver.substeps == 7
+    steps, simulator = int(end / solver.dt), ds.Simulator(solver)
+    with pytest.warns(UserWarning, match=r"divided into more than 7 substeps from here on, 14 in this one") as caught:
+        simulator.run(steps)
+    assert len(caught) == 1 and simulator.solver.substeps >= 14 and solver.substeps == 7
+    assert np.isfinite(simulator.positions).all() and np.abs(simulator.velocities).max() < 1
+    state = simulator.state
+    again = ds.Simulator(solver)
+    again.resume(state)
+    assert again.solver.substeps == simulator.solver.substeps
+    for one in (again, simulator):
+        one.run(3)
+    np.testing.assert_array_equal(again.positions, simulator.positions)
+    simulator.reset()
+    assert simulator.solver is solver
+    with pytest.raises(ds.Divergence, match=r"outgrown the stable step .*pass substeps=14, or reduce dt") as told:
+        ds.Rollout(solver, steps).forward()
+    assert 0 < told.value.enough < solver.substep and told.value.step > steps // 2

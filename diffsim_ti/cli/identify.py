@@ -121,9 +121,9 @@ def identify(
 def _tracked(scene, times: np.ndarray, places: np.ndarray, noise: float):
     """The rollout that markers were seen in, and what was seen."""
     frame = float(np.median(np.diff(times)))
-    substeps = int(np.ceil(frame / (0.4 * ds.stable_dt(scene))))  # stable up to six times the stiffness guessed
     steps = max(4, int(np.ceil(times[-1] / frame - 1e-9)))
-    solver = ds.VelocityVerletSolver(scene, dt=frame, substeps=substeps)
+    solver = ds.VelocityVerletSolver(scene, dt=frame)
+    solver.choose_substeps(share=0.4)  # stable up to six times the stiffness guessed
     markers = ds.MaterialPoints(places[0], nearest=True)
     rollout = ds.Rollout(solver, steps, save_every=1, outputs=[markers])
     return rollout, ds.Measurement(markers.name, places[1:], noise, times=np.minimum(times[1:], rollout.times[-1]))

@@ -3,8 +3,6 @@
 from importlib import import_module
 from typing import TypeVar
 
-from diffsim_ti.common import deprecated
-
 C = TypeVar("C", bound=type)
 
 _FIXED = (
@@ -82,12 +80,13 @@ OF_TORCH |= dict.fromkeys(_PHYSICS.split(), "diff_physics")
 
 
 def package_attribute(name: str) -> object:
-    """What the package's `__getattr__` gives for a name that needs torch, an old name, or one of those documents."""
+    """A name of the package that needs torch; AttributeError, with what to use if there is such, for any other."""
     if name in OF_TORCH:
         return getattr(import_module(f"diffsim_ti.{OF_TORCH[name]}"), name)
     if said := answer("diffsim_ti", name):
         raise AttributeError(f"diffsim_ti has no {name!r}: {said}")
-    return deprecated.package_attribute(name)
+    package = import_module("diffsim_ti")
+    raise AttributeError(f"module 'diffsim_ti' has no attribute {name!r}", name=name, obj=package)
 
 
 def answer(owner: type | str, name: str) -> str | None:

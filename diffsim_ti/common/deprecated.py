@@ -13,6 +13,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import ParamSpec, TypeVar
 
+from diffsim_ti.common import answers
 from diffsim_ti.common.warn import warn as warn_user
 
 # modules at the top of version 0.2.0 -> where they are
@@ -71,7 +72,7 @@ def renamed_arguments(**new: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def package_attribute(name: str) -> object:
-    """What the package's `__getattr__` gives for an old name of a class, function or module."""
+    """What the package's `__getattr__` gives for an old name of a class, function or module, or for one that needs torch."""
     package, old = import_module("diffsim_ti"), f"diffsim_ti.{name}"
     if name in NAMES:
         warn(old, f"diffsim_ti.{NAMES[name]}")
@@ -79,7 +80,7 @@ def package_attribute(name: str) -> object:
     if old in MODULES:
         warn(old, MODULES[old])
         return import_module(MODULES[old])
-    raise AttributeError(f"module 'diffsim_ti' has no attribute {name!r}", name=name, obj=package)
+    return answers.package_attribute(name)
 
 
 class MovedModule(ModuleType):

@@ -230,7 +230,7 @@ class Guard:
         """In words, how to come to substeps of so many [s]."""
         if not self.ws.solver.automatic:
             return "reduce dt, raise substeps"
-        return f"pass substeps={math.ceil(self.ws.solver.dt / enough)}, or reduce dt"
+        return f"pass substeps={math.ceil((1 - 1e-12) * self.ws.solver.dt / enough)}, or reduce dt"
 
     def _calm_substep(self, stable: float) -> float:
         """A substep [s] to take where the present one was too long for a state whose stable step is given."""

@@ -1,6 +1,5 @@
 """Simulator: the step-by-step interface of a solver."""
 
-import math
 import weakref
 from typing import overload
 
@@ -23,7 +22,7 @@ from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.solvers import SemiImplicitSolver
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.solvers.substeps import MOST
+from diffsim_ti.solvers.substeps import MOST, needed
 from diffsim_ti.state.bending import FacesBend
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactResolution
@@ -197,7 +196,7 @@ class Simulator(metaclass=Public):
         enough = getattr(error, "enough", None)
         if not self.solver.automatic or enough is None or not enough < self.solver.substep:
             raise error
-        count = math.ceil(self.solver.dt / enough)
+        count = needed(self.solver.dt, enough, 1.0)
         if count > MOST:
             raise error
         if self.solver is self._first_solver:

@@ -34,8 +34,8 @@ def checked(substeps: Substeps, explicit: bool) -> int:
 
 
 def needed(dt: float, stable: float, share: float = SHARE) -> int:
-    """Substeps of dt [s] that are a share of a stable step [s] at the most."""
-    return max(1, math.ceil(dt / (share * stable)))
+    """Substeps of dt [s] that are a share of a stable step [s] at the most, but for rounding."""
+    return max(1, math.ceil((1 - 1e-12) * dt / (share * stable)))
 
 
 def divided(dt: float, stable: StepLimit) -> int:

@@ -9,11 +9,9 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.rollout.finer import on_ten_nodes
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers import VelocityVerletSolver, stable_dt
+from diffsim_ti.solvers import VelocityVerletSolver
 from diffsim_ti.study.coarser import halved_grid, on_coarser
 from diffsim_ti.study.problem import ELEMENTS
-
-SHARE = 0.8  # of the stable step at the start
 
 
 @dataclass
@@ -126,8 +124,7 @@ class ElementTrials:
 
     def _motion(self, scene: Scene) -> tuple[np.ndarray, float]:
         frame = self.duration / self.frames
-        solver = VelocityVerletSolver(scene, dt=frame, substeps=int(np.ceil(frame / (SHARE * stable_dt(scene).dt))))
-        rollout = Rollout(solver, self.frames, save_every=1)
+        rollout = Rollout(VelocityVerletSolver(scene, dt=frame), self.frames, save_every=1)
         rollout.forward()  # compiles
         begin = time.perf_counter()
         moved = rollout.forward().displacements

@@ -26,6 +26,6 @@ def extent(argument: str, value: ArrayLike, plain: str) -> Input:
     return Input(argument, value, ((),), "m", POSITIVE, plain=plain)
 
 
-def share_of_body(mesh: TetrahedralMesh, share: float) -> float:
-    """A share of the size of the smallest body [m], with three digits."""
-    return float(f"{share * mesh.body_size:.3g}")
+def chosen_width(mesh: TetrahedralMesh) -> float:
+    """The width of a barrier whose width is left to the scene [m]: 1 % of the smallest body, with three digits."""
+    return float(f"{0.01 * mesh.body_size:.3g}")

@@ -11,10 +11,8 @@ from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.collision_surface import cuts_of
 from diffsim_ti.mesh.face_points import bow
-from diffsim_ti.terms.described import positive, share_of_body
+from diffsim_ti.terms.described import chosen_width, positive
 from diffsim_ti.terms.term import Term
-
-SHARE = 0.001  # of the body, the width of a barrier whose width is left to the scene
 
 
 class SelfContact(Term):
@@ -22,7 +20,7 @@ class SelfContact(Term):
 
     Energy of a pair at distance d: m b(d) with b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero
     beyond (barrier.py); m fades out edges that become parallel (proximity.py), with lengths as in the mesh.
-    Pairs that share a vertex do not count. stiffness [N/m]; width [m], None: 0.1 % of the smallest body (`mesh.body_size`),
+    Pairs that share a vertex do not count. stiffness [N/m]; width [m], None: 1 % of the smallest body (`mesh.body_size`),
     which `scene.describe()` says.
     Where ten-node faces are curved by a tenth of the width or more, primitives are those of a finer surface on the curved
     faces (mesh/collision_surface.py), whose new vertices are in the sets that all of their nodes are in.
@@ -102,7 +100,7 @@ class SelfContact(Term):
     def _on(self, mesh: TetrahedralMesh) -> "SelfContact":
         """With the width that a mesh asks for."""
         left = "self_contact_width" in self.left_to_scene
-        return self.with_input("self_contact_width", value=share_of_body(mesh, SHARE)) if left else self
+        return self.with_input("self_contact_width", value=chosen_width(mesh)) if left else self
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "SelfContact":
         return self._on(scene.mesh)

@@ -35,6 +35,13 @@ def refuse_transforms(tensors) -> None:
         )
 
 
+def refuse_state(law, where: str, remedy: str) -> None:
+    """Raise ValueError for a law that remembers, where nothing says what."""
+    if law.state_names:
+        names = ", ".join(law.state_names)
+        raise ValueError(f"{type(law).__name__} has a state ({names}) that {where} does not support: {remedy}")
+
+
 class _Refusal(torch.autograd.Function):
     """The identity on a gradient; differentiating it once more raises."""
 

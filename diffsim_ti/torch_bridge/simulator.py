@@ -8,12 +8,11 @@ from numpy.typing import ArrayLike
 from diffsim_ti.batch import Batch
 from diffsim_ti.common.checked import instance, whole
 from diffsim_ti.common.public import Public
-from diffsim_ti.diff_physics import refuse_state
 from diffsim_ti.inputs.step_values import StepValues
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.torch_bridge.autograd import torch, uncompiled
+from diffsim_ti.torch_bridge.autograd import refuse_state, torch, uncompiled
 from diffsim_ti.torch_bridge.rollout_node import rollout_frames
 from diffsim_ti.torch_bridge.tensors import DTYPES
 

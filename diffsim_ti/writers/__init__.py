@@ -6,7 +6,7 @@ from diffsim_ti.writers.film import FilmWriter
 from diffsim_ti.writers.gltf import GltfWriter
 from diffsim_ti.writers.paraview import ParaViewWriter
 from diffsim_ti.writers.picture import PictureWriter
-from diffsim_ti.writers.writer import WRITERS, View, Writer, open_writer, register, writer_for
+from diffsim_ti.writers.writer import WRITERS, View, Writer, open_writer, register, save_frames, writer_for
 
 __all__ = ["ArraysWriter", "FilmWriter", "Frame", "GltfWriter", "ParaViewWriter", "PictureWriter", "Setting", "View"]
-__all__ += ["WRITERS", "Writer", "open_writer", "register", "writer_for"]
+__all__ += ["WRITERS", "Writer", "open_writer", "register", "save_frames", "writer_for"]

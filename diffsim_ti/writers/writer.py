@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from diffsim_ti.common.public import Public, public
+from diffsim_ti.rollout import Frames
 from diffsim_ti.scene import Scene
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.drawing import BACKENDS
@@ -117,4 +118,20 @@ def open_writer(path: str | Path, scene: Scene, view: View | None = None) -> Wri
     """The writer for a file, opened for runs of a scene: `with open_writer("run.mp4", scene) as out: out.write(...)`."""
     writer = writer_for(path, view)
     writer.open(Setting.of(scene))
+    return writer
+
+
+def save_frames(path: str | Path, frames: Frames, view: View | None = None) -> Writer:
+    """Write all frames of a Rollout's run to a file, in the format of its suffix: `save_frames("run.mp4", frames)`.
+
+    The last one alone is `open_writer("end.png", scene)` with `write(Frame.of_run(scene, frames))`.
+    Raises ValueError for a suffix that is not known, and for frames without their scene: a copy by pickle.
+    """
+    scene = frames.scene
+    if scene is None:
+        remedy = "write each by open_writer(path, scene) and Frame.of_run(scene, frames, k)"
+        raise ValueError(f"frames: a copy by pickle has no scene: {remedy}")
+    with open_writer(path, scene, view) as writer:
+        for k in range(len(frames.times)):
+            writer.write(Frame.of_run(scene, frames, k))
     return writer

@@ -138,23 +138,18 @@ def torch_streams(options) -> dict:
     """A step and its gradient on torch's default stream and on another: the same bits."""
     import torch
 
-    from diffsim_ti.diff_physics import DifferentiableMaterial
-    from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
-
     where = "cuda" if torch.cuda.is_available() and runtime.arch_name() == "cuda" else "cpu"
     streams = [torch.cuda.default_stream(), torch.cuda.Stream()] if where == "cuda" else [None]
     out = []
+    floor = ds.Ground(-0.01, stiffness=1e4, width=0.01)
+    scene = ds.Scene(ds.TetrahedralMesh.create_cube(3), ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(-9.8), floor])
     for stream in streams:
         with torch.cuda.stream(stream):
-            E, nu = (torch.tensor(x, device=where) for x in (1e5, 0.3))
-            material = DifferentiableMaterial(E, nu)
-            mesh = ds.TetrahedralMesh.create_cube(3)
-            simulator = DifferentiableSimulator(mesh, material, DifferentiableSolver(dt=1e-3), device=where)
-            simulator.rollout(5)
-            simulator.positions.square().sum().backward()
-            out.append(
-                [p.grad.cpu().numpy() for p in material.parameters()] + [simulator.positions.detach().cpu().numpy()]
-            )
+            E, nu = (torch.tensor(x, device=where, requires_grad=True) for x in (1e5, 0.3))
+            rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 5)
+            frames = ds.rollout_frames(rollout, youngs_modulus=E, poissons_ratio=nu)
+            frames.positions[-1].square().sum().backward()
+            out.append([x.grad.cpu().numpy() for x in (E, nu)] + [frames.positions[-1].detach().cpu().numpy()])
     same = all(np.array_equal(a, b) for other in out[1:] for a, b in zip(out[0], other))
     return dict(tensors_on=where, streams=len(streams), passed=same and all(np.isfinite(x).all() for x in out[0]))
 

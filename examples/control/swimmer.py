@@ -74,8 +74,9 @@ def main(folder="output", iterations: int = 25, seed: int = 0) -> dict:
     mesh = fish()
     muscles = ds.Muscle([1, 0, 0], 2e4, np.zeros((STEPS, len(SETS))), SETS, per="set")
     scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.4), 1000.0, [ds.SurfaceDrag(), muscles], precision="f32")
-    substeps = int(np.ceil(DT / (0.5 * ds.stable_dt(scene).dt)))  # muscles shorten the fish, and its stable step
-    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, DT, substeps), STEPS, save_every=SHOWN, gradients=["activation"])
+    solver = ds.SemiImplicitSolver(scene, DT)
+    solver.choose_substeps(share=0.5)  # muscles shorten the fish, and its stable step
+    rollout = ds.Rollout(solver, STEPS, save_every=SHOWN, gradients=["activation"])
     numbers = (0.3 * torch.randn(3, len(SETS))).requires_grad_()
     optimizer, seconds = torch.optim.Adam([numbers], lr=0.1), []
     with torch.no_grad():
@@ -97,7 +98,7 @@ def main(folder="output", iterations: int = 25, seed: int = 0) -> dict:
         aside=float(way[2]),
         way_before=float(before[0]),
         lengths=float(way[0]) / LENGTH,
-        substeps=substeps,
+        substeps=int(solver.substeps),
         tetrahedra=mesh.num_tetrahedra,
         seconds_per_iteration=float(np.median(seconds)) if seconds else 0.0,
     )

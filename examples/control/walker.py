@@ -51,8 +51,8 @@ class Walker:
         scene = ds.Scene(
             mesh, ds.StableNeoHookean(1e5, 0.35), 500.0, [ds.Gravity(), ds.Drag(2.0), floor, muscle], precision="f32"
         )
-        substeps = int(np.ceil(DT / (STABLE * ds.stable_dt(scene).dt)))  # squeezed legs are stiffer
-        solver = ds.SemiImplicitSolver(scene, DT, substeps)
+        solver = ds.SemiImplicitSolver(scene, DT)
+        solver.choose_substeps(share=STABLE)  # squeezed legs are stiffer
         self.rollout = ds.Rollout(solver, SPAN, save_every=1, gradients=["activation"])
         self.rest = torch.tensor(mesh.vertices.mean(0), dtype=torch.float32)
         self.start = torch.zeros(mesh.num_vertices, 3)
@@ -135,7 +135,7 @@ def main(folder="output", iterations: int = 25, seed: int = 0) -> dict:
         way_of_the_last=float(last[0]),
         aside=float(after[2]),
         way_before=before,
-        substeps=walker.rollout.solver.substeps,
+        substeps=int(walker.rollout.solver.substeps),
         tetrahedra=walker.mesh.num_tetrahedra,
         seconds_per_iteration=float(np.median(seconds)) if seconds else 0.0,
     )

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common import deprecated
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
-from diffsim_ti.terms.described import place, positive, share_of_body
+from diffsim_ti.terms.described import chosen_width, place, positive
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
@@ -19,7 +19,6 @@ from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_pat
 from diffsim_ti.terms.term import Term
 
 PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
-SHARE = 0.01  # of the body, the width of a barrier whose width is left to the scene
 
 
 class ObstacleOptions(TypedDict, total=False):
@@ -166,7 +165,7 @@ class Obstacle(Term):
         velocity, motions over the first second, and what presses on the body ask for."""
         out = self
         if "barrier_width" in self.left_to_scene:
-            out = self.with_input("barrier_width", value=share_of_body(scene.mesh, SHARE))
+            out = self.with_input("barrier_width", value=chosen_width(scene.mesh))
         if not self.chooses_stiffness:
             return out
         gravity = scene.term(Gravity)
