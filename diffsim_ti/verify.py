@@ -212,13 +212,12 @@ class _Pulled:
 @contextmanager
 def _solved_to(rollout: Rollout, tolerance: float):
     """The same Rollout, so with whatever its `vjp` is, solved to another tolerance meanwhile."""
-    kept = rollout.solver, rollout.sweep
-    other = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance))
-    rollout.solver, rollout.sweep = other.solver, other.sweep
+    kept = rollout.sweep
+    rollout.sweep = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance)).sweep
     try:
         yield
     finally:
-        rollout.solver, rollout.sweep = kept
+        rollout.sweep = kept
 
 
 def check_gradients(
