@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.differences import CentralDifferences, TaylorResult, central_difference, taylor_test
+from diffsim_ti.common.public import public
 from diffsim_ti.identification import Identifiability, identifiability
 from diffsim_ti.inputs import RunSize
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.solvers import NotConverged
 
@@ -46,6 +48,7 @@ def pull_back(rollout: Rollout, frames: Frames, loss: Loss) -> dict[str, np.ndar
     return rollout.vjp(frames, *parts, **outputs)
 
 
+@public
 def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
     """A loss that no symmetry hides from: w . positions + z . velocities + |positions|^2 / 2 with random w, z.
 
@@ -66,7 +69,10 @@ def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
     return loss
 
 
-def dot_product_test(rollout: Rollout, inputs: Iterable[str] | None = None, seed: int = 0, **values) -> float:
+@public
+def dot_product_test(
+    rollout: Rollout, inputs: Iterable[str] | None = None, seed: int = 0, **values: InputValue
+) -> float:
     """Relative difference of <w, J v> and <J^T w, v> for random v in all inputs and random w in all frames.
 
     Further outputs of the rollout are tried each by itself, since they have other units; the largest difference counts.
@@ -126,7 +132,7 @@ class GradientCheck:
         return self.verdict == RIGHT
 
 
-@dataclass
+@dataclass(repr=False)
 class GradientReport:
     """The rows of `check_gradients` and notes on how they were found; `passed` if all are right; `str()` is the table."""
 
@@ -152,6 +158,8 @@ class GradientReport:
             )
         lines += [f"{r.input}: {r.advice}" for r in self.rows if r.advice]
         return "\n".join(lines + self.notes)
+
+    __repr__ = __str__
 
 
 class _Pulled:
@@ -213,13 +221,15 @@ class _Pulled:
 def _solved_to(rollout: Rollout, tolerance: float):
     """The same Rollout, so with whatever its `vjp` is, solved to another tolerance meanwhile."""
     kept = rollout.sweep
-    rollout.sweep = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance)).sweep
+    other = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance))
+    rollout.sweep = other.sweep  # which has its solver
     try:
         yield
     finally:
         rollout.sweep = kept
 
 
+@public
 def check_gradients(
     rollout: Rollout,
     loss: Loss | None = None,
@@ -406,7 +416,7 @@ class Judgement:
         return f"{changes}: {hides}{fewer}"
 
 
-@dataclass
+@dataclass(repr=False)
 class GradientHealth:
     """How an adjoint grows through a reverse sweep: norms per step (last step first), growth rate [1/s] and horizon."""
 
@@ -420,7 +430,10 @@ class GradientHealth:
         norms = f"{self.norms[0]:.3g} to {self.norms[-1]:.3g}"
         return f"adjoint norm {norms}, growth {self.growth_rate:.3g} 1/s, limit exceeded {where}"
 
+    __repr__ = __str__
 
+
+@public
 def gradient_health(rollout: Rollout, limit: float = 1e10) -> GradientHealth:
     """Health of the last reverse sweep of a Rollout made with health=True: is the gradient still of use?
 
@@ -438,7 +451,8 @@ def gradient_health(rollout: Rollout, limit: float = 1e10) -> GradientHealth:
     return GradientHealth(steps, norms, float(slope), int(steps[over[0]]) if len(over) else None)
 
 
-def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: float = 1e-5, **values) -> dict:
+@public
+def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: float = 1e-5, **values: InputValue) -> dict:
     """Hessian of the loss times a direction over some inputs, by central differences of exact gradients.
 
     direction: input name -> change of that input. Error O(epsilon^2) of the direction as given; use f64.
@@ -453,6 +467,7 @@ def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: floa
     return out
 
 
+@public
 def gauss_newton_product(rollout: Rollout, frames: Frames, direction: dict, weight: ArrayLike = 1.0) -> dict:
     """J^T (weight J d): the Gauss-Newton Hessian of 1/2 |sqrt(weight) (positions - target)|^2 times a direction; exact.
 
