@@ -127,7 +127,7 @@ def smallest_ratio(mesh: TetrahedralMesh, positions: ArrayLike) -> float:
 
 
 @public
-def guarded_step(design, d: ArrayLike, step: ArrayLike, least: float = 0.2) -> np.ndarray:
+def guarded_step(design: Cage | SurfaceDisplacement, d: ArrayLike, step: ArrayLike, least: float = 0.2) -> np.ndarray:
     """The step, halved until the smallest J of the new rest shape is at least `least`.
 
     Raises ValueError where the shape at d is already below that, or no step of twenty halvings is short enough.

@@ -1,17 +1,23 @@
 """PyTorch interface: learnable materials, smooth contact, implicit differentiation, checkpointed rollouts."""
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.common.public import Public, public
-from diffsim_ti.materials import StableNeoHookean, moduli
+from diffsim_ti.materials import Material, StableNeoHookean, moduli
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_state, torch
 from diffsim_ti.torch_bridge.barrier_contact import DifferentiableBarrierContact
 from diffsim_ti.torch_bridge.implicit_differentiation import ImplicitDifferentiation, conjugate_gradient
 from diffsim_ti.torch_bridge.step_sizes import bounded, refuse_steps
+
+if TYPE_CHECKING:
+    from diffsim_ti.diff_simulator import DifferentiableSimulator
 
 __all__ = ["TorchMaterial", "DifferentiableMaterial", "SpatiallyVaryingMaterial", "DifferentiableBarrierContact"]
 __all__ += ["ImplicitDifferentiation", "conjugate_gradient", "CheckpointedRollout", "smooth_step", "log_barrier"]
@@ -147,14 +153,14 @@ class DifferentiableMaterial(TorchMaterial):
 
     def __init__(
         self,
-        youngs_modulus=None,
-        poissons_ratio=None,
+        youngs_modulus: ArrayLike | None = None,
+        poissons_ratio: ArrayLike | None = None,
         requires_grad: bool = True,
         *,
-        E=None,
-        nu=None,
-        law=StableNeoHookean,
-        nu_range=None,
+        E: ArrayLike | None = None,
+        nu: ArrayLike | None = None,
+        law: type[Material] = StableNeoHookean,
+        nu_range: tuple[float, float] | None = None,
     ):
         super().__init__()
         self.material = law
@@ -197,10 +203,10 @@ class SpatiallyVaryingMaterial(TorchMaterial):
         *,
         base_E: float | None = None,
         base_nu: float | None = None,
-        grid_resolution=None,
-        E_range=None,
+        grid_resolution: Sequence[int] | None = None,
+        E_range: tuple[float, float] | None = None,
         requires_grad: bool = True,
-        law=StableNeoHookean,
+        law: type[Material] = StableNeoHookean,
     ):
         super().__init__()
         self.material = law
@@ -276,7 +282,7 @@ class CheckpointedRollout(metaclass=Public):
     DifferentiableSimulator; keeps the last state and really saves; returns its positions.
     """
 
-    def __init__(self, simulator, checkpoint_every: int = 10):
+    def __init__(self, simulator: "DifferentiableSimulator", checkpoint_every: int = 10):
         self.simulator, self.checkpoint_every = simulator, checkpoint_every
 
     def __call__(self, num_steps: int) -> torch.Tensor:

@@ -240,6 +240,18 @@ FOLLOWED = {
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0], tetrahedra="left", per="set"),
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0, 1.0], tetrahedra=["left", "right"], per="set"),
     ),
+    ("mesh/seed_names.py", "F varies within ten-node tetrahedra"): (
+        lambda: CUBE.quadratic().compute_deformation_gradient(CUBE.quadratic().vertices),
+        lambda: ds.Strain(stretches=True).settled(scene(mesh=CUBE.quadratic())),
+    ),
+    ("outputs/contact_force.py", "give on=, a set whose sum"): (
+        lambda: ds.ContactForce("floor", on="xmin", per_vertex=True),
+        lambda: (ds.ContactForce("floor", on="xmin"), ds.ContactForce("floor", per_vertex=True)),
+    ),
+    ("solvers/semi_implicit.py", "give it fixed=vertices"): (
+        lambda: ds.SemiImplicitSolver(scene(), dt=1e-4).set_fixed_vertices("ymin"),
+        lambda: ds.SemiImplicitSolver(scene(fixed="ymin"), dt=1e-4),
+    ),
     ("runtime/start.py", "init has no argument"): (lambda: ds.init(device="cpu"), lambda: None),
     ("runtime/start.py", "cannot be chosen"): (lambda: ds.init("cpu", fast_math=True), lambda: None),
     ("torch_bridge/rollout_node.py", "but this rollout computes"): (

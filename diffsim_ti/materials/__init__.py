@@ -2,6 +2,7 @@
 
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
 from diffsim_ti.materials.calculus.strains import StrainLaw
+from diffsim_ti.materials.calculus.tensor import invariants
 from diffsim_ti.materials.corotated import Corotated
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.fibre_reinforced import FibreReinforced
@@ -23,4 +24,4 @@ MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVena
 
 __all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw", "KelvinVoigt"]
 __all__ += ["Law", "LinearElastic", "Material", "MooneyRivlin", "Ogden", "Prony", "SmithNeoHookean"]
-__all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh"]
+__all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh", "invariants"]

@@ -1,6 +1,7 @@
 """What a law offers to kernels."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import taichi as ti
 
@@ -35,13 +36,14 @@ class Law(metaclass=Public):
 
     precision: str
 
-    coefficient_names = ()
-    state_names = ()
+    coefficient_names: ClassVar[tuple[str, ...]] = ()
+    state_names: ClassVar[tuple[str, ...]] = ()
     initial_state = ()  # one number for each of them, or none: zero
-    reads = ("H",)
+    reads: ClassVar[tuple[str, ...]] = ("H",)
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
     viscous = False  # whether it has a `viscous_differential`
-    frozen_names = ()  # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
+    # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
+    frozen_names: ClassVar[tuple[str, ...]] = ()
     short = False  # whether its kernels are so short that Taichi's own passes over them pay (runtime/launch.py)
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 

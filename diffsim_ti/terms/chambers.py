@@ -34,7 +34,16 @@ class Chamber(GivenOverTime, OnSurface, Term):
     num_numbers = 0  # what is read of it lies in rows of its own
     row_names: tuple[str, ...] = ()  # of its numbers, each of which has a row in time
 
-    def __init__(self, argument: str, given: OverTime, unit: str, plain: str, surface, name: str | None, *more: Input):
+    def __init__(
+        self,
+        argument: str,
+        given: OverTime,
+        unit: str,
+        plain: str,
+        surface: SetOrIndices | None,
+        name: str | None,
+        *more: Input,
+    ):
         described = replace(amount(argument, given, (), unit, plain), range=POSITIVE)
         super().__init__(described, *more, name=name)
         self.surface = surface

@@ -19,13 +19,13 @@ class DifferentiableBarrierContact(metaclass=Public):
 
     def __init__(
         self,
-        barrier_stiffness=1e4,
-        barrier_width=None,
+        barrier_stiffness: float | torch.Tensor = 1e4,
+        barrier_width: float | torch.Tensor | None = None,
         *,
         ground_height: float = 0.0,
-        barrier_distance=None,
-        friction=0.0,
-        friction_speed=1e-3,
+        barrier_distance: float | torch.Tensor | None = None,
+        friction: float | torch.Tensor = 0.0,
+        friction_speed: float | torch.Tensor = 1e-3,
     ):
         given = [w for w in (barrier_width, barrier_distance) if w is not None]
         if len(given) > 1:

@@ -1,6 +1,8 @@
 """PyTorch interface: gradients through solutions of equations, and conjugate gradients. Right for any equation, not
 only ours."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from diffsim_ti.common.public import Public, public
@@ -9,7 +11,13 @@ from diffsim_ti.torch_bridge.autograd import first_order_only, torch
 
 
 @public
-def conjugate_gradient(A, b: torch.Tensor, x0: torch.Tensor | None = None, max_iters: int = 100, atol: float = 1e-6):
+def conjugate_gradient(
+    A: Callable[[torch.Tensor], torch.Tensor],
+    b: torch.Tensor,
+    x0: torch.Tensor | None = None,
+    max_iters: int = 100,
+    atol: float = 1e-6,
+) -> torch.Tensor:
     """Solve A x = b for a symmetric positive definite operator given by products A(v); |b - A x| <= atol.
 
     Warns if it did not converge or met a direction of negative curvature. Hestenes, Stiefel 1952.

@@ -36,7 +36,8 @@ class Ground(Obstacle):
     """Floor y = height [m], which acts on surface vertices through the barrier of their distance d = y - height.
 
     up: the direction that the height is measured along: "y", "x", "z", "-x", "-y" or "-z", as in `Gravity`. With "z" it is
-    the floor z = height, with "-z" the plane -z = height, solid where -z is smaller.
+    the floor z = height, with "-z" the plane -z = height, solid where -z is smaller. Pictures and films have y up: they draw
+    such a floor as a square.
     Stiffness per area [N/m^3] (default: the scene chooses it) or stiffness of every vertex [N/m], width [m] (default: 1 % of
     the body), friction and path as for every `Obstacle`.
     Inputs with gradient: "ground_height", and those of every `Obstacle`.
