@@ -31,9 +31,7 @@ SIDES = {f"{axis}{end}": (d, end) for d, axis in enumerate("xyz") for end in ("m
 
 MeshFile = Annotated[Path, typer.Argument(metavar="MESH", help="tetrahedra, in any format that meshio reads")]
 Size = Annotated[float | None, typer.Option(help="scale the longest side of the bounding box to this [m]")]
-UpAxis = Annotated[
-    Up, typer.Option(help="axis of the file that points up; the body is turned to have y up")
-]
+UpAxis = Annotated[Up, typer.Option(help="axis of the file that points up; the body is turned to have y up")]
 FixOrientation = Annotated[bool, typer.Option("--fix-orientation", help="turn inside-out tetrahedra")]
 MaterialName = Annotated[str, typer.Option(help="the law, by class name; capitals do not matter")]
 Youngs = Annotated[float, typer.Option("--youngs-modulus", "-E", help="Young's modulus [Pa]")]
