@@ -221,8 +221,7 @@ class _Pulled:
 def _solved_to(rollout: Rollout, tolerance: float):
     """The same Rollout, so with whatever its `vjp` is, solved to another tolerance meanwhile."""
     kept = rollout.sweep
-    other = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance))
-    rollout.sweep = other.sweep  # which has its solver
+    rollout.sweep = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance)).sweep
     try:
         yield
     finally:

@@ -52,7 +52,8 @@ ds.Scene(mesh, soft, precision="f32", initial_positions=mesh.vertices + 1e6)  # 
 floor, above = ds.Ground(1e5, stiffness_per_area=1e6), mesh.vertices + [0, 100001, 0]
 ds.Scene(mesh, soft, terms=floor, precision="f32", initial_positions=above)  # float32
 ds.Measurement("positions", np.float32([[1e6]]), noise=1e-3)  # float32 rounds
-ds.MeshObstacle(np.float32(corners + 1e6), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], width=0.01)  # float32 resolves vertices
+faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+ds.MeshObstacle(np.float32(corners + 1e6), faces, width=0.01)  # float32 resolves vertices
 ds.SemiImplicitSolver(mesh, soft, dt=0.1, substeps=1)  # is divided into
 conjugate_gradient(lambda v: -v, torch.ones(3))  # not positive definite
 conjugate_gradient(lambda v: v * torch.arange(1.0, 4.0), torch.ones(3), max_iters=1, atol=1e-12)  # did not converge

@@ -101,9 +101,9 @@ def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages
 
 def _squares_of_strains(scene: Scene, derived) -> tuple[np.ndarray, np.ndarray]:
     """The same for a rest shape, kept as long as it stays."""
-    known, of = getattr(scene, "_strains", None), (derived.gradients, derived.volumes)
+    known, of = getattr(scene, "known_strains", None), (derived.gradients, derived.volumes)
     if known is None or any(x is not y for x, y in zip(known[0], of)):
-        known = scene._strains = of, _strains_of(scene.mesh, derived)
+        known = scene.known_strains = of, _strains_of(scene.mesh, derived)
     return known[1]
 
 
