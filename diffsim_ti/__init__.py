@@ -132,5 +132,6 @@ __all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "ch
 sys.meta_path.append(deprecated.MovedModules())
 if TYPE_CHECKING:  # type checkers report old names
     from diffsim_ti.torch_bridge.rollout_node import rollout_frames as rollout_frames
+    from diffsim_ti.torch_bridge.simulator import TorchSimulator as TorchSimulator
 else:
     __getattr__ = deprecated.package_attribute

@@ -253,7 +253,7 @@ def test_a_search_goes_on_where_a_solve_does_not_converge():
         (lambda s: ds.UnequalSteps([[1e-3]]), "one number for each step"),
         (lambda s: ds.UnequalSteps([1e-3], 1.5), "whole numbers"),
         (lambda s: ds.UnequalSteps([1e-3] * 3, [1, 2]), "one for each of 3"),
-        (lambda s: ds.Rollout(ds.VelocityVerletSolver(s, dt=1e-4), [1e-4, 1.0]), "shorten the longest"),
+        (lambda s: ds.Rollout(ds.VelocityVerletSolver(s, dt=1e-4, substeps=1), [1e-4, 1.0]), "shorten the longest"),
         (lambda s: ds.Rollout(ds.BDF2Solver(s), [1e-3, 3e-3]), "2.4 times"),
         (lambda s: ds.Rollout(ds.StaticSolver(s), [1.0, 1.0]), "equilibria"),
         (lambda s: ds.Rollout(ds.BDF2Solver(s), 2.5), "whole number >= 0, got 2.5; or pass lengths"),

@@ -70,7 +70,7 @@ ANSWERS: dict[str, dict[str, str]] = {
 }
 
 # names of the package that need torch -> where they are; torch is imported when one is asked for
-OF_TORCH = {"rollout_frames": "torch_bridge.rollout_node"}
+OF_TORCH = {"rollout_frames": "torch_bridge.rollout_node", "TorchSimulator": "torch_bridge.simulator"}
 OF_TORCH |= dict.fromkeys(["DifferentiableSimulator", "DifferentiableSolver"], "diff_simulator")
 _PHYSICS = (
     "DifferentiableBarrierContact ImplicitDifferentiation CheckpointedRollout DifferentiableMaterial TorchMaterial"

@@ -74,7 +74,7 @@ def as_numbers(name: str, value) -> np.ndarray:
         return value
     if getattr(value, "requires_grad", False):
         raise ValueError(
-            f"{name} is a tensor with a graph, which arrays would cut off: take diff_simulator.rollout_frames, through "
+            f"{name} is a tensor with a graph, which arrays would cut off: take diffsim_ti.rollout_frames, through "
             f"which gradients flow, or give {name}.detach()"
         )
     try:

@@ -199,9 +199,8 @@ class Guard:
         if np.isfinite(omega2) and stiff <= 4 and not apart:
             longer = 4 if stiff < 1 else 2  # the body has to become four times as stiff first
             most = self.close if stiff > 0.9**2 * 4 else self.usual
-            if solver.automatic and (
-                stiff > 0.8**2 * 4 or omega2 > 1.1 * self._seen_omega2 > 0
-            ):  # it has to be in time
+            rises = stiff > 0.8**2 * 4 or omega2 > 1.1 * self._seen_omega2 > 0
+            if solver.automatic and rises:  # which is to be seen in time
                 most = min(most, 2 * self.close)
             self.every, self._seen_omega2 = min(longer * self.every, most), omega2
             return

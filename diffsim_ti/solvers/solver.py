@@ -46,8 +46,9 @@ class Solver(metaclass=Public):
     substeps: a number, or "auto" of explicit solvers: one where dt is stable at the start (`stable_dt`), else so many that
         each is 0.7 of the stable step at the most. The first run of a Rollout or a Batch raises their number to what its
         values ask for, in a batch the stiffest scene; a later run that needs more, and one whose state outgrows the stable
-        step, raises an error with the number to pass. A Simulator takes more for the steps to come, with a warning.
-        Implicit solvers are stable with any step and take "auto" for one.
+        step, raises an error with the number to pass. A Simulator takes more for the steps to come, with a warning. Give the
+        number itself where another process is to repeat such a run. Implicit solvers are stable with any step and take
+        "auto" for one.
     parallel: each substep on all threads, or many of them in a row on one; None chooses by size.
     allow_unstable: take a step beyond the stable one all the same: neither the start nor the run is checked.
     check_start: whether the constructor looks at the stable step, which a number of substeps may not exceed; False where

@@ -19,7 +19,7 @@ from crawler import SoftCrawlers
 from jumper import HORIZON, OBSERVED, SoftJumpers
 from torch import nn
 
-from diffsim_ti.diff_simulator import rollout_frames
+import diffsim_ti as ds
 
 TASKS = {"jumper": (SoftJumpers, HORIZON), "crawler": (SoftCrawlers, 10)}  # steps before states are cut off
 SCENES, GAMMA, LAMBDA, CLIP, EPOCHS, BATCHES = 16, 0.99, 0.95, 0.2, 10, 4
@@ -86,7 +86,7 @@ def gradient_iteration(envs, policy: Policy, optimizer, span: int, seed: int) ->
         left = torch.full((envs.num_envs,), 1 - t / HORIZON)
         actions = policy(torch.cat(envs.seen(x, v, left), 1))
         forces = torch.einsum("bk,kni->bni", actions, press)[:, None]
-        frames = rollout_frames(envs.batch, initial_positions=x, initial_velocities=v, external_forces=forces)
+        frames = ds.rollout_frames(envs.batch, initial_positions=x, initial_velocities=v, external_forces=forces)
         x, v = frames.positions[:, -1], frames.velocities[:, -1]
         shown.append(envs.progress(x))
         if span < HORIZON and (t + 1) % span == 0:

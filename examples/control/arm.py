@@ -19,7 +19,6 @@ import pytorch_kinematics as pk
 import torch
 
 import diffsim_ti as ds
-from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.picture import Arrows, Points, arrows, save_picture
 from diffsim_ti.terms.obstacles.shapes import tube
 
@@ -97,7 +96,7 @@ class Pressing:
         way = self.home + torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)[:, None] * (angles - self.home)
         rotation, position = self.places(way)
         poses = torch.cat([position - self.flange[0], quaternions(rotation @ self.rotation[0].T)], 1)
-        return rollout_frames(self.rollout, **{"prescribed_pose.xmin": poses})
+        return ds.rollout_frames(self.rollout, **{"prescribed_pose.xmin": poses})
 
     def carried(self, angles: torch.Tensor) -> np.ndarray:
         """Where the finger would be if it were rigid [m]."""

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 import diffsim_ti as ds
-from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.film import save_film
 
 LENGTH, CELLS, PAIRS = 0.3, 12, 4
@@ -52,7 +51,7 @@ def stroke(numbers: torch.Tensor) -> torch.Tensor:
 def swim(rollout: ds.Rollout, numbers: torch.Tensor):
     """(frames, way of the fish's middle [m], activations)"""
     activation = stroke(numbers)
-    frames = rollout_frames(rollout, activation=activation)
+    frames = ds.rollout_frames(rollout, activation=activation)
     middle = frames.positions.mean(1)
     return frames, middle[-1] - middle[0], activation
 

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 
 import diffsim_ti as ds
-from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.film import save_film
 
 CELL, CLEARANCE, STRENGTH = 0.04, 0.006, 6e4
@@ -72,7 +71,9 @@ class Walker:
                 before = 0.5 * before + 0.5 * one
                 activation.append(before)
             activation, before = torch.stack(activation), before.detach()
-            frames = rollout_frames(self.rollout, initial_displacements=u, initial_velocities=v, activation=activation)
+            frames = ds.rollout_frames(
+                self.rollout, initial_displacements=u, initial_velocities=v, activation=activation
+            )
             way = frames.positions[-1].mean(0) - self.rest - u.mean(0)
             front, back = (frames.positions[-1][end].mean(0) for end in self.ends)
             turn = (front - back)[2]

@@ -124,7 +124,7 @@ def add_to_diagonal(A, x) -> Tensor:
 
 
 @traced
-def invariants(H):
+def invariants(H: Tensor) -> tuple:
     """(K, j, s) of F = I + H without cancellation: K = cof F - I, j = det F - 1, s = |F|^2 - 3 - 2 j."""
     if "invariants" not in H.known:
         H.known["invariants"] = _invariants(H)
