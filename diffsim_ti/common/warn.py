@@ -28,8 +28,7 @@ def warn(message: str | Warning, category: type[Warning] = UserWarning) -> None:
     place = kind, frame.f_code.co_filename, frame.f_lineno
     registry = _registries.setdefault(place, {})
     category = type(message) if isinstance(message, Warning) else category
-    if (
-        len(registry) > 1
-    ):  # "version" of the filters, and one message that they have shown; Python clears it with theirs
+    # "version" of the filters, and a message that they have let through once; Python empties it when the filters change
+    if len(registry) > 1:
         registry = _registries[place] = {"version": registry["version"], (str(message), category, frame.f_lineno): True}
     warnings.warn_explicit(message, category, *place[1:], frame.f_globals.get("__name__"), registry)
