@@ -38,7 +38,7 @@ def throw(mesh, E, v, contact, solver, duration) -> list[str]:
         scene = ds.Scene(mesh, ds.StableNeoHookean(E, 0.35), 1000.0, [ds.SelfContact(**contact)], initial_velocities=v)
         dt = dt or 0.7 * float(ds.stable_dt(scene).dt)
         try:
-            simulator = ds.Simulator(solver(scene, dt=dt))
+            simulator = ds.Simulator(solver(scene, dt=dt, substeps=1))
             simulator.run(int(np.ceil(duration / dt)))
             simulator.check_surfaces()
             return [*said, ""]

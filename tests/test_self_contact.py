@@ -309,13 +309,13 @@ def test_a_width_beyond_many_elements_is_refused():
 
 
 def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
-    solver = crossed_edges(speed=400.0)
+    solver = crossed_edges(speed=400.0, substeps=1)
     simulator = ds.Simulator(solver)
     with pytest.raises(ds.Tunnelling, match=r"substep of 0\.0001 s.*take substeps of"):
         simulator.run(20)
     simulator.check_surfaces()
     weak = ds.Simulator(
-        ds.SemiImplicitSolver(crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)]), dt=DT)
+        ds.SemiImplicitSolver(crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)]), dt=DT, substeps=1)
     )
     with pytest.raises(
         ds.Tunnelling, match=r"^step \d+, t = .*(edges|vertex).*may have gone through each other: their gap was .* m/s"
@@ -327,7 +327,7 @@ def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
 
 def test_contact_too_stiff_for_its_step_says_so_and_its_advice_works():
     scene = crossed_edges().scene
-    stiff = ds.Simulator(ds.SemiImplicitSolver(scene.replace(terms=[ds.SelfContact(1e9, WIDTH)]), dt=DT))
+    stiff = ds.Simulator(ds.SemiImplicitSolver(scene.replace(terms=[ds.SelfContact(1e9, WIDTH)]), dt=DT, substeps=1))
     with pytest.raises(ds.Tunnelling, match=r"at .* rad/s is too stiff for it: take substeps of") as error:
         stiff.run(200)
     step = error.value.stable_dt
@@ -344,7 +344,7 @@ def test_a_throw_goes_well_when_the_advice_is_taken(stiffness, dt):
 
     def throw():
         now = scene.replace(terms=[ds.SelfContact(of["stiffness"], WIDTH)])
-        simulator = ds.Simulator(ds.SemiImplicitSolver(now, dt=of["substep"]))
+        simulator = ds.Simulator(ds.SemiImplicitSolver(now, dt=of["substep"], substeps=1))
         simulator.run(int(0.016 / of["substep"]))
         simulator.check_surfaces()
         return simulator
