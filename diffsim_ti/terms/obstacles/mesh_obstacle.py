@@ -11,6 +11,7 @@ from diffsim_ti.common.checked import numbers, whole, wholes
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
+from diffsim_ti.terms.obstacles.kinematic_surface import KinematicSurface
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
 
@@ -72,6 +73,11 @@ class MeshObstacle(Obstacle):
         out = super().shift(origin)
         out[:3] -= self._base
         return out
+
+    def kinematic_surface(self):
+        none = np.zeros((0, 2), np.int64)
+        vertices, triangles = self._surface
+        return KinematicSurface(vertices + self.values["mesh_position"], triangles, none, none[:, 0])
 
     def surface(self, size):
         points, triangles = self._surface
