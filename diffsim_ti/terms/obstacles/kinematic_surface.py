@@ -28,7 +28,7 @@ class KinematicSurface:
     radius: float = 0.0
 
     @classmethod
-    def checked(cls, owner: str, vertices, triangles, segments, points, radius: float) -> "KinematicSurface":
+    def checked(cls, owner: str, vertices, triangles, segments, points) -> "KinematicSurface":
         """Of what a user gives; where nothing names vertices, all of them are points. Raises ValueError."""
         vertices = numbers(f"{owner}: vertices", vertices)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices) or not np.all(np.isfinite(vertices)):
@@ -50,7 +50,7 @@ class KinematicSurface:
             parts[name] = part
         if not any(len(part) for part in parts.values()):
             raise ValueError(f"{owner}: give it at least one triangle, segment or point")
-        return cls(vertices, parts["triangles"], parts["segments"], parts["points"][:, 0], radius)
+        return cls(vertices, parts["triangles"], parts["segments"], parts["points"][:, 0])
 
     @cached_property
     def one(self) -> np.ndarray:

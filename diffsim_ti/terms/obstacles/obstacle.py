@@ -11,7 +11,6 @@ from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.terms.described import place, positive
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
-from diffsim_ti.terms.obstacles.kinematic_surface import KinematicSurface
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.terms.obstacles.stiffness import approach, over_time, pressed_by, stiffness_of_impact
@@ -204,11 +203,6 @@ class Obstacle(Term):
         raise ValueError(
             f"the body starts on or in {self!r}: {named} ({len(inside)} vertices); move the body or the obstacle"
         )
-
-    def kinematic_surface(self) -> KinematicSurface | None:
-        """The triangles, segments and points that it consists of, where it was made; None for what is curved or has no
-        end."""
-        return None
 
     def surface(self, size: float) -> Triangles | None:
         """(points [m], shape (k, 3), triangles that face outwards) to draw, where the obstacle was made; None: not drawn.
