@@ -100,13 +100,14 @@ class BoxKernels:
 
     @ti.func
     def slack_of(self, p, scene: A, tree: A):
-        """Largest slacks of the corners of primitive p, towards its own body and others, and the number of the body."""
+        """Largest slacks of the corners of primitive p, towards its own body and others, the number of the body, and what
+        its reach is larger by."""
         s = scene.place[tree.corners[self.size * p]]
         own, other = scene.slack[s][0], scene.slack[s][1]
         for k in ti.static(range(1, self.size)):
             slack = scene.slack[scene.place[tree.corners[self.size * p + k]]]
             own, other = ti.max(own, slack[0]), ti.max(other, slack[1])
-        return self.vector(own, other, ti.cast(scene.body[s], self.fp), ti.cast(0, self.fp))
+        return self.vector(own, other, ti.cast(scene.body[s], self.fp), scene.slack[s][2])
 
     @ti.func
     def box(self, p, scene: A, tree: A, plan: A):
@@ -116,7 +117,7 @@ class BoxKernels:
         for k in ti.static(range(1, self.size)):
             x = self.at(tree.corners[self.size * p + k], scene, plan)
             lo, hi = ti.min(lo, x), ti.max(hi, x)
-        wide = ti.cast(MARGIN, self.fp) * (ti.cast(0.5, self.fp) * plan.reach + ti.max(slack[0], slack[1]))
+        wide = ti.cast(MARGIN, self.fp) * (ti.cast(0.5, self.fp) * plan.reach + ti.max(slack[0], slack[1]) + slack[3])
         largest = ti.max(ti.abs(lo), ti.abs(hi))
         wide += ti.cast(self.rounding, self.fp) * ti.max(largest[0], ti.max(largest[1], largest[2]))
         widening = self.vector(wide, wide, wide, ti.cast(0, self.fp))
