@@ -1,7 +1,8 @@
 """Triangles, segments and points as an obstacle, by the exact distance to what is nearest of them."""
 
 import warnings
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -13,10 +14,16 @@ from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
-from diffsim_ti.terms.obstacles.kinematic_surface import KinematicSurface
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.surface_distance import SurfaceDistance
+from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
+
+STRETCH, BOW = (
+    1.2,
+    0.12,
+)  # of a body's longest edge, how far it may be stretched; of the width, what faces need not feel
 
 
 class MeshObstacle(Obstacle):
@@ -55,13 +62,14 @@ class MeshObstacle(Obstacle):
                 stacklevel=2,
             )
         thick = Input("radius", radius, ((),), "m", NOT_NEGATIVE, plain="mesh_radius")
+        self._made = SurfaceMesh.checked("MeshObstacle", vertices, triangles, segments, points)
+        self._base = middle_far_part(self._made.vertices)
+        self._tree = SurfaceTree(self._made, self._base)
         super().__init__([place("position", position, "mesh_position"), thick], **options)
+        self.by_pairs = True
         if rounding_of(vertices) > OF_WIDTHS * self.values["barrier_width"]:
             coarse = f"float32 resolves vertices to {rounding_of(vertices):.2g} m, too little for the barrier's width"
             warnings.warn(f"MeshObstacle: {coarse}: give them in float64", stacklevel=2)
-        self._made = KinematicSurface.checked("MeshObstacle", vertices, triangles, segments, points)
-        self._base = middle_far_part(self._made.vertices)
-        self._tree = SurfaceTree(self._made, self._base)
 
     @cached_property
     def table(self) -> np.ndarray:
@@ -78,12 +86,19 @@ class MeshObstacle(Obstacle):
         out[:3] -= self._base
         return out
 
-    def kinematic_surface(self):
-        moved = self._made.vertices + self.values["mesh_position"]
-        return replace(self._made, vertices=moved, radius=float(self.values["mesh_radius"]))
-
     def surface(self, size):
-        return shapes.skeleton(self.kinematic_surface(), 0.002 * size)
+        points, triangles = shapes.skeleton(self._made, max(float(self.values["mesh_radius"]), 0.002 * size))
+        return points + self.values["mesh_position"], triangles
+
+    def settled(self, scene, density, initial_positions, initial_velocities):
+        """With those of its edges and corners that faces of the body are wide enough to feel between their own corners."""
+        out = copy(super().settled(scene, density, initial_positions, initial_velocities))
+        x = scene.mesh.vertices[scene.mesh.surface_triangles[:, :3]]
+        longest = STRETCH * float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0))
+        edges = self._made.sharp_edges(longest, BOW * float(self.values["barrier_width"]))
+        points = np.union1d(edges, self._made.one[self._made.points])
+        out.all_primitives = MeshPrimitives(points, edges, self._tree.x) if len(points) else None
+        return out
 
     def kernel(self, precision, table=0):
         if precision == "f32" and table + self.table.size > 2**24:
@@ -91,7 +106,23 @@ class MeshObstacle(Obstacle):
                 f"MeshObstacle: float32 cannot count the {table + self.table.size} numbers of a surface of "
                 f"{self._tree.count} triangles, segments and points: pass precision='f64', or fewer"
             )
-        return MeshForce(precision, self.has_friction, table, self._tree.is_sided, self._made.is_convex)
+        return MeshForce(precision, self.has_friction, table, self._tree.is_sided)
+
+
+@dataclass(frozen=True)
+class MeshPrimitives(Primitives):
+    """Of a mesh: its vertices [m] at the position that the numbers begin with, and its edges; then its radius."""
+
+    vertices: np.ndarray
+
+    def at(self, p):
+        return self.vertices + p[:3], float(p[3])
+
+    def jvp(self, p, dp):
+        return np.broadcast_to(dp[:3], self.vertices.shape), float(dp[3])
+
+    def vjp(self, p, by_corners, by_radius):
+        return np.append(by_corners.sum(0), by_radius)
 
 
 @dataclass(frozen=True)
@@ -100,7 +131,6 @@ class MeshForce(ObstacleForce):
 
     table: int = 0
     sided: bool = False
-    convex: bool = False
 
     count = 4
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.mesh.geometry import cross, curve_order
-from diffsim_ti.terms.obstacles.kinematic_surface import KinematicSurface
+from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 
 GROUP = 4
 HEADER = 5  # of the table: number of leaves, of primitives, where primitives begin, where vertices do, numbers of these
@@ -26,7 +26,7 @@ class SurfaceTree:
     """Of a surface's primitives, in float64 on the host and as a `table` of numbers for kernels; origin [m]: what places in
     the table are measured from."""
 
-    def __init__(self, surface: KinematicSurface, origin: np.ndarray):
+    def __init__(self, surface: SurfaceMesh, origin: np.ndarray):
         self.surface, self.x = surface, surface.vertices - origin
         s, p = surface.segments, surface.points
         corners = np.concatenate([surface.triangles, s[:, [0, 1, 1]], p[:, None][:, [0, 0, 0]]])
