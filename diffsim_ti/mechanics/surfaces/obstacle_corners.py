@@ -165,7 +165,7 @@ class ObstacleCorners:
                 self._add_shape(x, parameters, by_p, by_parameters)
 
 
-class KinematicSurface:
+class SurfaceWithObstacles:
     """The surface of a body and behind it the corners and edges of obstacles, as pairs read it; vertices of the body keep
     their numbers.
 
@@ -215,10 +215,10 @@ class KinematicSurface:
 
 
 class ObstacleMotion:
-    """Where the corners of a KinematicSurface are, on the device too, and the adjoints of that. `given` and `given_dot` are
+    """Where the corners of a SurfaceWithObstacles are, on the device too, and the adjoints of that. `given` and `given_dot` are
     displacements of all its vertices that no node gives, and changes of these."""
 
-    def __init__(self, surface: KinematicSurface, arrays):
+    def __init__(self, surface: SurfaceWithObstacles, arrays):
         self.surface, self.corners, self.a = surface, surface.corners, arrays
         self.given, self.given_dot, self.unmoved = (runtime.array(arrays.vector, surface.num_vertices) for _ in range(3))
         for array in (self.given, self.given_dot, self.unmoved):
@@ -279,9 +279,9 @@ class ObstacleMotion:
 
 
 class ContactNumbers:
-    """Which numbers of the scene the contacts of a KinematicSurface have, on the device (listed_pair.py)."""
+    """Which numbers of the scene the contacts of a SurfaceWithObstacles have, on the device (listed_pair.py)."""
 
-    def __init__(self, surface: KinematicSurface, arrays):
+    def __init__(self, surface: SurfaceWithObstacles, arrays):
         self.surface, parts, term = surface, surface.corners.parts, arrays.self_contact
         self.of_bodies, rows = arrays.parameters_of_self_contact, [[0, 0, 0]]
         if term:
