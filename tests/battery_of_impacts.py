@@ -55,7 +55,7 @@ class Case:
     rough: bool = False
     reduced: str | None = None  # how a part of the body moves
     order: int = 1
-    pairs: bool | None = None
+    pairs: bool = False
     stiffness: float | None = None  # per area [N/m^3]
     substeps: int = 1  # of explicit solvers: times what stability asks for
     substep: float = float("inf")  # what explicit ones were advised [s]
@@ -96,7 +96,7 @@ def draw(
     order: int = 1,
     reduced: bool = False,
     rough: bool = False,
-    pairs: bool | None = None,
+    pairs: bool = False,
 ) -> Case:
     rng, names = np.random.default_rng([seed, number]), list(solvers)
     log = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))  # noqa: E731
@@ -153,9 +153,11 @@ def build(case: Case):
         path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
     stiffness = case.stiffness or natural_stiffness(case, mesh, width)
     given, back = turning(case, path) if case.turning else (dict(path=path), lambda x, t: x - path(t))
+    if case.pairs:
+        given["by_pairs"] = True
     if case.rough:
         given |= dict(friction=0.5, friction_speed=0.01 * case.speed)
-    obstacle = obstacle(width=width, stiffness_per_area=stiffness, by_pairs=case.pairs, **given)
+    obstacle = obstacle(width=width, stiffness_per_area=stiffness, **given)
     E = case.youngs_modulus
     if case.reduced:
         mesh, E, more["reduced"] = reduced(case, mesh, held=more.get("fixed"))
@@ -327,7 +329,7 @@ def main() -> int:
     parser.add_argument("--turning", action="store_true")
     parser.add_argument("--rough", action="store_true")
     parser.add_argument("--reduced", action="store_true")
-    parser.add_argument("--pairs", action="store_const", const=True)
+    parser.add_argument("--pairs", action="store_true")
     parser.add_argument("--order", type=int, choices=(1, 2), default=1)
     given = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)

@@ -106,7 +106,9 @@ class LaggedFriction(PairFriction):
         self.pairs.begin(self.u_begin)
         self._measure_here()
 
-    def jvp(self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers, only=None) -> np.ndarray:
+    def jvp(
+        self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers, only=None
+    ) -> np.ndarray:
         """Change of the forces for those of u, of x, of where the pass begins, and of `numbers`, a Tangent."""
         self._back_to_begin()
         runtime.fill(self.pairs.step, du_begin[None])

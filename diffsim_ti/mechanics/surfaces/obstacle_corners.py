@@ -33,9 +33,7 @@ class ObstacleCorners:
                 given = np.concatenate([np.ravel(x.value) for x in term.described if x.value is not None])
                 corners, _ = term.primitives.at(given[: force.count])
                 own = slice(end, end := end + len(corners))
-                self.parts.append(
-                    SimpleNamespace(k=k, force=force, first=first, term=term, own=own, as_given=corners)
-                )
+                self.parts.append(SimpleNamespace(k=k, force=force, first=first, term=term, own=own, as_given=corners))
         self.count = end
 
     def _numbers(self, part, parameters: np.ndarray) -> np.ndarray:
@@ -142,9 +140,10 @@ class ObstacleCorners:
             out[x.own], row = rows_dot[3 * x.k + RATE], self._row(x, AT_BEGIN)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
-                J, dp = rotations.left_jacobian(turn), x.term.primitives.jvp(
-                    self._numbers(x, parameters), self._numbers(x, change)
-                )[0]
+                J, dp = (
+                    rotations.left_jacobian(turn),
+                    x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[0],
+                )
                 darms = np.cross(rows_dot[row], arms)
                 darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self._about(x, change))
                 turned = rotations.turned(rotations.quaternion(turn), arms)
@@ -220,7 +219,9 @@ class ObstacleMotion:
 
     def __init__(self, surface: SurfaceWithObstacles, arrays):
         self.surface, self.corners, self.a = surface, surface.corners, arrays
-        self.given, self.given_dot, self.unmoved = (runtime.array(arrays.vector, surface.num_vertices) for _ in range(3))
+        self.given, self.given_dot, self.unmoved = (
+            runtime.array(arrays.vector, surface.num_vertices) for _ in range(3)
+        )
         for array in (self.given, self.given_dot, self.unmoved):
             runtime.fill(array, 0)
         self.rows, self.m = np.zeros((arrays.poses.size, 3)), AT_STAGE

@@ -342,7 +342,11 @@ class ImplicitWorkspace(PrescribedInPasses):
     @property
     def pair_shares(self) -> PairShares | None:
         """What obstacles do by pairs; None where none acts so."""
-        return self.kept("pair shares", lambda: PairShares(self.potential)) if self.pairs and self.pairs.obstacles else None
+        return (
+            self.kept("pair shares", lambda: PairShares(self.potential))
+            if self.pairs and self.pairs.obstacles
+            else None
+        )
 
     # ---- what stands in the way --------------------------------------------------------------------------------------
 

@@ -1,7 +1,6 @@
 """What all obstacles share: a barrier of the distance, friction, a path, and every derivative of these."""
 
 from collections.abc import Sequence
-from copy import copy
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +18,6 @@ from diffsim_ti.terms.obstacles.stiffness import approach, over_time, pressed_by
 from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_path
 from diffsim_ti.terms.term import Term
 
-STRETCHED = 1.2  # edges of bodies in motion, over those of the mesh
 PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
 
 
@@ -65,7 +63,6 @@ class Obstacle(Term):
     acts_on_surface = True
     counterpart: type  # the device counterpart of the shape
     all_primitives: "Primitives | None" = None  # of the shape
-    usually_by_pairs = False  # whether it acts by them unless it is said
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -84,9 +81,9 @@ class Obstacle(Term):
         name: str | None = None,
         stiffness_per_area: float | None = None,
         about: ArrayLike | None = None,
-        by_pairs: bool | None = None,
+        by_pairs: bool = False,
     ):
-        self.by_pairs = self.usually_by_pairs if by_pairs is None else bool(by_pairs)
+        self.by_pairs = bool(by_pairs)
         if self.by_pairs and self.all_primitives is None:
             raise ValueError(
                 f"{type(self).__name__}: by_pairs is for shapes of points and edges, and this one has none: leave it out"
@@ -150,20 +147,20 @@ class Obstacle(Term):
         return self.values[self.about_name] if self.turns else np.zeros(3)
 
     @property
+    def primitives(self) -> "Primitives | None":
+        """By which it acts on faces and edges of bodies; None where by its distance alone."""
+        return self.all_primitives if self.by_pairs else None
+
+    @property
     def has_friction(self) -> bool:
         """Whether friction was given: without, none is compiled."""
         return "friction" in self.values
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
-        """With the points and edges that act on faces and edges of the scene's bodies, and with the stiffness per area that the
-        fall from the start, the start's velocity, motions over the first second, and what presses on the body ask for."""
-        felt = copy(self)
-        if self.by_pairs:
-            x = scene.mesh.vertices[scene.mesh.surface_triangles]
-            longest = STRETCHED * float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0))
-            felt.primitives = self.all_primitives.felt_by(longest, float(self.values["barrier_width"]))
+        """With the stiffness per area that the fall from the start, the start's velocity, motions over the first second, and
+        what presses on the body ask for."""
         if not self.chooses_stiffness:
-            return felt
+            return self
         gravity = scene.term(Gravity)
         g = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
         positions = scene.mesh.vertices if initial_positions is None else np.asarray(initial_positions, np.float64)
@@ -186,7 +183,7 @@ class Obstacle(Term):
                 f"{type(self).__name__}: without gravity, velocity, motion and loads nothing says how stiff the barrier "
                 "must be; pass stiffness_per_area [N/m^3]"
             )
-        return felt.with_input(PER_AREA, value=stiffness)
+        return self.with_input(PER_AREA, value=stiffness)
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         """Distance [m] of each position, shape (k, 3), to the obstacle as it was made; negative inside."""
