@@ -62,7 +62,8 @@ class ObstacleCollisions:
         meet then."""
         pairs = self.ws.pairs
         share = pairs.safe_share(u, step, most, self._corners_drift(places, drift))
-        return share, pairs.met if share < most else None
+        met = pairs.met if share < most else None
+        return share, met and Met(*met, share)
 
     def _corners_drift(self, places, drift) -> np.ndarray:
         """How far corners of obstacles that act by pairs go; they are put to where they begin."""

@@ -10,10 +10,9 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.obstacles.collision_detection import Met
 from diffsim_ti.mechanics.surfaces.buffers import Launches
 from diffsim_ti.mechanics.surfaces.curved_friction import friction_of
-from diffsim_ti.mechanics.surfaces.obstacle_corners import SurfaceWithObstacles, ObstacleCorners, ObstacleMotion
+from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleCorners, ObstacleMotion, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.runtime import Kernel, kernels_of, vector_type
@@ -312,15 +311,15 @@ class CurvedPairs:
         return self.inner.safe_share(self._spread(u), self._step(step, drift), most)
 
     @property
-    def met(self) -> Met | None:
-        """What stopped the last step; its obstacle is None where two bodies did."""
+    def met(self) -> tuple[tuple[int, ...], int | None] | None:
+        """What stopped the last step: vertices of the body, and the obstacle; None where two bodies did."""
         surface, corners = self.finer.mesh, self.inner.blocked
         if corners is None:
             return None
         numbers = surface.numbers[corners]
         nodes = np.asarray(self.matrix[corners[numbers == 0]].argmax(1)).ravel()
         obstacle = surface.corners.parts[numbers.max() - 1].k if numbers.any() else None
-        return Met(tuple(int(i) for i in dict.fromkeys(nodes.tolist())), obstacle, 0.0)
+        return tuple(int(i) for i in dict.fromkeys(nodes.tolist())), obstacle
 
     def is_collision_free(self, u: np.ndarray, step: np.ndarray, drift=None) -> bool:
         return self.inner.is_collision_free(self._spread(u), self._step(step, drift))

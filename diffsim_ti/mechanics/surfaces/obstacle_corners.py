@@ -214,8 +214,8 @@ class SurfaceWithObstacles:
 
 
 class ObstacleMotion:
-    """Where the corners of a SurfaceWithObstacles are, on the device too, and the adjoints of that. `given` and `given_dot` are
-    displacements of all its vertices that no node gives, and changes of these."""
+    """Where the corners of a SurfaceWithObstacles are, on the device too, and the adjoints of that. `given` and `given_dot`
+    are displacements of all its vertices that no node gives, and changes of these."""
 
     def __init__(self, surface: SurfaceWithObstacles, arrays):
         self.surface, self.corners, self.a = surface, surface.corners, arrays
@@ -325,7 +325,7 @@ class ContactNumbers:
         runtime.fill(self.numbers_dot, rows)
 
     def collect(self, parameters, sums: np.ndarray, out: np.ndarray) -> None:
-        """Adds the adjoints of the numbers to those of the scene for sums of (stiffness, width, -, radius) of each vertex."""
+        """Adds to the adjoints of all parameters those by sums of (stiffness, width, -, radius) at each vertex."""
         total = np.zeros((len(self.rows), 4))
         np.add.at(total, self.surface.owner, sums)
         for c in range(0 if self.of_bodies.stop > self.of_bodies.start else 1, len(total)):

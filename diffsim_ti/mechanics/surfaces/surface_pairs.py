@@ -8,9 +8,9 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
 from diffsim_ti.mechanics.surfaces.buffers import branches, whole
-from diffsim_ti.mechanics.surfaces.obstacle_corners import ContactNumbers, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.listed_pair import MANY, OPPOSITE
 from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
+from diffsim_ti.mechanics.surfaces.obstacle_corners import ContactNumbers, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
 from diffsim_ti.mesh.sets import pieces
