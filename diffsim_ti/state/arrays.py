@@ -147,7 +147,7 @@ class SceneArrays:
             rows = scene.inputs.parameters.of(term)
             counterpart = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
             if isinstance(term, Obstacle):
-                kind = dict(per_area=term.per_area, turns=term.turns, by_pairs=term.primitives is not None)
+                kind = dict(per_area=term.per_area, turns=term.turns, by_pairs=term.by_pairs)
                 counterpart = replace(counterpart, **kind)
             if counterpart.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
                 raise AssertionError(

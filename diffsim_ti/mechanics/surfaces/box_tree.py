@@ -14,6 +14,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mesh.geometry import curve_order
 from diffsim_ti.runtime import LANES, NUMPY, Kernel, kernels_of, number_type, vector_type
 
 A = ti.template()
@@ -194,20 +195,3 @@ class BoxTree:
             subtrees = max(1, self.leaves // SUBTREES)
             roots = max(1, subtrees // SUBTREES)
         return dict(count=self.count, leaves=self.leaves, subtrees=subtrees, roots=roots)
-
-
-def curve_order(points: np.ndarray) -> np.ndarray:
-    """Indices of points, shape (n, 3), in the order of Morton's curve through their bounding box."""
-    lowest = points.min(0)
-    cells = (
-        ((points - lowest) * (2**20 / max(np.ptp(points, axis=0).max(), 1e-300))).astype(np.int64).clip(0, 2**20 - 1)
-    )
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        cells = (cells | (cells << shift)) & mask
-    return np.argsort(cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2), kind="stable")

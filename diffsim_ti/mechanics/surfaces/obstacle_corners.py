@@ -31,6 +31,7 @@ class ObstacleCorners:
         for k, ((force, first, _), term) in enumerate(zip(arrays.obstacles, arrays.contacts)):
             if term.primitives is not None:
                 given = np.concatenate([np.ravel(x.value) for x in term.described if x.value is not None])
+                given = given - term.shift(np.zeros(3))
                 corners, _ = term.primitives.at(given[: force.count])
                 own = slice(end, end := end + len(corners))
                 self.parts.append(SimpleNamespace(k=k, force=force, first=first, term=term, own=own, as_given=corners))
