@@ -18,6 +18,7 @@ class ImplicitPairs(SurfacePairs):
 
     friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
+    blocked: np.ndarray | None = None  # corners of the pair that stopped the last march
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)
@@ -58,18 +59,20 @@ class ImplicitPairs(SurfacePairs):
         if not travel.any():
             return most
         runtime.fill(self.step, step[None])
-        share = 0.0
+        share, self.blocked = 0.0, None
         for _ in range(self.longest_march):
             runtime.fill(self.next, (u + share * step)[None])
             self._build(self.next, 0, wanted=(most - share) * travel)
             self.forces(self.next, 0, self.a.corner, exact=True)
             reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
             unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
-            listed = self._shares().min(initial=np.inf)
+            shares = self._shares()
+            listed = shares.min(initial=np.inf)
             share += min(listed, unlisted)
             if share >= most:
                 return most
             if listed < unlisted:
+                self.blocked = runtime.fetch(self.list.pairs)[4 * int(shares.argmin()) :][:4]
                 return share
         return share
 

@@ -20,7 +20,7 @@ class ObstacleForce(VertexForce):
     """Device counterpart of an obstacle: `count` numbers of its shape, then stiffness, width [, friction, friction_speed].
 
     per_area: whether stiffness is per area [N/m^3]; what is said here of a vertex is then said of one square metre.
-    by_pairs: whether what is narrower than faces acts on them by pairs (mechanics/surfaces/kinematic_surface.py).
+    by_pairs: whether what is narrower than faces acts on them by pairs (mechanics/surfaces/obstacle_corners.py).
     A shape writes one function, `distance_and_normal`, in numbers of a graph; everything else follows from it. Positions
     are relative to the obstacle: callers take its displacement from X. The numbers of one that turns end in the point that
     it turns about, and its X is seven numbers: a place, and the unit quaternion of its rotation. A change of X + u is then
