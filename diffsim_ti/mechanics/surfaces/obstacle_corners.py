@@ -32,13 +32,15 @@ class ObstacleCorners:
             if term.primitives is not None:
                 given = np.concatenate([np.ravel(x.value) for x in term.described if x.value is not None])
                 given = given - term.shift(np.zeros(3))
-                corners, _ = term.primitives.at(given[: force.count])
+                shape = np.r_[: force.count, force.size : force.size + term.num_extra]  # its numbers, from its first
+                corners, _ = term.primitives.at(given[shape])
                 own = slice(end, end := end + len(corners))
-                self.parts.append(SimpleNamespace(k=k, force=force, first=first, term=term, own=own, as_given=corners))
+                part = dict(k=k, force=force, first=first, term=term, own=own, as_given=corners, shape=first + shape)
+                self.parts.append(SimpleNamespace(**part))
         self.count = end
 
     def _numbers(self, part, parameters: np.ndarray) -> np.ndarray:
-        return parameters[part.first : part.first + part.force.count]
+        return parameters[part.shape]
 
     def made(self, parameters: np.ndarray) -> np.ndarray:
         """Where corners are as obstacles were made, shape (count, 3) [m]."""
@@ -104,8 +106,7 @@ class ObstacleCorners:
         return by
 
     def _add_shape(self, part, parameters, by, by_parameters, by_radius: float = 0.0) -> None:
-        own = slice(part.first, part.first + part.force.count)
-        by_parameters[own] += part.term.primitives.vjp(parameters[own], by, by_radius)
+        by_parameters[part.shape] += part.term.primitives.vjp(parameters[part.shape], by, by_radius)
 
     def add_radii(self, parameters, by_radii: np.ndarray, by_parameters: np.ndarray) -> None:
         """Adds the adjoints of the parameters by those of the radii."""
