@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
+from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
@@ -20,6 +21,7 @@ from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.surface_distance import SurfaceDistance
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
+from diffsim_ti.terms.obstacles.turning import rotation_matrix
 
 STRETCH, BOW = (
     1.2,
@@ -176,26 +178,55 @@ class MeshForce(ObstacleForce):
     def distance_and_normal(self, g, p, X, u):
         local = [(x - c) + y for x, c, y in zip(X, p, u)]
         point = let(ti.types.vector(3, self.fp)(*(k.value for k in local)))
-        begin = g.first + self.size if self.shapeable else self.nearest.vertices(g.parameters)
-        found, rows, w, bent = (let(x) for x in self.nearest.look(point, let(begin), g.parameters))
+        begin = self.begin(g.parameters, g.first)
+        found, rows, s, t, *bent = (let(x) for x in self.nearest.look(point, begin, g.parameters))
         n = [at(found, 1 + k) for k in range(3)]
         H = [[at(found, 4 + k) for k in row] for row in ((0, 1, 2), (1, 3, 4), (2, 4, 5))]
         by_d = [(x, lambda k=k: n[k]) for k, x in enumerate(local)]
         by_n = [[(x, lambda a=a, b=b: H[a][b]) for b, x in enumerate(local)] for a in range(3)]
         for c in range(self.corners):
+            share = (let(1 - s - t), s, t)[c]
             for e in range(3):
-                row, share = let(at(rows, c) + e), at(w, c)
-                leaf = g.leaf(at(g.parameters, row))
-                leaf.row = row
+                leaf = g.leaf(at(g.parameters, let(at(rows, c) + e)))
+                leaf.row = let(at(rows, c) + e)
                 g.corners.append(leaf)
+                turns = [let(at(bent[c - 1], a)) if c else let(-at(bent[0], a) - at(bent[1], a)) for a in range(3)]
                 by_d.append((leaf, lambda e=e, share=share: let(-share * n[e])))
                 for a in range(3):
-                    by_n[a].append(
-                        (leaf, lambda a=a, e=e, c=c, share=share: let(-share * H[a][e] - at(bent, a, c) * n[e]))
-                    )
+                    of_n = lambda a=a, e=e, share=share, turn=turns[a]: let(-share * H[a][e] - turn * n[e])  # noqa: E731
+                    by_n[a].append((leaf, of_n))
         d = g.function(at(found, 0), *by_d)
         return d - p[3], [g.function(n[a], *by_n[a]) for a in range(3)]
 
     @ti.func
     def may_touch(self, parameters: ti.template(), first, X, u):
         return True
+
+    @ti.func
+    def reached(self, parameters: ti.template(), first, X, u, move, d):
+        """By the plane of what is nearest, and by all triangles on the way."""
+        out = ti.min(d, d + self.approach(parameters, first, X, u, move))
+        if out > 0 and move.norm_sqr() >= d * d:
+            begin, x = self.begin(parameters, first), self.place(parameters, first, X, u)
+            share = self.nearest.free_share(x, self.place(parameters, first, X, u + move), begin, parameters)
+            if share < 1:
+                out = (share - 1) * ti.sqrt(move.norm_sqr())
+        return out
+
+    @traced
+    def begin(self, parameters, first):
+        """Where the vertices begin in the parameters."""
+        return let(first + self.size) if self.shapeable else self.nearest.vertices(parameters)
+
+    @traced
+    def place(self, parameters, first, X, u):
+        """A place as the tree sees it."""
+        x, y = ([at(vector, d) for d in range(3)] for vector in (X, u))
+        if self.turns:
+            R = rotation_matrix([at(X, 3 + k) for k in range(4)])
+            c = [at(parameters, first + self.index.about + d) for d in range(3)]
+            x, y = (
+                [sum_of(R[e][d] * z[e] for e in range(3)) for d in range(3)] for z in ([a - b for a, b in zip(x, c)], y)
+            )
+            x = [a + b for a, b in zip(x, c)]
+        return let(ti.types.vector(3, self.fp)(*((x[d] - at(parameters, first + d)) + y[d] for d in range(3))))

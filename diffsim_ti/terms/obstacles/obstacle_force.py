@@ -187,6 +187,11 @@ class ObstacleForce(VertexForce):
         return let(sum_of(n[d].value * at(move, d) for d in range(3)))
 
     @ti.func
+    def reached(self, parameters: ti.template(), first, X, u, move, d):
+        """The least distance on the way of a move from a place at distance d, not positive where it leads through [m]."""
+        return ti.min(d, d + self.approach(parameters, first, X, u, move))
+
+    @ti.func
     def rigidity(self, parameters: ti.template(), first, X, u):
         """b''(d) [N/m]"""
         s = self.gap(parameters, first, X, u) / self.width(parameters, first)

@@ -1,6 +1,6 @@
 """The distance of a place to what is nearest of a tree of triangles, in kernels, and its derivatives (surface_tree.py).
 
-With p = sum_i w_i y_i the nearest point of the corners y, r = x - p, and E the directions in which p is free (two inside of
+With z = sum_i w_i y_i the nearest point of the corners y, r = x - z, and E the directions in which z is free (two inside of
 a triangle, one on a side, none at a corner), G = (E^T E)^-1:
 
     d = s |r| - radius,    n = s r / |r|,    dn / dx = s / |r| (1 - n n^T - E G E^T)
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.runtime import number_type
-from diffsim_ti.terms.obstacles.surface_tree import FLAT, GROUP, HEADER
+from diffsim_ti.terms.obstacles.surface_tree import FLAT, GROUP, HEADER, NODE
 
 A = ti.template()  # an array handed to a Taichi function
 
@@ -59,7 +59,7 @@ class SurfaceDistance:
     @ti.func
     def square(self, node, x, parameters: A):
         """Squared distance to the box of a node."""
-        first, out = self.table + HEADER + 6 * node, ti.cast(0, self.fp)
+        first, out = self.table + HEADER + NODE * node, ti.cast(0, self.fp)
         for d in ti.static(range(3)):
             gap = ti.max(parameters[first + d] - x[d], x[d] - parameters[first + 3 + d], ti.cast(0, self.fp))
             out += gap * gap
@@ -78,18 +78,16 @@ class SurfaceDistance:
     @ti.func
     def nearer_child(self, node, x, parameters: A):
         """The child of a node whose box has the nearer middle."""
-        first, nearer = self.table + HEADER + 12 * node, ti.cast(0, self.fp)
-        for d in ti.static(range(3)):
-            left = parameters[first + d] + parameters[first + 3 + d]
-            right = parameters[first + 6 + d] + parameters[first + 9 + d]
-            nearer += (right - left) * (4 * x[d] - left - right)
-        return 2 * node + ti.cast(nearer > 0, ti.i32)
+        first = self.table + HEADER + NODE * node + 6
+        right = self.vector(first, parameters).dot(x) > parameters[first + 3]
+        return 2 * node + ti.cast(right, ti.i32)
 
     @ti.func
     def find(self, x, begin, parameters: A):
-        """(primitive, feature, shares of its corners) of what is nearest; begin: where vertices begin in the parameters."""
+        """(primitive, feature, s, t) of what is nearest, as `nearest` has them; begin: where vertices begin in the
+        parameters."""
         leaves, count = self.number(0, parameters), self.number(1, parameters)
-        best, m, feature, w = ti.cast(1e30, self.fp), 0, 0, self.vec3(0)
+        best, m, feature, s, t = ti.cast(1e30, self.fp), 0, 0, ti.cast(0, self.fp), ti.cast(0, self.fp)
         node, down = 1, True
         while node > 0:
             if down:
@@ -103,9 +101,9 @@ class SurfaceDistance:
                             a = self.vector(begin + self.corner(j, 0, parameters), parameters)
                             b = self.vector(begin + self.corner(j, 1, parameters), parameters)
                             c = self.vector(begin + self.corner(j, 2, parameters), parameters)
-                            own, shares, square = self.nearest(x, a, b, c)
+                            own, own_s, own_t, square = self.nearest(x, a, b, c)
                             if square < best:
-                                best, m, feature, w = square, j, own, shares
+                                best, m, feature, s, t = square, j, own, own_s, own_t
             elif node == 1:
                 node = 0
             elif node == self.nearer_child(node >> 1, x, parameters):
@@ -113,76 +111,108 @@ class SurfaceDistance:
                 down = True
             else:
                 node = node >> 1
-        return m, feature, w
+        return m, feature, s, t
+
+    @ti.func
+    def free_share(self, x, there, begin, parameters: A):
+        """The share of the way from x to another place before the first triangle on it; 1 where none is."""
+        leaves, count, node, out = self.number(0, parameters), self.number(1, parameters), 1, ti.cast(1, self.fp)
+        while node > 0:
+            first, meets = self.table + HEADER + NODE * node, True
+            for d in ti.static(range(3)):
+                meets = meets and parameters[first + d] <= ti.max(x[d], there[d])
+                meets = meets and parameters[first + 3 + d] >= ti.min(x[d], there[d])
+            if meets and node < leaves:
+                node = 2 * node
+            else:
+                if meets:
+                    for j in range(GROUP * (node - leaves), ti.min(GROUP * (node - leaves + 1), count)):
+                        a = self.vector(begin + self.corner(j, 0, parameters), parameters)
+                        b = self.vector(begin + self.corner(j, 1, parameters), parameters)
+                        c = self.vector(begin + self.corner(j, 2, parameters), parameters)
+                        out = ti.min(out, self.share_before(x, there, a, b, c))
+                node += 1
+                while (node & 1) == 0:
+                    node >>= 1
+                if node == 1:
+                    node = 0
+        return out
+
+    @ti.func
+    def share_before(self, x, there, a, b, c):
+        """The same of one triangle, with room for rounding at its sides."""
+        out, e1, e2 = ti.cast(1, self.fp), b - a, c - a
+        normal = e1.cross(e2)
+        begin, end, det = (x - a).dot(normal), (there - a).dot(normal), normal.norm_sqr()
+        if begin * end < 0 and det > 0:
+            share, room = begin / (begin - end), ti.cast(16 * self.flat**0.5, self.fp)
+            q = x - a + share * (there - x)
+            s, t = q.cross(e2).dot(normal) / det, e1.cross(q).dot(normal) / det
+            if ti.min(s, t) > 0 - room and s + t < 1 + room:
+                out = share
+        return out
 
     @ti.func
     def nearest(self, x, a, b, c):
-        """(feature, shares of the corners, squared distance) of a triangle."""
+        """(feature, s, t, squared distance) of a triangle: the nearest point is p + s (q - p) + t (r - p), p, q, r being its
+        corners from that on which `first_of` says."""
         zero, one = ti.cast(0, self.fp), ti.cast(1, self.fp)
-        e1, e2, q = b - a, c - a, x - a
+        e1, e2, y = b - a, c - a, x - a
         normal = e1.cross(e2)
         det = normal.norm_sqr()
         inverse = one / ti.max(det, ti.cast(self.tiny, self.fp))
-        s, t = q.cross(e2).dot(normal) * inverse, e1.cross(q).dot(normal) * inverse
-        height = q.dot(normal)
-        feature, w, square = 0, self.vec3(one - s - t, s, t), height * height * inverse
+        s, t = y.cross(e2).dot(normal) * inverse, e1.cross(y).dot(normal) * inverse
+        height = y.dot(normal)
+        feature, square = 0, height * height * inverse
         flat = not det > ti.cast(self.flat, self.fp) * e1.norm_sqr() * e2.norm_sqr()
         if flat or not (s > zero and t > zero and s + t < one):
-            square = ti.cast(1e30, self.fp)
-            for k in ti.static(range(3)):
-                begin = (a, b, c)[k]
-                side, r = (b, c, a)[k] - begin, x - begin
-                length = ti.max(side.norm_sqr(), ti.cast(self.tiny, self.fp))
-                share, own = r.dot(side) / length, 1 + k
+            square, t = ti.cast(1e30, self.fp), zero
+            begin, end, third = a, b, c
+            for k in range(3):
+                side, r, own = end - begin, x - begin, 1 + k
+                share = r.dot(side) / ti.max(side.norm_sqr(), ti.cast(self.tiny, self.fp))
                 if share <= zero:
                     share, own = zero, 4 + k
                 if share >= one:
                     share, own = one, 4 + (k + 1) % 3
                 new = (r - share * side).norm_sqr()
                 if new < square:
-                    square, feature, w = new, own, self.vec3(0)
-                    w[k] = one - share
-                    w[(k + 1) % 3] = share
-        return feature, w, square
+                    square, feature, s = new, own, ti.select(own < 4, share, zero)
+                before = begin
+                begin = end
+                end = third
+                third = before
+        return feature, s, t, square
+
+    @ti.func
+    def first_of(self, feature):
+        """The corner where the nearest side begins, or the nearest corner."""
+        return (feature + 2) % 3 * ti.cast(feature > 0, ti.i32)
 
     @ti.func
     def look(self, x, begin, parameters: A):
-        """((d without the radius, n, dn / dx: xx, xy, xz, yy, yz, zz), rows of the parameters where the corners begin, w, g
-        as columns)"""
+        """((d without the radius, n, dn / dx: xx, xy, xz, yy, yz, zz), where its corners p, q, r begin in the parameters, s and
+        t, those columns g of q and r that p balances)"""
         one, zero = ti.cast(1, self.fp), ti.cast(0, self.fp)
-        m, feature, w = self.find(x, begin, parameters)
-        rows, y, g = ti.Vector([0, 0, 0]), ti.Matrix.zero(self.fp, 3, 3), ti.Matrix.zero(self.fp, 3, 3)
-        for k in ti.static(range(3)):
-            rows[k] = begin + self.corner(m, k, parameters)
-            for i in ti.static(range(3)):
-                y[i, k] = parameters[rows[k] + i]
-        r = x - y @ w
-        a, b = self.column(y, 1) - self.column(y, 0), self.column(y, 2) - self.column(y, 0)
-        out, n, d, bend, along = ti.Vector.zero(self.fp, 10), a.cross(b), zero, zero, self.vec3(0)
+        m, feature, s, t = self.find(x, begin, parameters)
+        first = self.first_of(feature)
+        rows = ti.Vector([begin + self.corner(m, (first + k) % 3, parameters) for k in ti.static(range(3))])
+        p = self.vector(rows[0], parameters)
+        e, f = self.vector(rows[1], parameters) - p, self.vector(rows[2], parameters) - p
+        r = x - p - s * e - t * f
+        n, d, bend, g, h, along = e.cross(f), zero, zero, self.vec3(0), self.vec3(0), self.vec3(0)
         if feature == 0:
             square = n.norm_sqr()
-            b1, b2 = b.cross(n) / square, n.cross(a) / square  # that have the products 1 and 0 with a and b
+            g, h = f.cross(n) / square, n.cross(e) / square  # have the products 1 and 0 with e and f
             n = n / ti.sqrt(square)
             d = r.dot(n)
             if d < 0 and not self.has_inside(m, parameters):
                 n = zero * n - n
                 d = zero - d
-            for i in ti.static(range(3)):
-                g[i, 0], g[i, 1], g[i, 2] = zero - b1[i] - b2[i], b1[i], b2[i]
         else:
             if feature < 4:
-                first = feature - 1
-                following = (first + 1) % 3
-                for i in ti.static(range(3)):
-                    for k in ti.static(range(3)):
-                        share = ti.cast(following == k, self.fp) - ti.cast(first == k, self.fp)
-                        along[i] += share * y[i, k]
-                square = along.norm_sqr()
-                for i in ti.static(range(3)):
-                    for k in ti.static(range(3)):
-                        share = ti.cast(following == k, self.fp) - ti.cast(first == k, self.fp)
-                        g[i, k] = share * along[i] / square
-                along = along / ti.sqrt(square)
+                square = e.norm_sqr()
+                g, along = e / square, e / ti.sqrt(square)
             d = ti.sqrt(r.norm_sqr())
             sign = self.sign(m, feature, r, parameters)
             bend = sign / ti.max(d, ti.cast(self.tiny, self.fp))
@@ -190,17 +220,14 @@ class SurfaceDistance:
             if d <= ti.cast(self.tiny, self.fp):
                 n = self.vec3(one, zero, zero)
             d = sign * d
+        out = ti.Vector.zero(self.fp, 10)
         out[0] = d
         for k in ti.static(range(6)):
             i, j = ti.static(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))[k])
             if ti.static(k < 3):
                 out[1 + k] = n[k]
             out[4 + k] = bend * (ti.cast(i == j, self.fp) - n[i] * n[j] - along[i] * along[j])
-        return out, rows, w, g
-
-    @ti.func
-    def column(self, y, k: A):
-        return self.vec3(y[0, k], y[1, k], y[2, k])
+        return out, rows, s, t, g, h
 
     @ti.func
     def has_inside(self, m, parameters: A):
@@ -218,7 +245,7 @@ class SurfaceDistance:
                 first = self.table + self.number(2, parameters) + self.stride * m + 4 + 3 * (feature - 1)
                 if feature > 3:
                     first = self.vertices(parameters) + self.number(4, parameters)
-                    first += self.corner(m, feature - 4, parameters)
+                    first += self.corner(m, self.first_of(feature), parameters)
                 if r.dot(self.vector(first, parameters)) < 0:
                     out = ti.cast(-1, self.fp)
         return out

@@ -17,7 +17,10 @@ import numpy as np
 from diffsim_ti.mesh.geometry import cross, curve_order
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 
-GROUP = 4
+GROUP, NODE = (
+    4,
+    10,
+)  # primitives of a leaf; numbers of a node: lowest and highest corner, where its right child is nearer
 HEADER = 5  # of the table: number of leaves, of primitives, where primitives begin, where vertices do, numbers of these
 FLAT = 1e-14  # sin^2 of an angle below which a triangle is its sides
 CHUNK, MOST_PAIRS = 20_000, 1_000_000  # places that are looked for together, and pairs of them and nodes
@@ -74,9 +77,14 @@ class SurfaceTree:
         sided = self.is_sided
         primitives = np.column_stack([self.corners, self.pseudonormals]) if sided else self.corners
         vertices = [self.x.ravel(), *([self.surface.pseudonormals[1].ravel()] if sided else [])]
-        begin = HEADER + self.boxes.size
+        nodes = np.zeros((len(self.boxes), NODE))
+        nodes[:, :6], middles = self.boxes, 0.5 * (self.boxes[:, :3] + self.boxes[:, 3:])
+        left, right = middles[2 : 2 * self.leaves : 2], middles[3 : 2 * self.leaves : 2]  # of inner nodes from 1 on
+        nodes[1 : self.leaves, 6:9] = right - left
+        nodes[1 : self.leaves, 9] = 0.5 * np.einsum("ij,ij->i", right - left, right + left)
+        begin = HEADER + nodes.size
         header = [self.leaves, self.count, begin, begin + primitives.size, self.x.size]
-        return np.concatenate([header, self.boxes.ravel(), primitives.ravel(), *vertices])
+        return np.concatenate([header, nodes.ravel(), primitives.ravel(), *vertices])
 
     # ---- on the host -------------------------------------------------------------------------------------------------
 
