@@ -205,12 +205,8 @@ class ObstacleFunctions:
     @ti.func
     def passed(self, g: A, d, felt, step, parts):
         """(how many of the next points are farther away than `felt`, d or less than it) for a point at distance d."""
-        far = d
-        if ti.static(g.force.grain > 0):  # splines are steeper than distances, and end with their grid
-            inside = d < ti.cast(1e6 * g.force.grain, self.fp)
-            far = ti.select(inside, ti.cast(0.8, self.fp) * d, felt)
-        ahead = ti.min((far - felt) / step, ti.cast(parts, self.fp))
-        return ti.cast(ti.max(ahead, ti.cast(0, self.fp)), ti.i32), far
+        ahead = ti.min((d - felt) / step, ti.cast(parts, self.fp))
+        return ti.cast(ti.max(ahead, ti.cast(0, self.fp)), ti.i32), d
 
     @ti.func
     def dot3(self, a, b):

@@ -38,7 +38,6 @@ class ObstacleForce(VertexForce):
     # one side of each tangent plane (convex), or neither
     hollow, convex = False, False
     lanes = False  # whether `distance_and_normal` also takes numbers in lanes
-    grain = 0.0  # parts of a face that are smaller [m] need not be told apart
 
     @property
     def size(self) -> int:

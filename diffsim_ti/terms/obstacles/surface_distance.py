@@ -191,8 +191,8 @@ class SurfaceDistance:
 
     @ti.func
     def look(self, x, begin, parameters: A):
-        """((d without the radius, n, dn / dx: xx, xy, xz, yy, yz, zz), where its corners p, q, r begin in the parameters, s and
-        t, those columns g of q and r that p balances)"""
+        """((d without the radius, n, dn / dx: xx, xy, xz, yy, yz, zz), where its corners p, q, r begin in the parameters,
+        s, t, those columns g of q and r that p balances)"""
         one, zero = ti.cast(1, self.fp), ti.cast(0, self.fp)
         m, feature, s, t = self.find(x, begin, parameters)
         first = self.first_of(feature)
