@@ -75,21 +75,30 @@ class SurfaceMesh:
         a ball of radius h / phi, or phi length / 6 if it is shorter than they are.
         """
         edges, which = self._edges_of_triangles
-        count = np.bincount(which.ravel(), minlength=len(edges))
-        order = np.argsort(which.ravel(), kind="stable")
+        real = np.flatnonzero(self._is_real)
+        which = which[real].ravel()
+        count, order = np.bincount(which, minlength=len(edges)), np.argsort(which, kind="stable")
         first = (np.cumsum(count) - count)[count == 2]
-        x, keeps = self.vertices[self.triangles], count != 2
-        (f, g), (i, j) = np.divmod(order[np.stack([first, first + 1])], 3)  # the triangles of an edge, their sides
+        x, keeps = self.vertices[self.triangles[real]], (count != 2) & (count > 0)
+        (f, g), (i, j) = np.divmod(order[np.stack([first, first + 1])], 3)  # an edge's triangles, and their sides
         along = x[f, (i + 1) % 3] - x[f, i]
         along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
         a, b = x[f, (i + 2) % 3] - x[f, i], x[g, (j + 2) % 3] - x[f, i]
         a, b = (y - np.einsum("ij,ij->i", y, along)[:, None] * along for y in (a, b))
         height = np.minimum(*(np.linalg.norm(y, axis=1) for y in (a, b)))
         bend = np.arctan2(np.linalg.norm(cross(a, b), axis=1), -np.einsum("ij,ij->i", a, b))
-        is_concave = self.is_sided[f] & (np.einsum("ij,ij->i", cross(x[f, 1] - x[f, 0], x[f, 2] - x[f, 0]), b) > 0)
+        is_concave = self.is_sided[real][f] & (
+            np.einsum("ij,ij->i", cross(x[f, 1] - x[f, 0], x[f, 2] - x[f, 0]), b) > 0
+        )
         keeps[count == 2] = ~is_concave & (bend * length * np.maximum(length / height.clip(1e-300), 1) > 6 * bow)
         out = np.unique(np.concatenate([edges[keeps], np.sort(self.one[self.segments], 1)]), axis=0)
         return out[out[:, 0] < out[:, 1]]
+
+    @cached_property
+    def _is_real(self) -> np.ndarray:
+        """Whether a triangle's corners lie in three places; the neighbours of others meet."""
+        t = self.one[self.triangles]
+        return (t != np.roll(t, -1, axis=1)).all(1)
 
     @cached_property
     def is_sided(self) -> np.ndarray:
@@ -97,8 +106,7 @@ class SurfaceMesh:
         if not len(self.triangles):
             return np.zeros(0, bool)
         t, (edges, which) = self.one[self.triangles], self._edges_of_triangles
-        following = np.roll(t, -1, axis=1)
-        real = (t != following).all(1, keepdims=True)  # others have no area, and their neighbours meet
+        following, real = np.roll(t, -1, axis=1), self._is_real[:, None]
         count = np.bincount(which.ravel(), np.repeat(real, 3), len(edges))
         net = np.bincount(which.ravel(), (real * np.where(t < following, 1, -1)).ravel(), len(edges))
         fits = ((count == 2) & (net == 0))[which].all(1) | ~real[:, 0]
