@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
+from diffsim_ti.inputs.description import length
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
@@ -53,6 +54,7 @@ class MeshObstacle(Obstacle):
         segments: ArrayLike | None = None,
         points: ArrayLike | None = None,
         radius: float = 0.0,
+        shapeable: bool = False,
         **options,
     ):
         if resolution is not None:
@@ -66,15 +68,24 @@ class MeshObstacle(Obstacle):
         self._base = middle_far_part(self._made.vertices)
         self._tree = SurfaceTree(self._made, self._base)
         super().__init__([place("position", position, "mesh_position"), thick], **options)
-        self.by_pairs = True
+        self.by_pairs, self.shapeable = True, bool(shapeable)
+        if self.shapeable:  # behind all other numbers, as kernels read few of them at a time
+            shape = Input("vertices", vertices, (self._made.vertices.shape,), "m", change=length, plain="mesh_vertices")
+            self.described = (*self.described, shape)
         if rounding_of(vertices) > OF_WIDTHS * self.values["barrier_width"]:
             coarse = f"float32 resolves vertices to {rounding_of(vertices):.2g} m, too little for the barrier's width"
             warnings.warn(f"MeshObstacle: {coarse}: give them in float64", stacklevel=2)
 
     @cached_property
-    def table(self) -> np.ndarray:
-        """What kernels find distances in."""
+    def table(self):
         return self._tree.table()
+
+    def table_at(self, numbers):
+        """Of moved vertices, with the edges and sides that there are."""
+        if not self.shapeable:
+            return self.table
+        moved = numbers[-self._tree.x.size :].reshape(-1, 3)
+        return self.table if np.array_equal(moved, self._tree.x) else self._tree.moved(moved).table()
 
     def distance(self, positions):
         from_base = positions - (self._base + self.values["mesh_position"])
@@ -84,6 +95,8 @@ class MeshObstacle(Obstacle):
         """The tree is measured from `_base`, which the position has more."""
         out = super().shift(origin)
         out[:3] -= self._base
+        if self.shapeable:
+            out[-self._tree.x.size :] = np.tile(self._base, len(self._tree.x))
         return out
 
     def surface(self, size):
@@ -106,7 +119,11 @@ class MeshObstacle(Obstacle):
                 f"MeshObstacle: float32 cannot count the {table + self.table.size} numbers of a surface of "
                 f"{self._tree.count} triangles, segments and points: pass precision='f64', or fewer"
             )
-        return MeshForce(precision, self.has_friction, table, self._tree.is_sided)
+        return MeshForce(precision, self.has_friction, table, self._tree.is_sided, self.shapeable)
+
+    @property
+    def num_extra(self):
+        return self._tree.x.size if self.shapeable else 0
 
 
 @dataclass(frozen=True)
@@ -131,8 +148,13 @@ class MeshForce(ObstacleForce):
 
     table: int = 0
     sided: bool = False
+    shapeable: bool = False
 
     count = 4
+
+    @property
+    def corners(self):
+        return 3 if self.shapeable else 0
 
     @cached_property
     def nearest(self) -> SurfaceDistance:
@@ -142,12 +164,25 @@ class MeshForce(ObstacleForce):
     def distance_and_normal(self, g, p, X, u):
         local = [(x - c) + y for x, c, y in zip(X, p, u)]
         point = let(ti.types.vector(3, self.fp)(*(k.value for k in local)))
-        found = let(self.nearest.look(point, g.parameters))
+        begin = g.first + self.size if self.shapeable else self.nearest.vertices(g.parameters)
+        found, rows, w, bent = (let(x) for x in self.nearest.look(point, let(begin), g.parameters))
         n = [at(found, 1 + k) for k in range(3)]
         H = [[at(found, 4 + k) for k in row] for row in ((0, 1, 2), (1, 3, 4), (2, 4, 5))]
-        d = g.function(at(found, 0), *((x, lambda k=k: n[k]) for k, x in enumerate(local)))
-        rows = [g.function(n[a], *((x, lambda a=a, b=b: H[a][b]) for b, x in enumerate(local))) for a in range(3)]
-        return d - p[3], rows
+        by_d = [(x, lambda k=k: n[k]) for k, x in enumerate(local)]
+        by_n = [[(x, lambda a=a, b=b: H[a][b]) for b, x in enumerate(local)] for a in range(3)]
+        for c in range(self.corners):
+            for e in range(3):
+                row, share = let(at(rows, c) + e), at(w, c)
+                leaf = g.leaf(at(g.parameters, row))
+                leaf.row = row
+                g.corners.append(leaf)
+                by_d.append((leaf, lambda e=e, share=share: let(-share * n[e])))
+                for a in range(3):
+                    by_n[a].append(
+                        (leaf, lambda a=a, e=e, c=c, share=share: let(-share * H[a][e] - at(bent, a, c) * n[e]))
+                    )
+        d = g.function(at(found, 0), *by_d)
+        return d - p[3], [g.function(n[a], *by_n[a]) for a in range(3)]
 
     @ti.func
     def may_touch(self, parameters: ti.template(), first, X, u):

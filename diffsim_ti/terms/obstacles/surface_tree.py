@@ -9,6 +9,7 @@ Hapala, Davidovic, Wald, Havran, Slusallek 2011, Efficient stack-less BVH traver
 Ericson, Real-Time Collision Detection, 2005, 5.1 and 6; Morton 1966.
 """
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -48,6 +49,12 @@ class SurfaceTree:
                 if first == 1:
                     break
                 first, row = first // 2, reduce(row[::2], row[1::2])
+
+    def moved(self, x: np.ndarray) -> "SurfaceTree":
+        """That of vertices elsewhere, with the same edges and sides."""
+        surface = replace(self.surface, vertices=x)
+        vars(surface).update({name: getattr(self.surface, name) for name in ("one", "is_sided", "_edges_of_triangles")})
+        return SurfaceTree(surface, np.zeros(3))
 
     @cached_property
     def pseudonormals(self) -> np.ndarray:
