@@ -183,6 +183,8 @@ class PartSolver:
                 return xi
             step = -self.inverse(J, -by_y)(r)
             change, before, share = J @ step, -r @ step, 1.0
+            if np.all(np.abs(change) <= SURE * (np.abs(y) + np.abs(at.begin))):
+                return xi + step
             change_xi = xi @ step, step @ step
             while True:
                 y_next = y + share * change
@@ -191,8 +193,6 @@ class PartSolver:
                     break
                 share *= 0.5
             xi, y = xi + share * step, y_next
-            if share == 1 and np.all(np.abs(change) <= SURE * (np.abs(y) + np.abs(at.begin))):
-                return xi
         return None
 
     def take(self, part: Part, of, at) -> tuple[np.ndarray, np.ndarray]:

@@ -18,13 +18,14 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSolver
-from diffsim_ti.mechanics.surfaces.host_geometry import nearest
+from diffsim_ti.mechanics.surfaces.host_geometry import dot, nearest
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.runtime.slots import VertexRows
 from diffsim_ti.terms.self_contact import SelfContact
 
 LONGEST, RESOLVED = 0.2, 0.02  # of the width that near surfaces move in a part; and where it need not be resolved
 HALF = 0.5  # share of a distance by which a resolved part may close it before normals are taken
+MOST_LOOKS = 200  # at the pairs of a pass
 SHORTEST = 2.0**-14  # share of a pass
 INDEX = SelfContact.index
 
@@ -64,6 +65,8 @@ class PairContact(Stage):
         self.row_of, self.rough = rows, self.inner.term.has_friction
         runtime.fill(a.corner, 0)
         self.scratch = runtime.array(self.inner.kernels.vec4, self.inner.a.first_contact_corner + self.inner.list.num_surface)
+        self.begin = runtime.array(a.vector, 1, a.num_vertices)
+        runtime.fill(self.begin, 0)
         self.clear()
 
     # ---- passes --------------------------------------------------------------------------------------------------------
@@ -79,10 +82,9 @@ class PairContact(Stage):
         yield
         if at.stride:
             self.kept[at.end] = None
-        near = self._near(*self._fine(u, at.end)) if now.alpha > 0 else ()
         try:
-            if len(near):
-                self._act(at, start, near)
+            if now.alpha > 0:
+                self._act(at, start)
             inner.check_pass(*self._fine(u, at.end), now.h)
         except Tunnelling as error:
             raise at.ws.dated(error, at.j, at.num_passes) from None
@@ -90,21 +92,33 @@ class PairContact(Stage):
     def _fine(self, u, slot: int) -> tuple:
         return (u, slot) if self.matrix is None else (self.pairs.fine(u, slot), 0)
 
-    def _near(self, u, slot: int) -> np.ndarray:
-        """Numbers of the near pairs of the list."""
+    def _look(self, u, slot: int) -> tuple[bool, bool]:
+        """(whether the list does not hold where the pass led, whether pairs of it may be near)"""
         inner = self.inner
-        if not inner.list.count:
-            return np.zeros(0, int)
         inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
-        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, **inner._sums)
+        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, lost=0.0, **inner._sums)
         inner.run(inner.motion.find, dict(u=u), slot=slot, **bodies)
         flags = runtime.view(inner.flags)
-        if not (runtime.fetch(inner.flags) if flags is None else flags)[2]:
-            return np.zeros(0, int)
-        return np.flatnonzero(whole(inner.near)[: inner.list.count])
+        stale, _, near = runtime.fetch(inner.flags) if flags is None else flags
+        return bool(stale), bool(near)
 
-    def _act(self, at: Passes, start: np.ndarray, near: np.ndarray) -> None:
+    def _act(self, at: Passes, start: np.ndarray) -> None:
+        inner, end = self.inner, self._fine(at.history.u, at.end)
+        stale, any_near = self._look(*end)
+        if stale:  # a list of where the pass began, which holds to its end
+            self.rows.put(self.begin, 0, start)
+            travel = inner._travel(runtime.fetch_row(*end)[inner.mesh.surface_vertices] - runtime.fetch(inner.before))
+            begin = self._fine(self.begin, 0)
+            inner._build(*begin, wanted=1.01 * travel)
+            inner.forces(*begin, self.scratch)
+            _, any_near = self._look(*self._fine(at.history.u, at.end))
+        if not any_near:
+            return
         u, v = self.rows.get(at.history.u, at.end), self.rows.get(at.history.v, at.end)
+        near = np.flatnonzero(whole(inner.near)[: inner.list.count])
+        near = near[self._comes_near(self._pass(near, start, u, v), at.now, u - start)]
+        if not near.size:
+            return
         one = self._pass(near, start, u, v)
         of = self._numbers(one, at.now)
         e, one.b = self._go(one, of)
@@ -116,6 +130,18 @@ class PairContact(Stage):
         v_next[one.nodes] += at.now.decay * one.b
         self.rows.put(at.history.u, at.end, u_next)
         self.rows.put(at.history.v, at.end, v_next)
+
+    def _comes_near(self, one: ContactPass, now, motion: np.ndarray) -> np.ndarray:
+        """Which pairs would come nearer than their width, by looks at the pass so often that none misses a crossing: of the
+        state alone, however old the list is."""
+        near, of = one.solver.near, self._numbers(one, now)
+        farthest = 2 * np.linalg.norm(motion - motion.mean(0), axis=1).max()
+        looks = min(MOST_LOOKS, 1 + int(2 * farthest / of.W))
+        out = np.zeros(len(one.pairs), bool)
+        for share in np.linspace(0, 1, looks + 1):
+            _, r, _ = nearest(near.relative(near.points(of.x + share * of.motion)), near.edges)
+            out |= dot(r, r) < of.width**2
+        return out
 
     def _mark_done(self, near: np.ndarray) -> None:
         """The parts have looked after these: `check_pass` need not."""
@@ -143,16 +169,16 @@ class PairContact(Stage):
         place = self.node_place[nodes]
         return ContactPass(PartSolver(own), place, corners, start[place], u, v, [], None, (*rest, row))
 
-    def _numbers(self, one: ContactPass, now, dot=None) -> SimpleNamespace:
-        """What parts read; dot: changes of it, as imaginary parts of the size `TINY`."""
+    def _numbers(self, one: ContactPass, now, changes=None) -> SimpleNamespace:
+        """What parts read; changes: of it, as imaginary parts of the size `TINY`."""
         a, first = self.a, self.inner.first
         nodes = self.a.mesh.surface_vertices[one.nodes]
         numbers, rest, mass = a.values.parameters.astype(float), a.values.rest, a.values.mass
         start, end, h_alpha, D = one.start, one.u[one.nodes], now.alpha, one.rest[0][:, 3]
-        if dot is not None:
-            numbers, rest, mass = numbers + dot.parameters, rest + dot.rest, mass + dot.mass
-            start, end, h_alpha = start + dot.start, end + dot.end, h_alpha + dot.alpha
-            D = D + np.einsum("pd,pk,pkd->p", one.rest[0][:, :3], one.rest[1], dot.fine_rest[one.pairs])
+        if changes is not None:
+            numbers, rest, mass = numbers + changes.parameters, rest + changes.rest, mass + changes.mass
+            start, end, h_alpha = start + changes.start, end + changes.end, h_alpha + changes.alpha
+            D = D + np.einsum("pd,pk,pkd->p", one.rest[0][:, :3], one.rest[1], changes.fine_rest[one.pairs])
         k, W = numbers[first + INDEX.stiffness], numbers[first + INDEX.width]
         half = 0.5 * D / W
         share = np.where(half.real < 1, half, 1)
@@ -174,41 +200,36 @@ class PairContact(Stage):
     def _go(self, one: ContactPass, of) -> tuple[np.ndarray, np.ndarray]:
         """(e, b) of the pass, whose parts are noted."""
         solver, e = one.solver, np.zeros_like(of.motion)
-        b, begin, share = e.copy(), 0.0, 1.0
-        damping = self.damping
+        b, begin, share, shortened = e.copy(), 0.0, 1.0, False
         while begin < 1:
             share = min(share, 1 - begin)
-            tried = self._try(solver, of, begin, share, e, b, damping)
+            tried = self._try(solver, of, begin, share, e, b)
             if tried is None:
-                share *= 0.5
+                share, shortened = 0.5 * share, True
                 if share < SHORTEST:
                     self._refuse(one, of)
                 continue
             part, e, b = tried
             one.parts.append(part)
-            begin, share = begin + share, 2 * share
+            begin, share, shortened = begin + share, share if shortened else 2 * share, False
         return e, b
 
-    def _try(self, solver: PartSolver, of, begin, share, e, b, damping):
+    def _try(self, solver: PartSolver, of, begin, share, e, b):
         """(the part, e, b after it), or None where it is too long."""
-        part, near = Part(begin, share, damping, e, b), solver.near
-        at = SimpleNamespace(f=share * (of.motion + of.alpha * b))
-        move = near.relative(near.points(at.f))
+        part, near = Part(begin, share, self.damping, e, b), solver.near
+        move = near.relative(near.points(share * (of.motion + of.alpha * b)))
         farthest = np.sqrt((move**2).sum(-1).max(1) / of.width**2).max()
         if farthest > LONGEST:
             return None
         X = near.points(of.x + begin * of.motion + e)
-        if damping < 1:
-            at = solver.look(part, of)
-            y = near.relative(X)
-            w, r, _ = nearest(y, near.edges)
-            d = np.sqrt((r * r).sum(1))
-            held = near.parted(r / d[:, None], X, at.points)
-            if not np.all(held > HALF * d):
+        at = solver.look(part, of)
+        if self.damping < 1:
+            before = near.parted(at.n, X)
+            if not np.all((before > 0) & (at.d > HALF * before)):
                 if farthest > RESOLVED:
                     return None
                 part.c = 1.0
-        at = solver.look(part, of)
+                at = solver.look(part, of)
         part.xi = solver.solve(part, of, at)
         if part.xi is None:
             return None

@@ -133,8 +133,10 @@ class MotionKernels(ListedPair):
 
     @ti.func
     def find_all(self, scene: A, at: A, plan: A):
-        scene.flags[2] = 0
+        for k in ti.static(range(3)):
+            scene.flags[k] = 0
         self.follow_frames(scene, at, plan)
+        self.compare_slacks(scene, at, plan)
         self.find_farthest(scene, at, plan)
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
@@ -148,12 +150,14 @@ class MotionKernels(ListedPair):
 
     @cached_property
     def find(self) -> Kernel:
-        """`near`: which pairs may be nearer than their width, where `forces` left planes or here; flags[2]: whether any."""
+        """`near`: which pairs may be nearer than their width, where `forces` left planes or here; flags: a vertex
+        has used up its slack (0), there is such a pair (2)."""
         own = dict(body="ints", marked="ints", flags="ints", frame="vectors", farthest="scalars", near="ints")
-        own |= dict(before="vectors", built="vectors")
+        own |= dict(before="vectors", built="vectors", slack="vectors")
         numbers = dict.fromkeys(
             ("num_bodies", "markers", "body_block", "body_blocks", "blocks", "size", "number"), "int"
         )
+        numbers |= dict(lost="float")
         return self.kernel("find", self.find_all, dict(u="vectors2"), own, **numbers)
 
     @ti.func
