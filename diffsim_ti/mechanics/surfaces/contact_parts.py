@@ -354,4 +354,3 @@ class PartSolver:
             entries = (entries @ near.C.T).tocsr()
         row = np.arange(len(near.corners))
         return np.stack([np.asarray(entries[row, near.corners[:, k]]).ravel() for k in range(4)], 1)
-

@@ -64,7 +64,9 @@ class PairContact(Stage):
         self.label[self.inner.mesh.surface_vertices] = labels
         self.row_of, self.rough = rows, self.inner.term.has_friction
         runtime.fill(a.corner, 0)
-        self.scratch = runtime.array(self.inner.kernels.vec4, self.inner.a.first_contact_corner + self.inner.list.num_surface)
+        self.scratch = runtime.array(
+            self.inner.kernels.vec4, self.inner.a.first_contact_corner + self.inner.list.num_surface
+        )
         self.begin = runtime.array(a.vector, 1, a.num_vertices)
         runtime.fill(self.begin, 0)
         self.clear()
@@ -245,7 +247,9 @@ class PairContact(Stage):
         doubtful = np.flatnonzero(~(near.parted(at.n, X, end) > room))
         if not doubtful.size:
             return True
-        some = NearPairs(near.corners[doubtful], near.edges[doubtful], near.scale[doubtful], near.num_points, None, None)
+        some = NearPairs(
+            near.corners[doubtful], near.edges[doubtful], near.scale[doubtful], near.num_points, None, None
+        )
         best = np.full(doubtful.size, -np.inf)
         for x in (X, end):
             _, r, _ = nearest(some.relative(x), some.edges)

@@ -128,18 +128,19 @@ class MeshObstacle(Obstacle):
 
 @dataclass(frozen=True)
 class MeshPrimitives(Primitives):
-    """Of a mesh: its vertices [m] at the position that the numbers begin with, and its edges; then its radius."""
+    """Of a mesh: its vertices [m] at the position that the numbers begin with, and its edges; then its radius, and where
+    they are inputs its vertices."""
 
     vertices: np.ndarray
 
     def at(self, p):
-        return self.vertices + p[:3], float(p[3])
+        return (p[4:].reshape(-1, 3) if len(p) > 4 else self.vertices) + p[:3], float(p[3])
 
     def jvp(self, p, dp):
-        return np.broadcast_to(dp[:3], self.vertices.shape), float(dp[3])
+        return (dp[4:].reshape(-1, 3) if len(dp) > 4 else 0 * self.vertices) + dp[:3], float(dp[3])
 
     def vjp(self, p, by_corners, by_radius):
-        return np.append(by_corners.sum(0), by_radius)
+        return np.concatenate([by_corners.sum(0), [by_radius], by_corners.ravel()[: len(p) - 4]])
 
 
 @dataclass(frozen=True)
