@@ -104,7 +104,7 @@ class Part:
 
 class PartSolver:
     """Takes parts of a pass; `of`, its numbers, has x, motion (nodes, 3): where nodes are, how they move without contact;
-    inverse (nodes,): 1 / mass; stiffness, width, mu (pairs,), speed, wall; h, alpha."""
+    inverse (nodes,): 1 / mass; stiffness, width, radius, mu, speed (pairs,); wall; h, alpha."""
 
     def __init__(self, near: NearPairs):
         self.near = near
@@ -125,8 +125,8 @@ class PartSolver:
         at.m = geometry.fading(at.y, near.edges, near.scale)
         at.B = near.weighed(at.w)
         at.moved = at.B @ at.f
-        at.begin = at.d - part.theta * dot(at.n, at.moved)
-        at.free = at.d + (1 - part.theta) * dot(at.n, at.moved)
+        at.begin = at.d - of.radius - part.theta * dot(at.n, at.moved)
+        at.free = at.d - of.radius + (1 - part.theta) * dot(at.n, at.moved)
         at.root = np.sqrt(at.alpha * 0.5 * (1 + part.c) * at.h * of.inverse)
         return at
 
@@ -293,6 +293,7 @@ class PartSolver:
         by.m += of.width * (of.stiffness * p + wall * q) * by.P
         # y = d + n . B ((1 - theta) f + zeta), begin = d - theta n . B f
         by.d += y_adj + s_adj
+        adj.radius -= y_adj + s_adj
         along = y_adj[:, None] * ((1 - part.theta) * at.moved + at.B @ at.zeta)
         by.n += along - (s_adj * part.theta)[:, None] * at.moved
         lever = (1 - part.theta) * at.f + at.zeta
@@ -323,7 +324,7 @@ class PartSolver:
         L = at.h * at.load
         G = -L * dot(e, r_adj)
         by_load, by_bound = -at.h * at.kappa * dot(at.t, r_adj), -G * at.slip * at.share_of_mu
-        adj.speed += (-G * at.slip * at.ratio).sum()
+        adj.speed -= G * at.slip * at.ratio
         t_adj = (-L * at.kappa)[:, None] * r_adj + (G * (at.slip - at.kappa))[:, None] * e
         across = dot(at.n, t_adj)
         v_adj = t_adj - across[:, None] * at.n

@@ -19,15 +19,16 @@ from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSolver
 from diffsim_ti.mechanics.surfaces.host_geometry import dot, nearest
+from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
+from diffsim_ti.mechanics.surfaces.stages import moment_of
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.runtime.slots import VertexRows
-from diffsim_ti.terms.self_contact import SelfContact
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 LONGEST, RESOLVED = 0.2, 0.02  # of the width that near surfaces move in a part; and where it need not be resolved
 HALF = 0.5  # share of a distance by which a resolved part may close it before normals are taken
 MOST_LOOKS = 200  # at the pairs of a pass
 SHORTEST = 2.0**-14  # share of a pass
-INDEX = SelfContact.index
 
 
 @dataclass
@@ -52,17 +53,20 @@ class PairContact(Stage):
         self.damping = damping
         self.pairs, self.inner, self.a = pairs, getattr(pairs, "inner", pairs), pairs.a
         a, mesh = self.a, self.a.mesh
-        self.matrix = getattr(pairs, "matrix", None)
-        self.rows = VertexRows(a, mesh.surface_vertices)
-        self.node_place = np.full(mesh.num_vertices, -1)
-        self.node_place[mesh.surface_vertices] = np.arange(len(mesh.surface_vertices))
+        self.matrix, self.obstacles = getattr(pairs, "matrix", None), pairs.obstacles
+        self.rows, num_nodes = VertexRows(a, mesh.surface_vertices), mesh.num_vertices
+        self.num_own = len(mesh.surface_vertices)
+        self.nodes = mesh.surface_vertices  # of bodies; corners of obstacles, of infinite mass, follow all vertices
+        if self.obstacles:
+            num_nodes += self.obstacles.corners.count
+            self.matrix = self.pairs.finer.mesh.with_corners
+            self.nodes = np.append(self.nodes, np.arange(mesh.num_vertices, num_nodes))
+        self.node_place = np.full(num_nodes, -1)
+        self.node_place[self.nodes] = np.arange(len(self.nodes))
         self.kept: dict[int, ContactPass | None] = {}
         self.partly_fixed = bool(len(a.supports.partly_fixed))
-        self.free = a.supports.freedom(a.num_vertices) if self.partly_fixed else None
-        labels, rows = self.inner.term.labels(self.inner.mesh)
-        self.label = np.zeros(self.inner.mesh.num_vertices, int)
-        self.label[self.inner.mesh.surface_vertices] = labels
-        self.row_of, self.rough = rows, self.inner.term.has_friction
+        self.free = a.supports.freedom(num_nodes) if self.partly_fixed else None
+        self.numbers, self.rough = PairNumbers(self.inner), self.inner.friction is not None
         runtime.fill(a.corner, 0)
         self.scratch = runtime.array(
             self.inner.kernels.vec4, self.inner.a.first_contact_corner + self.inner.list.num_surface
@@ -76,12 +80,14 @@ class PairContact(Stage):
     @contextmanager
     def do(self, at: Passes):
         pairs, inner, u, now = self.pairs, self.inner, at.history.u, at.now
+        self._follow(at, AT_BEGIN)
         if at.launch is None:
             pairs.ensure(u, at.slot)
         fine = self._fine(u, at.slot)
         inner.forces(*fine, self.scratch)
-        start = self.rows.get(u, at.slot)
+        start = self._places(u, at.slot)
         yield
+        self._follow(at, AT_STAGE)
         if at.stride:
             self.kept[at.end] = None
         try:
@@ -90,6 +96,16 @@ class PairContact(Stage):
             inner.check_pass(*self._fine(u, at.end), now.h)
         except Tunnelling as error:
             raise at.ws.dated(error, at.j, at.num_passes) from None
+
+    def _follow(self, at: Passes, m: int) -> None:
+        """Obstacles are where a pass begins (AT_BEGIN), or at its end."""
+        if self.obstacles:
+            self.pairs.follow(self.a.poses.value(self.a.rows["path"], moment_of(at)), m)
+
+    def _places(self, u, slot: int) -> np.ndarray:
+        """Displacements of the nodes in a slot, and of corners of obstacles."""
+        own = self.rows.get(u, slot)
+        return np.concatenate([own, self.obstacles.displacements]) if self.obstacles else own
 
     def _fine(self, u, slot: int) -> tuple:
         return (u, slot) if self.matrix is None else (self.pairs.fine(u, slot), 0)
@@ -108,15 +124,17 @@ class PairContact(Stage):
         inner, end = self.inner, self._fine(at.history.u, at.end)
         stale, any_near = self._look(*end)
         if stale:  # a list of where the pass began, which holds to its end
-            self.rows.put(self.begin, 0, start)
+            self._follow(at, AT_BEGIN)
+            self.rows.put(self.begin, 0, start[: self.num_own])
             travel = inner._travel(runtime.fetch_row(*end)[inner.mesh.surface_vertices] - runtime.fetch(inner.before))
             begin = self._fine(self.begin, 0)
             inner._build(*begin, wanted=1.01 * travel)
             inner.forces(*begin, self.scratch)
+            self._follow(at, AT_STAGE)
             _, any_near = self._look(*self._fine(at.history.u, at.end))
         if not any_near:
             return
-        u, v = self.rows.get(at.history.u, at.end), self.rows.get(at.history.v, at.end)
+        u, v = self._places(at.history.u, at.end), self.rows.get(at.history.v, at.end)
         near = np.flatnonzero(whole(inner.near)[: inner.list.count])
         near = near[self._comes_near(self._pass(near, start, u, v), at.now, u - start)]
         if not near.size:
@@ -127,9 +145,10 @@ class PairContact(Stage):
         if at.stride:
             self.kept[at.end] = one
         self._mark_done(near)
-        u_next, v_next = u.copy(), v.copy()
-        u_next[one.nodes] += e
-        v_next[one.nodes] += at.now.decay * one.b
+        own = one.nodes < self.num_own
+        u_next, v_next = u[: self.num_own].copy(), v.copy()
+        u_next[one.nodes[own]] += e[own]
+        v_next[one.nodes[own]] += at.now.decay * one.b[own]
         self.rows.put(at.history.u, at.end, u_next)
         self.rows.put(at.history.v, at.end, v_next)
 
@@ -138,11 +157,11 @@ class PairContact(Stage):
         state alone, however old the list is."""
         near, of = one.solver.near, self._numbers(one, now)
         farthest = 2 * np.linalg.norm(motion - motion.mean(0), axis=1).max()
-        looks = min(MOST_LOOKS, 1 + int(2 * farthest / of.W))
+        looks = min(MOST_LOOKS, 1 + int(2 * farthest / np.min(of.W)))
         out = np.zeros(len(one.pairs), bool)
         for share in np.linspace(0, 1, looks + 1):
             _, r, _ = nearest(near.relative(near.points(of.x + share * of.motion)), near.edges)
-            out |= dot(r, r) < of.width**2
+            out |= dot(r, r) < (of.width + of.radius) ** 2
         return out
 
     def _mark_done(self, near: np.ndarray) -> None:
@@ -153,7 +172,7 @@ class PairContact(Stage):
             runtime.fill(self.inner.plane, plane)
 
     def _pass(self, near: np.ndarray, start, u, v) -> ContactPass:
-        inner, surface = self.inner, self.a.mesh.surface_vertices
+        inner = self.inner
         corners = runtime.fetch(inner.list.pairs)[: 4 * inner.list.count].reshape(-1, 4)[near]
         edges = near >= inner.list.num_vt
         scale = np.zeros(len(near))
@@ -167,32 +186,36 @@ class PairContact(Stage):
         free = None if self.free is None else self.free[nodes]
         own = NearPairs(local.reshape(-1, 4), edges, scale, len(points), C, free)
         rest = whole(inner.rest_plane)[near].astype(float), whole(inner.rest_weights)[near].astype(float)
-        row = self.row_of[self.label[corners[:, 0]], self.label[corners[:, 2]]]
-        place = self.node_place[nodes]
-        return ContactPass(PartSolver(own), place, corners, start[place], u, v, [], None, (*rest, row))
+        place, numbers = self.node_place[nodes], self.numbers.of(near, corners)
+        return ContactPass(PartSolver(own), place, corners, start[place], u, v, [], None, (*rest, numbers))
 
     def _numbers(self, one: ContactPass, now, changes=None) -> SimpleNamespace:
         """What parts read; changes: of it, as imaginary parts of the size `TINY`."""
-        a, first = self.a, self.inner.first
-        nodes = self.a.mesh.surface_vertices[one.nodes]
-        numbers, rest, mass = a.values.parameters.astype(float), a.values.rest, a.values.mass
+        a, own = self.a, one.rest[2]
+        nodes, numbers = self.nodes[one.nodes], a.values.parameters.astype(float)
+        rest, mass, inverse_mass, radius = a.values.rest - a.origin, a.values.mass, self.inverse, 0.0
+        if self.obstacles:
+            corners = self.obstacles.corners
+            rest, radius = np.concatenate([rest, corners.made(numbers)]), np.append(0.0, corners.radii(numbers))
+            mass, inverse_mass = (np.append(x, np.zeros(corners.count)) for x in (mass, inverse_mass))
+            radius = radius[own.contact]
         start, end, h_alpha, D = one.start, one.u[one.nodes], now.alpha, one.rest[0][:, 3]
         if changes is not None:
             numbers, rest, mass = numbers + changes.parameters, rest + changes.rest, mass + changes.mass
             start, end, h_alpha = start + changes.start, end + changes.end, h_alpha + changes.alpha
+            radius = radius + changes.radius[own.contact]
             D = D + np.einsum("pd,pk,pkd->p", one.rest[0][:, :3], one.rest[1], changes.fine_rest[one.pairs])
-        k, W = numbers[first + INDEX.stiffness], numbers[first + INDEX.width]
+        k, W = own.area * numbers[own.stiffness], numbers[own.width]
         half = 0.5 * D / W
         share = np.where(half.real < 1, half, 1)
-        inverse = np.where(self.inverse[nodes] > 0, 1 / np.where(mass[nodes] > 0, mass[nodes], 1), 0)
-        mu, row = np.zeros(len(one.pairs), numbers.dtype), one.rest[2]
-        if self.rough:
-            mu[row >= 0] = numbers[first + INDEX.friction + row[row >= 0]]
-        speed = numbers[first + INDEX.friction_speed] if self.rough else 1.0
+        inverse = np.where(inverse_mass[nodes] > 0, 1 / np.where(mass[nodes] > 0, mass[nodes], 1), 0)
+        mu, rubs = np.zeros(len(one.pairs), numbers.dtype), own.mu >= 0
+        mu[rubs] = numbers[own.mu[rubs]]
+        speed = np.where(rubs, numbers[own.speed], 1.0)
         return SimpleNamespace(
             x=rest[nodes] + start, motion=end - start, inverse=inverse, h=now.h, alpha=h_alpha, stiffness=k / share,
             width=share * W, mu=mu, speed=speed, wall=mass[self.a.mesh.surface_vertices].mean(), rough=self.rough,
-            share=share, k=k, W=W, D=D,
+            share=share, k=k, W=W, D=D, radius=radius,
         )  # fmt: skip
 
     @property
@@ -226,8 +249,8 @@ class PairContact(Stage):
         X = near.points(of.x + begin * of.motion + e)
         at = solver.look(part, of)
         if self.damping < 1:
-            before = near.parted(at.n, X)
-            if not np.all((before > 0) & (at.d > HALF * before)):
+            before = near.parted(at.n, X) - of.radius
+            if not np.all((before > 0) & (at.d - of.radius > HALF * before)):
                 if farthest > RESOLVED:
                     return None
                 part.c = 1.0
@@ -237,13 +260,13 @@ class PairContact(Stage):
             return None
         e_next, b_next = solver.take(part, of, at)
         end = near.points(of.x + (begin + share) * of.motion + e_next)
-        if not self._stays_apart(near, at, X, end):
+        if not self._stays_apart(near, at, X, end, of.radius):
             return None
         return part, e_next, b_next
 
-    def _stays_apart(self, near: NearPairs, at, X: np.ndarray, end: np.ndarray) -> bool:
+    def _stays_apart(self, near: NearPairs, at, X: np.ndarray, end: np.ndarray, radius) -> bool:
         """Whether a plane parts each pair where a part begins and where it ends, and so all the way."""
-        room = self.rounding * (1 + np.abs(end).max())
+        room = self.rounding * (1 + np.abs(end).max()) + np.broadcast_to(radius, len(near.corners))
         doubtful = np.flatnonzero(~(near.parted(at.n, X, end) > room))
         if not doubtful.size:
             return True
@@ -255,7 +278,7 @@ class PairContact(Stage):
             _, r, _ = nearest(some.relative(x), some.edges)
             d = np.sqrt((r * r).sum(1))
             best = np.maximum(best, some.parted(r / np.maximum(d, 1e-300)[:, None], X, end))
-        return bool(np.all(best > room))
+        return bool(np.all(best > room[doubtful]))
 
     def _refuse(self, one: ContactPass, of) -> None:
         self.inner.fresh = False
@@ -270,11 +293,12 @@ class PairContact(Stage):
 
     def _alone(self, at: Passes, one: ContactPass | None):
         """The record without what the stage did."""
-        return nullcontext() if one is None else self.rows.replaced(at.history, at.end, one.u, one.v)
+        return nullcontext() if one is None else self.rows.replaced(at.history, at.end, one.u[: self.num_own], one.v)
 
     @contextmanager
     def tangent(self, at: Passes):
         one, run, now = self.kept.get(at.end), at.run, at.now
+        self._follow(at, AT_STAGE)
         before = self.rows.get(run.u, 0) if one else None
         with self._alone(at, one):
             yield
@@ -283,11 +307,17 @@ class PairContact(Stage):
         tiny, t = 1e-30j, run.tangent
         after, change = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         rest = runtime.fetch(run.numbers.rest).astype(float) if t.rest is None else np.asarray(t.rest, float)
-        parameters = np.asarray(t.parameters, float)
-        rate = run.rate_dot
+        parameters = np.asarray(t.parameters, float)[: len(self.a.values.parameters)]
+        rate, first, last, mass, radius = run.rate_dot, before, after, t.mass, np.zeros(1)
+        if self.obstacles:
+            poses = self.a.poses.jvp(self.a.rows["path"], t.path, moment_of(at))
+            at_end, at_begin, _ = self.obstacles.changes(parameters, poses)
+            first, last = np.concatenate([before, at_begin]), np.concatenate([after, at_end])
+            rest, mass = (np.concatenate([x, np.zeros((len(at_end), *x.shape[1:]))]) for x in (rest, mass))
+            radius = np.append(0.0, self.obstacles.corners.radii_jvp(self.a.values.parameters, parameters))
         dots = SimpleNamespace(
-            parameters=tiny * parameters[: len(self.a.values.parameters)], rest=tiny * rest, mass=tiny * t.mass,
-            start=tiny * before[one.nodes], end=tiny * after[one.nodes], alpha=tiny * rate * now.alpha_by_rate,
+            parameters=tiny * parameters, rest=tiny * rest, mass=tiny * mass, radius=tiny * radius,
+            start=tiny * first[one.nodes], end=tiny * last[one.nodes], alpha=tiny * rate * now.alpha_by_rate,
             fine_rest=tiny * (rest if self.matrix is None else self.matrix @ rest),
         )  # fmt: skip
         of = self._numbers(one, now, dots)
@@ -296,8 +326,9 @@ class PairContact(Stage):
             own = Part(part.begin, part.share, part.c, e, b, part.xi)
             e, b = one.solver.take(own, of, one.solver.look(own, of))
         decay = now.decay + tiny * rate * now.decay_by_rate
-        after[one.nodes] += e.imag / 1e-30
-        change[one.nodes] += (decay * b).imag / 1e-30
+        own = one.nodes < self.num_own
+        after[one.nodes[own]] += e[own].imag / 1e-30
+        change[one.nodes[own]] += (decay * b[own]).imag / 1e-30
         self.rows.put(run.u, 0, after)
         self.rows.put(run.v, 0, change)
 
@@ -310,59 +341,86 @@ class PairContact(Stage):
             yield
             return
         run.complete()
+        self._follow(at, AT_STAGE)
         p, q = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         of = self._numbers(one, now)
-        nodes = one.nodes
+        own, count = one.nodes < self.num_own, len(one.nodes)
+        nodes = one.nodes[own]
         adj = SimpleNamespace(
-            x=np.zeros_like(of.motion), motion=np.zeros_like(of.motion), inverse=np.zeros(len(nodes)), alpha=0.0,
+            x=np.zeros_like(of.motion), motion=np.zeros_like(of.motion), inverse=np.zeros(count), alpha=0.0,
             stiffness=np.zeros(len(one.pairs)), width=np.zeros(len(one.pairs)), mu=np.zeros(len(one.pairs)),
-            speed=0.0, wall=0.0,
+            speed=np.zeros(len(one.pairs)), radius=np.zeros(len(one.pairs)), wall=0.0,
         )  # fmt: skip
-        e_adj, b_adj = p[nodes], now.decay * q[nodes]
-        by_decay = float((q[nodes] * one.b).sum())
+        e_adj, b_adj = np.zeros((2, count, 3))
+        e_adj[own], b_adj[own] = p[nodes], now.decay * q[nodes]
+        by_decay = float((q[nodes] * one.b[own]).sum())
         for part in one.parts[::-1]:
             e_adj, b_adj = one.solver.back(part, of, e_adj, b_adj, adj)
         self.by_rate += now.alpha_by_rate * adj.alpha + now.decay_by_rate * by_decay
-        by_start = adj.x - adj.motion
-        p[nodes] += adj.motion
+        by_start = (adj.x - adj.motion)[own]
+        p[nodes] += adj.motion[own]
         self.rows.put(run.u, 0, p)
-        self._add(one, of, adj)
+        self._add(one, of, adj, own)
+        if self.obstacles:
+            self._add_obstacles(at, one, adj, own)
         with self._alone(at, one):
             yield
         p = self.rows.get(run.u, 0)
         p[nodes] += by_start
         self.rows.put(run.u, 0, p)
 
-    def _add(self, one: ContactPass, of, adj) -> None:
+    def _add_obstacles(self, at: Passes, one: ContactPass, adj, own: np.ndarray) -> None:
+        """Adjoints of where corners of obstacles were, and of radii."""
+        obstacles, place = self.obstacles, one.nodes[~own] - self.num_own
+        by_begin, by_end = np.zeros((2, obstacles.corners.count, 3))
+        by_begin[place], by_end[place] = (adj.x - adj.motion)[~own], adj.motion[~own]
+        obstacles.add_places(by_begin, AT_BEGIN)
+        obstacles.add_places(by_end, AT_STAGE)
+        by_radii = np.zeros(1 + len(obstacles.corners.parts))
+        np.add.at(by_radii, one.rest[2].contact, adj.radius)
+        obstacles.corners.add_radii(self.a.values.parameters, by_radii[1:], self.by_numbers)
+        by_rows = obstacles.take_rows()
+        if self.by_path is not None:
+            self.a.poses.vjp(self.a.rows["path"], by_rows, moment_of(at), self.by_path)
+
+    def _add(self, one: ContactPass, of, adj, own: np.ndarray) -> None:
         """Adjoints of the numbers, of masses and of the rest shape."""
         surface = self.a.mesh.surface_vertices
-        nodes = surface[one.nodes]
-        self.by_mass[nodes] -= of.inverse**2 * adj.inverse
+        nodes, numbers = self.nodes[one.nodes[own]], one.rest[2]
+        self.by_mass[nodes] -= (of.inverse**2 * adj.inverse)[own]
         self.by_mass[surface] += adj.wall / len(surface)
-        self.by_rest[nodes] += adj.x
+        self.by_rest[nodes] += adj.x[own]
         # stiffness k / share, width share W, share = min(1, D / (2 W))
         by_share = np.where(of.share < 1, of.W * adj.width - of.k / of.share**2 * adj.stiffness, 0)
-        first = self.a.parameters_of_self_contact.start
-        self.by_numbers[INDEX.stiffness] += (adj.stiffness / of.share).sum()
-        self.by_numbers[INDEX.width] += (of.share * adj.width - by_share * of.share / of.W).sum()
+        np.add.at(self.by_numbers, numbers.stiffness, numbers.area * adj.stiffness / of.share)
+        np.add.at(self.by_numbers, numbers.width, of.share * adj.width - by_share * of.share / of.W)
         by_D = 0.5 * by_share / of.W
         if by_D.any():
             plane, weights = one.rest[:2]
             at_corners = (by_D[:, None] * weights)[:, :, None] * plane[:, None, :3]
             np.add.at(self.by_fine_rest, one.pairs, at_corners)
         if self.rough:
-            self.by_numbers[INDEX.friction_speed] += adj.speed
-            rows = one.rest[2]
-            np.add.at(self.by_numbers, INDEX.friction + rows[rows >= 0], adj.mu[rows >= 0])
+            rubs = numbers.mu >= 0
+            np.add.at(self.by_numbers, numbers.speed[rubs], adj.speed[rubs])
+            np.add.at(self.by_numbers, numbers.mu[rubs], adj.mu[rubs])
 
     def clear(self) -> None:
-        a, own = self.a, self.a.parameters_of_self_contact
-        self.by_numbers, self.by_mass, self.by_rate = np.zeros(own.stop - own.start), np.zeros(a.num_vertices), 0.0
+        a, path = self.a, self.a.rows.get("path")
+        self.by_numbers, self.by_mass, self.by_rate = np.zeros(len(a.values.parameters)), np.zeros(a.num_vertices), 0.0
         self.by_rest, self.by_fine_rest = np.zeros((a.num_vertices, 3)), np.zeros((self.inner.mesh.num_vertices, 3))
+        self.by_path = np.zeros(path.shape) if self.obstacles and path is not None else None
+        if self.obstacles:
+            self.obstacles.clear()
 
     def collect(self, out: Derived) -> None:
-        out.parameters[self.a.parameters_of_self_contact] = self.by_numbers
-        by_fine = self.by_fine_rest if self.matrix is None else self.matrix.T @ self.by_fine_rest
+        out.parameters += self.by_numbers
+        by_fine = (
+            self.by_fine_rest if self.matrix is None else (self.matrix.T @ self.by_fine_rest)[: self.a.num_vertices]
+        )
+        if self.obstacles:
+            out.parameters += self.obstacles.by_parameters
+        if self.by_path is not None:
+            out.path += self.by_path
         out.rest = self.by_rest + by_fine + out.rest
         out.mass = out.mass + self.by_mass
         drag = self.a.features().drag
