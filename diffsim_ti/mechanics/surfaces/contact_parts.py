@@ -104,7 +104,8 @@ class Part:
 
 class PartSolver:
     """Takes parts of a pass; `of`, its numbers, has x, motion (nodes, 3): where nodes are, how they move without contact;
-    inverse (nodes,): 1 / mass; stiffness, width, radius, mu, speed (pairs,); wall; h, alpha."""
+    inverse (nodes,): 1 / mass; stiffness, width, radius, mu, speed (pairs,); wall; h, alpha; seeds: adjoints of `impulses`,
+    (which pairs, of push, of friction)."""
 
     def __init__(self, near: NearPairs):
         self.near = near
@@ -211,6 +212,13 @@ class PartSolver:
         at.w_drift = part.b + blend * at.delta + at.rubbed
         return part.e + at.alpha * at.w_drift, part.b + at.delta + at.rubbed
 
+    def impulses(self, at, own: np.ndarray, of) -> tuple[np.ndarray, np.ndarray]:
+        """What some pairs gave the nodes in a part that was taken [N s], by push and by friction."""
+        B = at.B[np.flatnonzero(own)]
+        pushed = at.h * (B.T @ (at.P[own, None] * at.n[own]))
+        rubbed = B.T @ at.impulse[own] if of.rough else 0 * pushed
+        return self.near.freed(pushed), self.near.freed(rubbed)
+
     def _follow(self, part: Part, of, at) -> None:
         real = SimpleNamespace(**{k: x.real if isinstance(x, np.ndarray) else x for k, x in vars(at).items()})
         real.B, real.h, real.alpha = at.B.real, at.h, np.real(at.alpha)
@@ -274,6 +282,12 @@ class PartSolver:
         by.n += at.P[:, None] * Bq
         by.w += at.P[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(pulled))
         adj.inverse += at.h * dot(freed, at.pressed)
+        for own, pushed, _ in of.seeds:
+            q = at.h * near.freed(pushed)
+            Bq = own[:, None] * (at.B @ q)
+            by.P += dot(at.n, Bq)
+            by.n += at.P[:, None] * Bq
+            by.w += (own * at.P)[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(q))
         # P at the solution
         _, by_begin, by_y, by_width, p, q = self.pushes(part, of, at, at.end)
         J = self.jacobian(part, at)
@@ -320,6 +334,10 @@ class PartSolver:
         adj.inverse += dot(freed, at.rub_sum)
         r_adj = at.B @ pulled
         by.w += np.einsum("pd,pkd->pk", at.impulse, at_corners(pulled))
+        for own, _, rubbed in of.seeds:
+            q = near.freed(rubbed)
+            r_adj = r_adj + own[:, None] * (at.B @ q)
+            by.w += own[:, None] * np.einsum("pd,pkd->pk", at.impulse, at_corners(q))
         e = at.t / np.maximum(at.s, TINY)[:, None]
         L = at.h * at.load
         G = -L * dot(e, r_adj)

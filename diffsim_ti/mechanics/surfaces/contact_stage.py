@@ -144,6 +144,8 @@ class PairContact(Stage):
         e, one.b = self._go(one, of)
         if at.stride:
             self.kept[at.end] = one
+        if at.ws.impulses:
+            self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
         self._mark_done(near)
         own = one.nodes < self.num_own
         u_next, v_next = u[: self.num_own].copy(), v.copy()
@@ -151,6 +153,34 @@ class PairContact(Stage):
         v_next[one.nodes[own]] += at.now.decay * one.b[own]
         self.rows.put(at.history.u, at.end, u_next)
         self.rows.put(at.history.v, at.end, v_next)
+
+    def _of_obstacles(self, impulses, at: Passes, one: ContactPass):
+        """(frame, place among the obstacles by pairs, which pairs are its) of each that is noted."""
+        frame = impulses.frame_of(at.numbers)
+        for k in range(len(impulses.by_pairs) if frame is not None else 0):
+            own = one.rest[2].contact == k + 1
+            if own.any():
+                yield frame, k, own
+
+    def _note(self, impulses, at: Passes, one: ContactPass, of, taken: list, changes: bool = False) -> None:
+        """Note what each obstacle did; taken: (part, where it looked), which are taken here unless changes are noted."""
+        for frame, k, own in self._of_obstacles(impulses, at, one):
+            bodies = one.nodes < self.num_own
+            for part, look in taken:
+                if not changes:
+                    one.solver.take(part, of, look)
+                for side, given in enumerate(one.solver.impulses(look, own, of)):
+                    given = given.imag / 1e-30 if changes else given
+                    impulses.of_pairs[frame, k, side, one.nodes[bodies]] += given[bodies]
+
+    def _seeds(self, impulses, at: Passes, one: ContactPass) -> list:
+        """Adjoints of what each obstacle did."""
+        out, bodies = [], one.nodes < self.num_own
+        for frame, k, own in self._of_obstacles(impulses, at, one) if impulses else ():
+            seeds = np.zeros((2, len(one.nodes), 3))
+            seeds[:, bodies] = impulses.of_pairs[frame, k][:, one.nodes[bodies]]
+            out.append((own, *seeds))
+        return out
 
     def _comes_near(self, one: ContactPass, now, motion: np.ndarray) -> np.ndarray:
         """Which pairs would come nearer than their width, by looks at the pass so often that none misses a crossing: of the
@@ -215,7 +245,7 @@ class PairContact(Stage):
         return SimpleNamespace(
             x=rest[nodes] + start, motion=end - start, inverse=inverse, h=now.h, alpha=h_alpha, stiffness=k / share,
             width=share * W, mu=mu, speed=speed, wall=mass[self.a.mesh.surface_vertices].mean(), rough=self.rough,
-            share=share, k=k, W=W, D=D, radius=radius,
+            share=share, k=k, W=W, D=D, radius=radius, seeds=(),
         )  # fmt: skip
 
     @property
@@ -322,9 +352,13 @@ class PairContact(Stage):
         )  # fmt: skip
         of = self._numbers(one, now, dots)
         e = b = np.zeros_like(of.motion)
+        looks = []
         for part in one.parts:
             own = Part(part.begin, part.share, part.c, e, b, part.xi)
-            e, b = one.solver.take(own, of, one.solver.look(own, of))
+            looks.append((own, one.solver.look(own, of)))
+            e, b = one.solver.take(own, of, looks[-1][1])
+        if run.impulses:
+            self._note(run.impulses, at, one, of, looks, changes=True)
         decay = now.decay + tiny * rate * now.decay_by_rate
         own = one.nodes < self.num_own
         after[one.nodes[own]] += e[own].imag / 1e-30
@@ -344,6 +378,7 @@ class PairContact(Stage):
         self._follow(at, AT_STAGE)
         p, q = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         of = self._numbers(one, now)
+        of.seeds = self._seeds(run.impulses, at, one)
         own, count = one.nodes < self.num_own, len(one.nodes)
         nodes = one.nodes[own]
         adj = SimpleNamespace(
