@@ -171,6 +171,10 @@ class ExplicitWorkspace(Workspace):
         self.check_apart()
 
     @property
+    def stages_pairs(self) -> bool:
+        return bool(self.pairs) and self.solver.stages_contact and not self.scene.reduced
+
+    @property
     def has_unnoted_work(self) -> bool:
         """Whether forces without an energy act vertex by vertex, whose work passes do not note."""
         on_host = (x for x in self.scene.interactions if x.on_host)

@@ -47,11 +47,11 @@ class KickDrift(Stage):
 
 def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
-    staged = ws.pairs and ws.solver.stages_contact and not ws.scene.reduced
-    forces = SurfaceForces(ws.pairs) if ws.pairs else None
-    if staged:
+    forces = friction = None
+    if ws.stages_pairs:
         forces = PairContact(ws.pairs, ws.solver.contact_damping)
-    friction = SurfaceFriction(ws.pairs) if ws.pairs and ws.pairs.friction and not staged else None
+    elif ws.pairs:
+        forces, friction = SurfaceForces(ws.pairs), SurfaceFriction(ws.pairs) if ws.pairs.friction else None
     every = forces, ws.volumes, friction, ws.chambers, ws.faces, KickDrift()
     return [stage for stage in every if stage]
 
