@@ -32,49 +32,22 @@ class ObstacleCorners:
             if term.primitives is not None:
                 given = np.concatenate([np.ravel(x.value) for x in term.described if x.value is not None])
                 given = given - term.shift(np.zeros(3))
-                numbers = np.r_[: force.count, force.size : force.size + term.num_extra]
-                named = np.union1d(term.primitives.points, term.primitives.edges)
-                own, first_corner = dict(k=k, force=force, first=first, term=term, numbers=first + numbers), end
-                corners = term.primitives.at(given[numbers])[0]
-                end += len(named)
-                own |= dict(own=slice(first_corner, end), named=named, all=len(corners), as_given=corners[named])
-                place = np.full(len(corners), -1)
-                place[named] = np.arange(len(named))
-                points, edges = place[term.primitives.points], place[term.primitives.edges]
-                self.parts.append(SimpleNamespace(**own, points=points, edges=edges))
+                shape = np.r_[: force.count, force.size : force.size + term.num_extra]  # its numbers, from its first
+                corners, _ = term.primitives.at(given[shape])
+                own = slice(end, end := end + len(corners))
+                part = dict(k=k, force=force, first=first, term=term, own=own, as_given=corners, shape=first + shape)
+                self.parts.append(SimpleNamespace(**part))
         self.count = end
 
-    @staticmethod
-    def _shape(part, parameters: np.ndarray) -> tuple[np.ndarray, float]:
-        """(corners as the obstacle was made, radius)"""
-        corners, radius = part.term.primitives.at(parameters[part.numbers])
-        return corners[part.named], radius
-
-    @staticmethod
-    def _shape_jvp(part, parameters: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, float]:
-        corners, radius = part.term.primitives.jvp(parameters[part.numbers], change[part.numbers])
-        return corners[part.named], radius
-
-    @staticmethod
-    def _add_shape(part, parameters, by, by_parameters, by_radius: float = 0.0) -> None:
-        by_corners = np.zeros((part.all, 3))
-        by_corners[part.named] = by
-        by_parameters[part.numbers] += part.term.primitives.vjp(parameters[part.numbers], by_corners, by_radius)
+    def _numbers(self, part, parameters: np.ndarray) -> np.ndarray:
+        return parameters[part.shape]
 
     def made(self, parameters: np.ndarray) -> np.ndarray:
         """Where corners are as obstacles were made, shape (count, 3) [m]."""
-        return np.concatenate([self._shape(x, parameters)[0] for x in self.parts])
+        return np.concatenate([x.term.primitives.at(self._numbers(x, parameters))[0] for x in self.parts])
 
     def radii(self, parameters: np.ndarray) -> np.ndarray:
-        return np.array([self._shape(x, parameters)[1] for x in self.parts])
-
-    def radii_jvp(self, parameters, change) -> np.ndarray:
-        return np.array([self._shape_jvp(x, parameters, change)[1] for x in self.parts])
-
-    def add_radii(self, parameters, by_radii: np.ndarray, by_parameters: np.ndarray) -> None:
-        """Adds the adjoints of the parameters by those of the radii."""
-        for x, by in zip(self.parts, by_radii):
-            self._add_shape(x, parameters, 0.0, by_parameters, float(by))
+        return np.array([x.term.primitives.at(self._numbers(x, parameters))[1] for x in self.parts])
 
     # ---- poses -------------------------------------------------------------------------------------------------------
 
@@ -89,7 +62,7 @@ class ObstacleCorners:
 
     def _arms(self, part, parameters, rows, m: int, p=None, c=None) -> np.ndarray:
         """R (p - c) of an obstacle that turns."""
-        p = self._shape(part, parameters)[0] if p is None else p
+        p = part.term.primitives.at(self._numbers(part, parameters))[0] if p is None else p
         c = self._about(part, parameters) if c is None else c
         return rotations.turned(rotations.from_rodrigues(rows[self._row(part, m)]), p - c)
 
@@ -97,7 +70,7 @@ class ObstacleCorners:
         """Where corners are at the rows number m of poses."""
         out = []
         for x in self.parts:
-            p, _ = self._shape(x, parameters)
+            p, _ = x.term.primitives.at(self._numbers(x, parameters))
             if self._row(x, m) is not None:
                 p = self._about(x, parameters) + self._arms(x, parameters, rows, m, p)
             out.append(p + rows[3 * x.k + m])
@@ -107,7 +80,7 @@ class ObstacleCorners:
         """Its change for those of the parameters and of the rows (rotations: theta)."""
         out = []
         for x in self.parts:
-            dp, _ = self._shape_jvp(x, parameters, change)
+            dp, _ = x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))
             row = self._row(x, m)
             if row is not None:
                 dc, arms = self._about(x, change), self._arms(x, parameters, rows, m)
@@ -131,6 +104,19 @@ class ObstacleCorners:
         at = part.first + part.force.index.about
         by_parameters[at : at + 3] += by_c - by.sum(0)
         return by
+
+    def _add_shape(self, part, parameters, by, by_parameters, by_radius: float = 0.0) -> None:
+        by_parameters[part.shape] += part.term.primitives.vjp(parameters[part.shape], by, by_radius)
+
+    def add_radii(self, parameters, by_radii: np.ndarray, by_parameters: np.ndarray) -> None:
+        """Adds the adjoints of the parameters by those of the radii."""
+        for x, by in zip(self.parts, by_radii):
+            self._add_shape(x, parameters, np.zeros((x.own.stop - x.own.start, 3)), by_parameters, float(by))
+
+    def radii_jvp(self, parameters, change) -> np.ndarray:
+        return np.array(
+            [x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[1] for x in self.parts]
+        )
 
     # ---- velocities, on the chord of a time tau from where the pass begins (mechanics/obstacles/turned.py) --------------
 
@@ -156,7 +142,10 @@ class ObstacleCorners:
             out[x.own], row = rows_dot[3 * x.k + RATE], self._row(x, AT_BEGIN)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
-                J, dp = rotations.left_jacobian(turn), self._shape_jvp(x, parameters, change)[0]
+                J, dp = (
+                    rotations.left_jacobian(turn),
+                    x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[0],
+                )
                 darms = np.cross(rows_dot[row], arms)
                 darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self._about(x, change))
                 turned = rotations.turned(rotations.quaternion(turn), arms)
@@ -192,7 +181,7 @@ class SurfaceWithObstacles:
         self.body, self.corners, self.surface_triangles = body, corners, body.surface_triangles
         self.surface_vertices = np.concatenate([body.surface_vertices, np.arange(n, self.num_vertices)])
         self.elements, self.tetrahedron_sets, self.vertex_sets = body.elements, body.tetrahedron_sets, body.vertex_sets
-        begin = [(n + x.own.start, x) for x in corners.parts]
+        begin = [(n + x.own.start, x.term.primitives) for x in corners.parts]
         self.edges = np.concatenate([edges, *(at + part.edges for at, part in begin)])
         points = np.concatenate([at + part.points for at, part in begin])
         self.own_edges, self.meeting_edges = len(edges), len(edges) if self_contact else 0

@@ -110,7 +110,7 @@ class MeshObstacle(Obstacle):
         longest = STRETCH * float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0))
         edges = self._made.sharp_edges(longest, BOW * float(self.values["barrier_width"]))
         points = np.union1d(edges, self._made.one[self._made.points])
-        out.all_primitives = MeshPrimitives(points, edges, self._tree.x) if len(points) else None
+        out.all_primitives = MeshPrimitives.of(points, edges, self._tree.x) if len(points) else None
         return out
 
     def kernel(self, precision, table=0):
@@ -126,21 +126,32 @@ class MeshObstacle(Obstacle):
         return self._tree.x.size if self.shapeable else 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeshPrimitives(Primitives):
-    """Of a mesh: its vertices [m] at the position that the numbers begin with, and its edges; then its radius, and where
-    they are inputs its vertices."""
+    """Of a mesh: some of its vertices, whose numbers are `own`, at the position that the numbers begin with, and edges
+    between these; then its radius, and all vertices where inputs move them. vertices [m]: where none does."""
 
+    own: np.ndarray
     vertices: np.ndarray
 
+    @classmethod
+    def of(cls, points: np.ndarray, edges: np.ndarray, vertices: np.ndarray) -> "MeshPrimitives":
+        own = np.union1d(edges, points)
+        return cls(np.searchsorted(own, points), np.searchsorted(own, edges), own, vertices[own])
+
     def at(self, p):
-        return (p[4:].reshape(-1, 3) if len(p) > 4 else self.vertices) + p[:3], float(p[3])
+        vertices = p[4:].reshape(-1, 3)[self.own] if len(p) > 4 else self.vertices
+        return vertices + p[:3], float(p[3])
 
     def jvp(self, p, dp):
-        return (dp[4:].reshape(-1, 3) if len(dp) > 4 else 0 * self.vertices) + dp[:3], float(dp[3])
+        moved = dp[4:].reshape(-1, 3)[self.own] if len(p) > 4 else np.zeros_like(self.vertices)
+        return moved + dp[:3], float(dp[3])
 
     def vjp(self, p, by_corners, by_radius):
-        return np.concatenate([by_corners.sum(0), [by_radius], by_corners.ravel()[: len(p) - 4]])
+        by_vertices = np.zeros((len(p[4:]) // 3, 3))
+        if len(p) > 4:
+            by_vertices[self.own] = by_corners
+        return np.concatenate([by_corners.sum(0), [by_radius], by_vertices.ravel()])
 
 
 @dataclass(frozen=True)
