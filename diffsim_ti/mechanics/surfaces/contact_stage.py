@@ -135,23 +135,31 @@ class PairContact(Stage):
         if not any_near:
             return
         u, v = self._places(at.history.u, at.end), self.rows.get(at.history.v, at.end)
-        near = np.flatnonzero(whole(inner.near)[: inner.list.count])
-        near = near[self._comes_near(self._pass(near, start, u, v), at.now, u - start)]
+        flagged = np.flatnonzero(whole(inner.near)[: inner.list.count])
+        near = flagged[self._comes_near(self._pass(flagged, start, u, v), at.now, u - start)]
+        u_next = u
+        while near.size:
+            one = self._pass(near, start, u, v)
+            of, own = self._numbers(one, at.now), one.nodes < self.num_own
+            e, one.b = self._go(one, of)
+            u_next = u.copy()
+            u_next[one.nodes[own]] += e[own]
+            others = np.setdiff1d(flagged, near)  # which the way that contact has changed may bring near
+            if others.size:
+                others = others[self._comes_near(self._pass(others, start, u_next, v), at.now, u_next - start)]
+            if not others.size:
+                break
+            near = np.union1d(near, others)
+        self._mark_done(flagged)
         if not near.size:
             return
-        one = self._pass(near, start, u, v)
-        of = self._numbers(one, at.now)
-        e, one.b = self._go(one, of)
         if at.stride:
             self.kept[at.end] = one
         if at.ws.impulses:
             self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
-        self._mark_done(near)
-        own = one.nodes < self.num_own
-        u_next, v_next = u[: self.num_own].copy(), v.copy()
-        u_next[one.nodes[own]] += e[own]
+        v_next = v.copy()
         v_next[one.nodes[own]] += at.now.decay * one.b[own]
-        self.rows.put(at.history.u, at.end, u_next)
+        self.rows.put(at.history.u, at.end, u_next[: self.num_own])
         self.rows.put(at.history.v, at.end, v_next)
 
     def _of_obstacles(self, impulses, at: Passes, one: ContactPass):
