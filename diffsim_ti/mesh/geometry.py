@@ -138,10 +138,8 @@ def three(name: str, given, one_will_do: bool = False) -> np.ndarray:
 
 def curve_order(points: np.ndarray) -> np.ndarray:
     """Indices of points, shape (n, 3), in the order of Morton's curve through their bounding box."""
-    lowest = points.min(0)
-    cells = (
-        ((points - lowest) * (2**20 / max(np.ptp(points, axis=0).max(), 1e-300))).astype(np.int64).clip(0, 2**20 - 1)
-    )
+    lowest, size = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
+    cells = ((points - lowest) * (2**20 / size)).astype(np.int64).clip(0, 2**20 - 1)
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

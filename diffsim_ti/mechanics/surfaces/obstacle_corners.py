@@ -214,6 +214,13 @@ class SurfaceWithObstacles:
         own = identity(self.body.num_vertices, format="csr") if own is None else own
         return vstack([own, csr_matrix((self.corners.count, own.shape[1]))], format="csr")
 
+    @cached_property
+    def with_corners(self):
+        """The same for X of nodes and then of corners of obstacles."""
+        from scipy.sparse import block_diag, identity
+
+        return block_diag([self.matrix[: self.first], identity(self.corners.count)], format="csr")
+
 
 class ObstacleMotion:
     """Where the corners of a SurfaceWithObstacles are, on the device too, and the adjoints of that. `given` and `given_dot`

@@ -11,6 +11,12 @@ from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs, Tunnelling
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, Moment
 
 
+def moment_of(at: Passes) -> Moment:
+    """Obstacles at the end of a pass, and where it begins."""
+    schedule = at.ws.solver.schedule
+    return Moment(schedule, at.j, schedule.end(at.j), schedule.begin(at.j))
+
+
 class SurfaceForces(Stage):
     """Forces of near pairs before the kick; after the step none of them may have gone through each other."""
 
@@ -19,15 +25,9 @@ class SurfaceForces(Stage):
     def __init__(self, pairs: SurfacePairs):
         self.pairs, self.a, self.by_path = pairs, pairs.a, None
 
-    @staticmethod
-    def _moment(at: Passes) -> Moment:
-        """Obstacles at the end of a pass, and where it begins."""
-        schedule = at.ws.solver.schedule
-        return Moment(schedule, at.j, schedule.end(at.j), schedule.begin(at.j))
-
     def _follow(self, at: Passes, m: int) -> None:
         if self.pairs.obstacles:
-            self.pairs.follow(self.a.poses.value(self.a.rows["path"], self._moment(at)), m)
+            self.pairs.follow(self.a.poses.value(self.a.rows["path"], moment_of(at)), m)
 
     @contextmanager
     def do(self, at: Passes):
@@ -48,7 +48,7 @@ class SurfaceForces(Stage):
     def tangent(self, at: Passes):
         pairs, run, place = self.pairs, at.run, (at.history.u, at.slot)
         self._follow(at, AT_BEGIN)
-        poses = self.a.poses.jvp(self.a.rows["path"], run.tangent.path, self._moment(at)) if pairs.obstacles else None
+        poses = self.a.poses.jvp(self.a.rows["path"], run.tangent.path, moment_of(at)) if pairs.obstacles else None
         of_obstacles = dict(poses_dot=poses) if pairs.obstacles else {}
         pairs.ensure(*place)
         if pairs.friction:  # which needs the forces, and their corners are those of the product
@@ -64,7 +64,7 @@ class SurfaceForces(Stage):
         self.pairs.vjp(at.history.u, at.slot, at.run.w, at.run.corner)
         if self.by_path is not None:
             by_rows = self.pairs.obstacles.take_rows()
-            self.a.poses.vjp(self.a.rows["path"], by_rows, self._moment(at), self.by_path)
+            self.a.poses.vjp(self.a.rows["path"], by_rows, moment_of(at), self.by_path)
 
     def clear(self) -> None:
         self.pairs.clear_sums()

@@ -13,6 +13,7 @@ from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ContactNumbers, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
+from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.terms.obstacles.barrier import beta, curvature_at
@@ -101,12 +102,8 @@ class SurfacePairs:
 
     def _stiffness_and_width(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of pairs of the list, without their shares."""
-        if not self.kinematic:
-            one = np.ones(len(pairs))
-            return self._number(SelfContact.index.stiffness) * one, self.width * one
-        rows = self.contacts.rows[self.kinematic.numbers[pairs[:, [0, 2]]].max(1)]
-        k, width = self.a.values.parameters[rows[:, :2]].T
-        return k * whole(self.list.area)[: len(pairs)], width
+        own, values = PairNumbers(self).of(np.arange(len(pairs)), pairs), self.a.values.parameters
+        return own.area * values[own.stiffness], values[own.width]
 
     def load(self, u) -> None:
         """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""

@@ -171,8 +171,19 @@ class ExplicitWorkspace(Workspace):
         self.check_apart()
 
     @property
+    def stages_pairs(self) -> bool:
+        return bool(self.pairs) and self.solver.stages_contact and not self.scene.reduced
+
+    @property
     def has_unnoted_work(self) -> bool:
-        """Whether forces without an energy act vertex by vertex, whose work passes do not note."""
+        """Whether forces without an energy act vertex by vertex, or obstacles that move by pairs, whose work passes do not
+        note."""
+        if (
+            self.pairs
+            and self.pairs.obstacles
+            and any(x.term.path is not None for x in self.pairs.obstacles.corners.parts)
+        ):
+            return True
         on_host = (x for x in self.scene.interactions if x.on_host)
         return any(x.in_kernels and not len(x.vertices) and not f.has_energy for x, f in zip(on_host, self.hosts))
 

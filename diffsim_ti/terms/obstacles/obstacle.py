@@ -45,6 +45,12 @@ class Obstacle(Term):
     the obstacle as it was made to c + t + R (x - c), with constant angular velocity between keyframes and within steps.
     Quaternions take the short way; rotation vectors on one axis keep their turns, less than one in a step.
     about [m]: the point c.
+    by_pairs: whether a ball, capsule or box acts on faces and edges of bodies between their vertices as bodies act on each
+    other, exactly: a ball's centre on triangles, at the distance less the radius; of a capsule its axis on edges and its
+    ends on triangles, of a box its twelve edges and eight corners. Energy of a pair as of a vertex, m b(d) with m of
+    `SelfContact`; the stiffness per area is multiplied by the triangle's area in the mesh, or by a third of that of the
+    triangles at the edge. Mesh obstacles always do so with what is sharp of them. Otherwise points within faces feel what
+    is narrower than these.
 
     Inputs with gradient: the shape's own numbers, "barrier_stiffness_per_area" or "barrier_stiffness", "barrier_width",
     with friction also "friction" and "friction_speed", with a path "<shape>_path", shape (steps + 1, 3), of a pose
