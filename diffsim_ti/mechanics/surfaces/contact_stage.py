@@ -25,6 +25,7 @@ from diffsim_ti.terms.self_contact import SelfContact
 
 LONGEST, RESOLVED = 0.2, 0.02  # of the width that near surfaces move in a part; and where it need not be resolved
 HALF = 0.5  # share of a distance by which a resolved part may close it before normals are taken
+MOST_LISTS = 6  # made for one pass
 MOST_LOOKS = 200  # at the pairs of a pass
 SHORTEST = 2.0**-14  # share of a pass
 INDEX = SelfContact.index
@@ -64,7 +65,9 @@ class PairContact(Stage):
         self.label[self.inner.mesh.surface_vertices] = labels
         self.row_of, self.rough = rows, self.inner.term.has_friction
         runtime.fill(a.corner, 0)
-        self.scratch = runtime.array(self.inner.kernels.vec4, self.inner.a.first_contact_corner + self.inner.list.num_surface)
+        self.scratch = runtime.array(
+            self.inner.kernels.vec4, self.inner.a.first_contact_corner + self.inner.list.num_surface
+        )
         self.begin = runtime.array(a.vector, 1, a.num_vertices)
         runtime.fill(self.begin, 0)
         self.clear()
@@ -103,33 +106,44 @@ class PairContact(Stage):
         return bool(stale), bool(near)
 
     def _act(self, at: Passes, start: np.ndarray) -> None:
-        inner, end = self.inner, self._fine(at.history.u, at.end)
-        stale, any_near = self._look(*end)
-        if stale:  # a list of where the pass began, which holds to its end
-            self.rows.put(self.begin, 0, start)
-            travel = inner._travel(runtime.fetch_row(*end)[inner.mesh.surface_vertices] - runtime.fetch(inner.before))
-            begin = self._fine(self.begin, 0)
-            inner._build(*begin, wanted=1.01 * travel)
-            inner.forces(*begin, self.scratch)
-            _, any_near = self._look(*self._fine(at.history.u, at.end))
-        if not any_near:
-            return
-        u, v = self.rows.get(at.history.u, at.end), self.rows.get(at.history.v, at.end)
-        near = np.flatnonzero(whole(inner.near)[: inner.list.count])
+        """What contact does to a pass from `start`; anew with a longer list where one does not hold to the end."""
+        inner, history, surface = self.inner, at.history, self.inner.mesh.surface_vertices
+        u, v = self.rows.get(history.u, at.end), self.rows.get(history.v, at.end)
+        stale, any_near = self._look(*self._fine(history.u, at.end))
+        wanted = 0.0
+        for _ in range(MOST_LISTS):
+            if stale:
+                moved = runtime.fetch_row(*self._fine(history.u, at.end))[surface] - runtime.fetch(inner.before)
+                wanted = np.maximum(wanted, 1.1 * inner._travel(moved))
+                self.rows.put(history.u, at.end, u)
+                self.rows.put(history.v, at.end, v)
+                self.rows.put(self.begin, 0, start)
+                begin = self._fine(self.begin, 0)
+                inner._build(*begin, wanted=wanted)
+                inner.forces(*begin, self.scratch)
+                _, any_near = self._look(*self._fine(history.u, at.end))
+            one = self._contact(at, start, u, v) if any_near else None
+            if at.stride:
+                self.kept[at.end] = one
+            _, stale, _ = inner._check(*self._fine(history.u, at.end), 0, 0)
+            if not stale:
+                break
+
+    def _contact(self, at: Passes, start, u, v) -> ContactPass | None:
+        """The stage, with the list as it is."""
+        near = np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
         near = near[self._comes_near(self._pass(near, start, u, v), at.now, u - start)]
         if not near.size:
-            return
+            return None
         one = self._pass(near, start, u, v)
-        of = self._numbers(one, at.now)
-        e, one.b = self._go(one, of)
-        if at.stride:
-            self.kept[at.end] = one
+        e, one.b = self._go(one, self._numbers(one, at.now))
         self._mark_done(near)
         u_next, v_next = u.copy(), v.copy()
         u_next[one.nodes] += e
         v_next[one.nodes] += at.now.decay * one.b
         self.rows.put(at.history.u, at.end, u_next)
         self.rows.put(at.history.v, at.end, v_next)
+        return one
 
     def _comes_near(self, one: ContactPass, now, motion: np.ndarray) -> np.ndarray:
         """Which pairs would come nearer than their width, by looks at the pass so often that none misses a crossing: of the
@@ -245,7 +259,9 @@ class PairContact(Stage):
         doubtful = np.flatnonzero(~(near.parted(at.n, X, end) > room))
         if not doubtful.size:
             return True
-        some = NearPairs(near.corners[doubtful], near.edges[doubtful], near.scale[doubtful], near.num_points, None, None)
+        some = NearPairs(
+            near.corners[doubtful], near.edges[doubtful], near.scale[doubtful], near.num_points, None, None
+        )
         best = np.full(doubtful.size, -np.inf)
         for x in (X, end):
             _, r, _ = nearest(some.relative(x), some.edges)
@@ -254,9 +270,17 @@ class PairContact(Stage):
         return bool(np.all(best > room))
 
     def _refuse(self, one: ContactPass, of) -> None:
+        near = one.solver.near
+        move = near.relative(near.points(of.motion))
+        speed = float(np.sqrt((move**2).sum(-1)).max()) / of.h
+        corners = one.pairs[int((move**2).sum(-1).max(1).argmax())]
         self.inner.fresh = False
-        worst = one.pairs[0]
-        raise Tunnelling(f"contact found no way to keep surfaces apart, near vertices {worst.tolist()}")
+        error = Tunnelling(
+            f"contact of width {of.W:.3g} m does not keep surfaces apart near vertices {corners.tolist()}, which meet at "
+            f"{speed:.3g} m/s: take substeps of {0.25 * of.h:.3g} s"
+        )
+        error.stable_dt, error.stiffness = 0.25 * of.h, None
+        raise error
 
     @property
     def rounding(self) -> float:
