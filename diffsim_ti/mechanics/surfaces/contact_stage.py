@@ -65,9 +65,8 @@ class PairContact(Stage):
         self.label[self.inner.mesh.surface_vertices] = labels
         self.row_of, self.rough = rows, self.inner.term.has_friction
         runtime.fill(a.corner, 0)
-        self.scratch = runtime.array(
-            self.inner.kernels.vec4, self.inner.a.first_contact_corner + self.inner.list.num_surface
-        )
+        corners = self.inner.a.first_contact_corner + self.inner.list.num_surface
+        self.scratch = runtime.array(self.inner.kernels.vec4, corners)  # for forces, which are not looked at
         self.begin = runtime.array(a.vector, 1, a.num_vertices)
         runtime.fill(self.begin, 0)
         self.clear()
@@ -165,7 +164,7 @@ class PairContact(Stage):
             runtime.fill(self.inner.plane, plane)
 
     def _pass(self, near: np.ndarray, start, u, v) -> ContactPass:
-        inner, surface = self.inner, self.a.mesh.surface_vertices
+        inner = self.inner
         corners = runtime.fetch(inner.list.pairs)[: 4 * inner.list.count].reshape(-1, 4)[near]
         edges = near >= inner.list.num_vt
         scale = np.zeros(len(near))
@@ -362,7 +361,6 @@ class PairContact(Stage):
         self.by_rest[nodes] += adj.x
         # stiffness k / share, width share W, share = min(1, D / (2 W))
         by_share = np.where(of.share < 1, of.W * adj.width - of.k / of.share**2 * adj.stiffness, 0)
-        first = self.a.parameters_of_self_contact.start
         self.by_numbers[INDEX.stiffness] += (adj.stiffness / of.share).sum()
         self.by_numbers[INDEX.width] += (of.share * adj.width - by_share * of.share / of.W).sum()
         by_D = 0.5 * by_share / of.W
