@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
-from scipy.linalg import solve as solve_dense
+from scipy.linalg import cho_factor, cho_solve
 
 from diffsim_ti.mechanics.surfaces import host_geometry as geometry
 from diffsim_ti.mechanics.surfaces.host_geometry import TINY, dot
@@ -29,7 +29,7 @@ from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
 
 WALL = 1e-3  # share of the width
 MOST_ROUNDS = 60
-DENSE = 180  # unknowns up to which a dense matrix is solved
+DENSE = 1000  # unknowns up to which a dense matrix is factored
 SURE = 1e-9  # relative change of distances at which Newton's method takes its last step
 
 
@@ -156,21 +156,31 @@ class PartSolver:
     @staticmethod
     def inverse(J, K: np.ndarray):
         """x to (1 + J^T K J)^-1 x."""
-        size = J.shape[1]
+        from scipy.sparse import diags
+        from scipy.sparse.linalg import splu
+
         some = np.flatnonzero(K > 0)
         if not some.size:
             return lambda x: x
-        J, K = J[some], K[some]
-        if size <= DENSE:
-            J = J.toarray()
-            H = (J.T * K) @ J
-            H[np.diag_indices(size)] += 1
-            return lambda x: solve_dense(H, x, assume_a="pos")
-        from scipy.sparse import diags, identity
-        from scipy.sparse.linalg import splu
+        J = J[some]
+        own, columns = np.unique(J.indices, return_inverse=True)
+        J = type(J)((J.data, columns.ravel(), J.indptr), (some.size, own.size))
+        H = J.T @ diags(K[some]) @ J
+        if own.size <= DENSE:
+            H = H.toarray()
+            H[np.diag_indices(own.size)] += 1
+            factors = cho_factor(H, lower=True, overwrite_a=True, check_finite=False)
+            act = lambda x: cho_solve(factors, x, check_finite=False)  # noqa: E731
+        else:
+            H = (H + diags(np.ones(own.size))).tocsc()
+            act = splu(H, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True)).solve
 
-        H = (identity(size) + J.T @ diags(K) @ J).tocsc()
-        return splu(H, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True)).solve
+        def product(x):
+            out = x.copy()
+            out[own] = act(x[own])
+            return out
+
+        return product
 
     def solve(self, part: Part, of, at) -> np.ndarray | None:
         """xi, z - f over the roots, where pushes balance it; None where they are not found."""

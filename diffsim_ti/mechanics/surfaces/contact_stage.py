@@ -27,6 +27,7 @@ from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 LONGEST, RESOLVED = 0.2, 0.02  # of the width that near surfaces move in a part; and where it need not be resolved
 HALF = 0.5  # share of a distance by which a resolved part may close it before normals are taken
+MOST_LISTS = 6  # made for one pass
 MOST_LOOKS = 200  # at the pairs of a pass
 SHORTEST = 2.0**-14  # share of a pass
 
@@ -68,9 +69,8 @@ class PairContact(Stage):
         self.free = a.supports.freedom(num_nodes) if self.partly_fixed else None
         self.numbers, self.rough = PairNumbers(self.inner), self.inner.friction is not None
         runtime.fill(a.corner, 0)
-        self.scratch = runtime.array(
-            self.inner.kernels.vec4, self.inner.a.first_contact_corner + self.inner.list.num_surface
-        )
+        corners = self.inner.a.first_contact_corner + self.inner.list.num_surface
+        self.scratch = runtime.array(self.inner.kernels.vec4, corners)  # for forces, which are not looked at
         self.begin = runtime.array(a.vector, 1, a.num_vertices)
         runtime.fill(self.begin, 0)
         self.clear()
@@ -121,27 +121,45 @@ class PairContact(Stage):
         return bool(stale), bool(near)
 
     def _act(self, at: Passes, start: np.ndarray) -> None:
-        inner, end = self.inner, self._fine(at.history.u, at.end)
-        stale, any_near = self._look(*end)
-        if stale:  # a list of where the pass began, which holds to its end
-            self._follow(at, AT_BEGIN)
-            self.rows.put(self.begin, 0, start[: self.num_own])
-            travel = inner._travel(runtime.fetch_row(*end)[inner.mesh.surface_vertices] - runtime.fetch(inner.before))
-            begin = self._fine(self.begin, 0)
-            inner._build(*begin, wanted=1.01 * travel)
-            inner.forces(*begin, self.scratch)
-            self._follow(at, AT_STAGE)
-            _, any_near = self._look(*self._fine(at.history.u, at.end))
-        if not any_near:
-            return
-        u, v = self._places(at.history.u, at.end), self.rows.get(at.history.v, at.end)
-        flagged = np.flatnonzero(whole(inner.near)[: inner.list.count])
+        """What contact does to a pass from `start`; anew with a longer list where one does not hold to the end."""
+        inner, history, surface = self.inner, at.history, self.inner.mesh.surface_vertices
+        u, v = self._places(history.u, at.end), self.rows.get(history.v, at.end)
+        stale, any_near = self._look(*self._fine(history.u, at.end))
+        wanted = 0.0
+        for _ in range(MOST_LISTS):
+            if stale:
+                moved = runtime.fetch_row(*self._fine(history.u, at.end))[surface] - runtime.fetch(inner.before)
+                wanted = np.maximum(wanted, 1.1 * inner._travel(moved))
+                self.rows.put(history.u, at.end, u[: self.num_own])
+                self.rows.put(history.v, at.end, v)
+                self.rows.put(self.begin, 0, start[: self.num_own])
+                self._follow(at, AT_BEGIN)
+                begin = self._fine(self.begin, 0)
+                inner._build(*begin, wanted=wanted)
+                inner.forces(*begin, self.scratch)
+                self._follow(at, AT_STAGE)
+                _, any_near = self._look(*self._fine(history.u, at.end))
+            one = self._contact(at, start, u, v) if any_near else None
+            if at.stride:
+                self.kept[at.end] = one
+            _, stale, _ = inner._check(*self._fine(history.u, at.end), 0, 0)
+            if not stale:
+                break
+        if one and at.ws.impulses:
+            of = self._numbers(one, at.now)
+            self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
+
+    def _contact(self, at: Passes, start, u, v) -> ContactPass | None:
+        """The stage, with the list as it is."""
+        flagged = np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
         near = flagged[self._comes_near(self._pass(flagged, start, u, v), at.now, u - start)]
-        u_next = u
-        while near.size:
+        if not near.size:
+            self._mark_done(flagged)
+            return None
+        while True:
             one = self._pass(near, start, u, v)
-            of, own = self._numbers(one, at.now), one.nodes < self.num_own
-            e, one.b = self._go(one, of)
+            own = one.nodes < self.num_own
+            e, one.b = self._go(one, self._numbers(one, at.now))
             u_next = u.copy()
             u_next[one.nodes[own]] += e[own]
             others = np.setdiff1d(flagged, near)  # which the way that contact has changed may bring near
@@ -151,16 +169,11 @@ class PairContact(Stage):
                 break
             near = np.union1d(near, others)
         self._mark_done(flagged)
-        if not near.size:
-            return
-        if at.stride:
-            self.kept[at.end] = one
-        if at.ws.impulses:
-            self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
         v_next = v.copy()
         v_next[one.nodes[own]] += at.now.decay * one.b[own]
         self.rows.put(at.history.u, at.end, u_next[: self.num_own])
         self.rows.put(at.history.v, at.end, v_next)
+        return one
 
     def _of_obstacles(self, impulses, at: Passes, one: ContactPass):
         """(frame, place among the obstacles by pairs, which pairs are its) of each that is noted."""
@@ -319,9 +332,17 @@ class PairContact(Stage):
         return bool(np.all(best > room[doubtful]))
 
     def _refuse(self, one: ContactPass, of) -> None:
+        near = one.solver.near
+        move = near.relative(near.points(of.motion))
+        speed = float(np.sqrt((move**2).sum(-1)).max()) / of.h
+        corners = one.pairs[int((move**2).sum(-1).max(1).argmax())]
         self.inner.fresh = False
-        worst = one.pairs[0]
-        raise Tunnelling(f"contact found no way to keep surfaces apart, near vertices {worst.tolist()}")
+        error = Tunnelling(
+            f"contact of width {np.min(of.W):.3g} m does not keep surfaces apart near vertices {corners.tolist()}, which "
+            f"meet at {speed:.3g} m/s: take substeps of {0.25 * of.h:.3g} s"
+        )
+        error.stable_dt, error.stiffness = 0.25 * of.h, None
+        raise error
 
     @property
     def rounding(self) -> float:

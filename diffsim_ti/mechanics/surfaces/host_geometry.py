@@ -131,7 +131,7 @@ def fading_vjp(y: np.ndarray, edges: np.ndarray, scale: np.ndarray, m_adj: np.nd
     return np.stack([cross(b, x_adj), -by_b, by_b], 1)
 
 
-# ---- the barrier, and the secant's slope -----------------------------------------------------------------------------------
+# ---- the barrier, and the secant's slope --------------------------------------------------------------------------------
 
 
 def _joined(s, below, inside):

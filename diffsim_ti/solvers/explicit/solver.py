@@ -63,6 +63,8 @@ class ExplicitSolver(Solver):
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
         are `reduced` take obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
+        SelfContact acts likewise: as a stage in parts of each pass (surfaces/contact_stage.py), which keeps surfaces apart
+        whatever its stiffness, with friction in it; as a force by "force" and in scenes with reduced sets.
         In both, what is narrower than faces acts on points within them in a stage of its own, which integrates the pass
         again in as many parts as barrier and speed ask for (explicit_face_kernels.py), and then friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
