@@ -207,9 +207,9 @@ class MeshForce(ObstacleForce):
         return True
 
     @ti.func
-    def reached(self, parameters: ti.template(), first, X, u, move, d):
+    def reached(self, parameters: ti.template(), first, X, u, move, d, approach):
         """By the plane of what is nearest, and by all triangles on the way."""
-        out = ti.min(d, d + self.approach(parameters, first, X, u, move))
+        out = ti.min(d, d + approach)
         if out > 0 and move.norm_sqr() >= d * d:
             begin, x = self.begin(parameters, first), self.place(parameters, first, X, u)
             share = self.nearest.free_share(x, self.place(parameters, first, X, u + move), begin, parameters)
