@@ -36,12 +36,15 @@ class MeshObstacle(Obstacle):
     vertices by index; where none is given all vertices are points. position [m]: where the vertices' origin lies.
     Parts whose triangles are closed, each edge passed once each way, have an inside, which their normals point out of: they
     push out what got into them, and no body may start there; triangles that face inwards are the wall of a room. All
-    other triangles, segments and points are felt from both sides alike. A tree of boxes finds what is nearest, so that
-    triangles that are far away cost next to nothing. `resolution` has no meaning.
+    other triangles, segments and points are felt from both sides alike. Vertices of bodies find what is nearest in a tree
+    of boxes, so that triangles that are far away cost next to nothing. Segments, points, and edges and corners that are
+    sharp for the body's faces also act on edges and faces of bodies, by pairs.
+    shapeable: whether vertices are an input; in gradients each vertex of the body then has 3 k numbers of its own.
+    `resolution` has no meaning, for nothing is sampled.
 
-    Inputs with gradient: "mesh_position", shape (3,), "mesh_radius", and those of every `Obstacle`, whose other arguments
-    it takes. The distance is C1 but where two parts are equally near; where the nearest goes from a face to an edge or
-    a corner the contact's stiffness jumps.
+    Inputs with gradient: "mesh_position", shape (3,), "mesh_radius", "mesh_vertices", shape (k, 3), if it is shapeable, and
+    those of every `Obstacle`, whose other arguments it takes. The distance is C1 but where two parts are equally near;
+    where the nearest goes from a face to an edge or a corner the contact's stiffness jumps.
     Raises ValueError for vertices or indices that do not fit.
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
     """
@@ -80,6 +83,7 @@ class MeshObstacle(Obstacle):
 
     @cached_property
     def table(self):
+        """The tree, as kernels read it (surface_tree.py)."""
         return self._tree.table()
 
     def table_at(self, numbers):
@@ -203,9 +207,9 @@ class MeshForce(ObstacleForce):
         return True
 
     @ti.func
-    def reached(self, parameters: ti.template(), first, X, u, move, d):
+    def reached(self, parameters: ti.template(), first, X, u, move, d, approach):
         """By the plane of what is nearest, and by all triangles on the way."""
-        out = ti.min(d, d + self.approach(parameters, first, X, u, move))
+        out = ti.min(d, d + approach)
         if out > 0 and move.norm_sqr() >= d * d:
             begin, x = self.begin(parameters, first), self.place(parameters, first, X, u)
             share = self.nearest.free_share(x, self.place(parameters, first, X, u + move), begin, parameters)

@@ -186,9 +186,10 @@ class ObstacleForce(VertexForce):
         return let(sum_of(n[d].value * at(move, d) for d in range(3)))
 
     @ti.func
-    def reached(self, parameters: ti.template(), first, X, u, move, d):
-        """The least distance on the way of a move from a place at distance d, not positive where it leads through [m]."""
-        return ti.min(d, d + self.approach(parameters, first, X, u, move))
+    def reached(self, parameters: ti.template(), first, X, u, move, d, approach):
+        """The least distance on the way of a move from a place at distance d, not positive where it leads through [m];
+        approach: change of the distance by the plane there."""
+        return ti.min(d, d + approach)
 
     @ti.func
     def rigidity(self, parameters: ti.template(), first, X, u):
