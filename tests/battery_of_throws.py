@@ -46,7 +46,7 @@ def draw(rng) -> dict:
     v[:, 0] = 0.5 * speed * (1 - 2 * body / (bodies - 1))
     v += speed * rng.uniform(-0.1, 0.1, (bodies, 3))[body]
     kinds = {"body_0": str(rng.choice(["rigid", "affine"]))} if rng.random() < 0.15 else {}
-    duration = 0.3 / wave + 0.01 * bodies / speed
+    duration = 0.2 / wave + 0.01 * (bodies - 1) / speed
     return case | dict(mesh=mesh, v=v, duration=duration, kind="reduced" if kinds else f"order {order}", reduced=kinds)
 
 
@@ -86,8 +86,10 @@ class Judge:
         points = np.unique(triangles) if len(tetrahedra) else ()
         self.exact = ExactJudge(self.of(mesh.vertices), triangles, tetrahedra=tetrahedra, points=points)
 
-    def count(self, x) -> int:
-        return self.exact.count(self.of(np.asarray(x, np.float64)))
+    def count(self, x, wholly: bool) -> int:
+        """Intersections at x; wholly: also bodies within others, which no edge pierces."""
+        x = self.of(np.asarray(x, np.float64))
+        return self.exact.count(x) if wholly else len(self.exact.pierced(x))
 
 
 def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
@@ -112,7 +114,7 @@ def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
             while left > 0:
                 simulator.run(min(looks, left))
                 left -= looks
-                silent += judge.count(simulator.positions)
+                silent += judge.count(simulator.positions, left <= 0)
             return [*said, ""], silent
         except (FloatingPointError, ValueError) as error:
             said.append(str(error))
@@ -141,11 +143,9 @@ def main() -> int:
         said, silent = throw(case, options.looks)
         verdict = "silent" if silent else "failed" if said[-1] else "in front" if len(said) == 1 else "after advice"
         counts[case["kind"], verdict] += 1
-        print(
-            f"{k:4d} {case['kind']:8} {case['precision']} {case['solver'].__name__:20} {verdict} after {len(said)} runs",
-            end="",
-        )
-        print(f", {time.process_time() - begin:.1f} s", *said, sep="\n     ", flush=True)
+        of = f"{case['kind']:8} {case['precision']} {case['solver'].__name__:20}"
+        took = f"{verdict} after {len(said)} runs, {time.process_time() - begin:.1f} s"
+        print(f"{k:4d} {of} {took}", *filter(None, said), sep="\n     ", flush=True)
     verdicts = "in front", "after advice", "failed", "silent"
     print("".join(f"{name:>14}" for name in ("", *verdicts)))
     for kind in sorted({kind for kind, _ in counts}):

@@ -125,8 +125,8 @@ class PairContact(Stage):
         inner, history, surface = self.inner, at.history, self.inner.mesh.surface_vertices
         u, v = self._places(history.u, at.end), self.rows.get(history.v, at.end)
         stale, any_near = self._look(*self._fine(history.u, at.end))
-        wanted = 0.0
-        for _ in range(MOST_LISTS):
+        one, wanted, lists = None, 0.0, MOST_LISTS if stale or any_near else 0
+        for _ in range(lists):
             if stale:
                 moved = runtime.fetch_row(*self._fine(history.u, at.end))[surface] - runtime.fetch(inner.before)
                 wanted = np.maximum(wanted, 1.1 * inner._travel(moved))
@@ -150,29 +150,25 @@ class PairContact(Stage):
             self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
 
     def _contact(self, at: Passes, start, u, v) -> ContactPass | None:
-        """The stage, with the list as it is."""
-        flagged = np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
-        near = flagged[self._comes_near(self._pass(flagged, start, u, v), at.now, u - start)]
-        if not near.size:
-            self._mark_done(flagged)
-            return None
-        while True:
-            one = self._pass(near, start, u, v)
-            own = one.nodes < self.num_own
-            e, one.b = self._go(one, self._numbers(one, at.now))
-            u_next = u.copy()
-            u_next[one.nodes[own]] += e[own]
-            others = np.setdiff1d(flagged, near)  # which the way that contact has changed may bring near
-            if others.size:
-                others = others[self._comes_near(self._pass(others, start, u_next, v), at.now, u_next - start)]
-            if not others.size:
+        """The stage, with the list as it is: of the pairs that would come near, and of those that do by what it does."""
+        one, u_next, flagged = None, u, self._flagged()
+        chosen, seen = np.zeros(self.inner.list.count, bool), flagged
+        for _ in range(MOST_LISTS):
+            more = flagged[self._comes_near(self._pass(flagged, start, u_next, v), at.now)]
+            if np.all(chosen[more]):
                 break
-            near = np.union1d(near, others)
-        self._mark_done(flagged)
-        v_next = v.copy()
-        v_next[one.nodes[own]] += at.now.decay * one.b[own]
-        self.rows.put(at.history.u, at.end, u_next[: self.num_own])
-        self.rows.put(at.history.v, at.end, v_next)
+            chosen[more] = True
+            one = self._pass(np.flatnonzero(chosen), start, u, v)
+            e, one.b = self._go(one, self._numbers(one, at.now))
+            u_next, v_next, own = u.copy(), v.copy(), one.nodes < self.num_own
+            u_next[one.nodes[own]] += e[own]
+            v_next[one.nodes[own]] += at.now.decay * one.b[own]
+            self.rows.put(at.history.u, at.end, u_next[: self.num_own])
+            self.rows.put(at.history.v, at.end, v_next)
+            self._look(*self._fine(at.history.u, at.end))
+            flagged = self._flagged()
+            seen = np.union1d(seen, flagged)
+        self._mark_done(seen)
         return one
 
     def _of_obstacles(self, impulses, at: Passes, one: ContactPass):
@@ -203,20 +199,28 @@ class PairContact(Stage):
             out.append((own, *seeds))
         return out
 
-    def _comes_near(self, one: ContactPass, now, motion: np.ndarray) -> np.ndarray:
-        """Which pairs would come nearer than their width, by looks at the pass so often that none misses a crossing: of the
-        state alone, however old the list is."""
+    def _flagged(self) -> np.ndarray:
+        """Numbers of the pairs that may come near, as `_look` found them."""
+        return np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
+
+    def _comes_near(self, one: ContactPass, now) -> np.ndarray:
+        """Which pairs come nearer than their width from `start` to `u`, by looks so often that none misses a crossing: of
+        the state alone, however old the list is."""
         near, of = one.solver.near, self._numbers(one, now)
-        farthest = 2 * np.linalg.norm(motion - motion.mean(0), axis=1).max()
-        looks = min(MOST_LOOKS, 1 + int(2 * farthest / np.min(of.W)))
-        out = np.zeros(len(one.pairs), bool)
-        for share in np.linspace(0, 1, looks + 1):
-            _, r, _ = nearest(near.relative(near.points(of.x + share * of.motion)), near.edges)
-            out |= dot(r, r) < (of.width + of.radius) ** 2
+        begin, motion = near.relative(near.points(of.x)), near.relative(near.points(of.motion))
+        looks = 1 + np.minimum(MOST_LOOKS, 2 * np.sqrt((motion**2).sum(-1)).max(1, initial=0) / of.width).astype(int)
+        out, left = np.zeros(len(one.pairs), bool), np.arange(len(one.pairs))
+        for k in range(int(looks.max(initial=0)) + 1):
+            left = left[(looks[left] >= k) & ~out[left]]
+            if not left.size:
+                break
+            y = begin[left] + (k / looks[left])[:, None, None] * motion[left]
+            _, r, _ = nearest(y, near.edges[left])
+            out[left] = dot(r, r) < (of.width + of.radius)[left] ** 2
         return out
 
     def _mark_done(self, near: np.ndarray) -> None:
-        """The parts have looked after these: `check_pass` need not."""
+        """The stage has looked after these: `check_pass` need not."""
         plane = whole(self.inner.plane)
         plane[near, 3] = 1e30
         if runtime.view(self.inner.plane) is None:
