@@ -35,7 +35,7 @@ class CurvedLaggedFriction:
             self.given = np.zeros_like(there)
             self.given[first:] = obstacles.displacements_at(obstacles.rows)
             there[first:] = self.given[first:] - obstacles.velocities() / per_gamma
-        self.inner.begin(self.pairs._spread(u), there, per_gamma)
+        self.inner.begin(self.pairs.spread(u), there, per_gamma)
 
     def _fine(self, u: np.ndarray) -> np.ndarray:
         return self.C @ u + self.given

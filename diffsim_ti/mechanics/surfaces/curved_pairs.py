@@ -188,7 +188,7 @@ class CurvedPairs:
         gather = self._launch(self.kernels.gather, rows=self.to_corners, at=at)
         gather(count=self.num_corners, first=self.a.first_contact_corner)
 
-    def _spread(self, u: np.ndarray, to: np.ndarray | None = None) -> np.ndarray:
+    def spread(self, u: np.ndarray, to: np.ndarray | None = None) -> np.ndarray:
         """Displacements of the finer surface, of corners of obstacles to where they are, or are said to be."""
         self.finer.follow()
         out = self.matrix @ u
@@ -283,7 +283,7 @@ class CurvedPairs:
 
     def begin(self, u: np.ndarray) -> None:
         runtime.fill(self.next, u[None])
-        self.inner.begin(self._spread(u))
+        self.inner.begin(self.spread(u))
 
     def place(self, u) -> None:
         self.inner.place(self.fine(u, 0))
@@ -304,11 +304,11 @@ class CurvedPairs:
         self._launch(self.kernels.add_blocks, rows=self.up, at=at)(count=self.a.num_vertices)
 
     def _step(self, step: np.ndarray, drift) -> np.ndarray:
-        return self._spread(step, 0.0 if drift is None else drift)
+        return self.spread(step, 0.0 if drift is None else drift)
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None) -> float:
         """drift: displacements of corners of obstacles meanwhile; None: they stand still."""
-        return self.inner.safe_share(self._spread(u), self._step(step, drift), most)
+        return self.inner.safe_share(self.spread(u), self._step(step, drift), most)
 
     @property
     def met(self) -> tuple[tuple[int, ...], int | None] | None:
@@ -322,10 +322,10 @@ class CurvedPairs:
         return tuple(int(i) for i in dict.fromkeys(nodes.tolist())), obstacle
 
     def is_collision_free(self, u: np.ndarray, step: np.ndarray, drift=None) -> bool:
-        return self.inner.is_collision_free(self._spread(u), self._step(step, drift))
+        return self.inner.is_collision_free(self.spread(u), self._step(step, drift))
 
     def check_end(self, u: np.ndarray, u_next: np.ndarray, drift=None) -> None:
-        self.inner.check_end(self._spread(u), self._spread(u) + self._step(u_next - u, drift))
+        self.inner.check_end(self.spread(u), self.spread(u) + self._step(u_next - u, drift))
 
 
 def _rows(matrix, fp) -> SimpleNamespace:
