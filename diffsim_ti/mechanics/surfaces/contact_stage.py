@@ -118,6 +118,7 @@ class PairContact(Stage):
                 self.rows.put(history.v, at.end, v)
                 self.rows.put(self.begin, 0, start)
                 begin = self._fine(self.begin, 0)
+                inner.age = 0  # the slacks are those wanted, whatever the pace before
                 inner._build(*begin, wanted=wanted)
                 inner.forces(*begin, self.scratch)
                 _, any_near = self._look(*self._fine(history.u, at.end))
