@@ -98,7 +98,7 @@ class PairContact(Stage):
         """(whether the list does not hold where the pass led, whether pairs of it may be near)"""
         inner = self.inner
         inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
-        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, lost=0.0, **inner._sums)
+        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, lost=0.0, **inner.sizes_of_sums)
         inner.run(inner.motion.find, dict(u=u), slot=slot, **bodies)
         flags = runtime.view(inner.flags)
         stale, _, near = runtime.fetch(inner.flags) if flags is None else flags
@@ -113,19 +113,19 @@ class PairContact(Stage):
         for _ in range(lists):
             if stale:
                 moved = runtime.fetch_row(*self._fine(history.u, at.end))[surface] - runtime.fetch(inner.before)
-                wanted = np.maximum(wanted, 1.1 * inner._travel(moved))
+                wanted = np.maximum(wanted, 1.1 * inner.travel(moved))
                 self.rows.put(history.u, at.end, u)
                 self.rows.put(history.v, at.end, v)
                 self.rows.put(self.begin, 0, start)
                 begin = self._fine(self.begin, 0)
                 inner.age = 0  # the slacks are those wanted, whatever the pace before
-                inner._build(*begin, wanted=wanted)
+                inner.build(*begin, wanted=wanted)
                 inner.forces(*begin, self.scratch)
                 _, any_near = self._look(*self._fine(history.u, at.end))
             one = self._contact(at, start, u, v) if any_near else None
             if at.stride:
                 self.kept[at.end] = one
-            _, stale, _ = inner._check(*self._fine(history.u, at.end), 0, 0)
+            _, stale, _ = inner.check(*self._fine(history.u, at.end), 0, 0)
             if not stale:
                 break
 

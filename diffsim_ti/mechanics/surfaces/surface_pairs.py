@@ -71,7 +71,7 @@ class SurfacePairs:
         self.num_bodies, self.marked = len(marked), runtime.upload(marked.ravel(), ti.i32)
         bodies, blocks = branches(self.num_bodies), -(-n // BLOCK)
         upper = branches(blocks)
-        self._sums = dict(body_block=bodies["size"], body_blocks=bodies["number"], blocks=blocks, **upper)
+        self.sizes_of_sums = dict(body_block=bodies["size"], body_blocks=bodies["number"], blocks=blocks, **upper)
         self.frame = runtime.array(vector, self.num_bodies + 2 + 2 * bodies["number"])
         self.farthest = runtime.array(self.kernels.fp, 1 + blocks + upper["number"])
         self.touched = runtime.array(ti.i32, n)
@@ -96,7 +96,7 @@ class SurfacePairs:
             runtime.fill(rest_state, 0)
             self._check_rest(rest_state)
             self._checked_rest = checked
-        self._build(u, 0)
+        self.build(u, 0)
         self.check_apart(u)
 
     def _check_rest(self, u) -> None:
@@ -106,7 +106,7 @@ class SurfacePairs:
                 f"self-contact of width {self.width:.3g} m: more than {self.most_edges:g} times the mean edge of the "
                 f"surface, so that most of its pairs would be near at rest; take a width below {largest:.3g} m"
             )
-        self._build(u, 0)
+        self.build(u, 0)
         plane = whole(self.rest_plane)[: self.list.count]
         if plane.size and not plane[:, 3].min() > 0:
             worst, pairs = plane[:, 3].argmin(), runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
@@ -118,7 +118,7 @@ class SurfacePairs:
     def check_apart(self, u) -> None:
         """Raise Overlap if surfaces touch or pass through each other at u[0]."""
         if not self.fresh or self.age:
-            self._build(u, 0)
+            self.build(u, 0)
         found = self.list.first_piercing(self.a.rest, u, 0)
         if found:
             edge, triangle = self.edges[found[0]], self.mesh.surface_triangles[found[1]]
@@ -134,7 +134,7 @@ class SurfacePairs:
     def forget(self, u) -> None:
         """The state was set from outside."""
         self.age = 0
-        self._build(u, 0)
+        self.build(u, 0)
         self.check_apart(u)
 
     def run(self, kernel, at: dict, *more, **numbers) -> None:
@@ -148,7 +148,7 @@ class SurfacePairs:
 
     # ---- the list ---------------------------------------------------------------------------------------------------
 
-    def _build(self, u, slot: int, wanted=0.0) -> None:
+    def build(self, u, slot: int, wanted=0.0) -> None:
         """The list at u[slot]; slacks follow the motion, or cover `wanted`, shape (n, 2) [m]."""
         x = runtime.fetch(u, slot)[self.mesh.surface_vertices]
         if not np.all(np.isfinite(x)):  # the guard of the run will say so
@@ -171,7 +171,7 @@ class SurfacePairs:
         slack, least = np.zeros((len(x), 4)), self.least_slack * self.width
         slack[:, :2] = wanted
         if self.fresh and self.age:
-            overall, last = self._travel(x - runtime.fetch(self.built)), self._travel(x - runtime.fetch(self.before))
+            overall, last = self.travel(x - runtime.fetch(self.built)), self.travel(x - runtime.fetch(self.before))
             pace = np.maximum(overall / self.age, last)
             pace += pace.mean(0)  # the mean, for what will be hit
             passes = self.typical_slack * self.width / max(float(np.median(pace.max(1))), 1e-300)
@@ -182,7 +182,7 @@ class SurfacePairs:
             slack[:, k] = slack[:, k].clip(least, max(least, 0.5 * (largest * self.list.typical - self.width)))
         return slack
 
-    def _travel(self, move: np.ndarray) -> np.ndarray:
+    def travel(self, move: np.ndarray) -> np.ndarray:
         """Lengths of surface vertices' motions relative to their body's and to the mean of all, shape (n, 2)."""
         frame = move[runtime.fetch(self.marked).reshape(self.num_bodies, -1)].mean(1)
         origins = frame[self.body[self.mesh.surface_vertices]], frame.mean(0)
@@ -192,9 +192,9 @@ class SurfacePairs:
         """Let go of the arrays that forces were computed from."""
         self._launch.clear()
 
-    def _check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
+    def check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
-        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width, **self._sums)
+        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width, **self.sizes_of_sums)
         self.run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_pairs=num_pairs, **bodies)
         flags = runtime.view(self.flags)
         stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
@@ -202,18 +202,18 @@ class SurfacePairs:
 
     def ensure(self, u, slot: int) -> None:
         """Make the list anew if it does not hold at u[slot]."""
-        if not self.fresh or self._check(u, slot, 0, 0)[0]:
+        if not self.fresh or self.check(u, slot, 0, 0)[0]:
             self.age = 0  # a jump says nothing of the pace
-            self._build(u, slot)
+            self.build(u, slot)
 
     def check_pass(self, u, slot: int, h: float) -> None:
         """After a pass of length h [s] to u[slot]: raise Tunnelling if a pair may have crossed."""
         self.age += 1
-        stale, lost, crossed = self._check(u, slot, self.list.num_vt, self.list.count)
+        stale, lost, crossed = self.check(u, slot, self.list.num_vt, self.list.count)
         if (lost or crossed) and np.all(np.isfinite(runtime.fetch(u, slot))):
             self._refuse(runtime.fetch_row(u, slot), h, crossed)
         if stale:
-            self._build(u, slot)
+            self.build(u, slot)
 
     def _refuse(self, u: np.ndarray, h: float, crossed: bool) -> None:
         surface = self.mesh.surface_vertices
