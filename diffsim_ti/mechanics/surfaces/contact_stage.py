@@ -135,6 +135,7 @@ class PairContact(Stage):
                 self.rows.put(self.begin, 0, start[: self.num_own])
                 self._follow(at, AT_BEGIN)
                 begin = self._fine(self.begin, 0)
+                inner.age = 0  # the slacks are those wanted, whatever the pace before
                 inner.build(*begin, wanted=wanted)
                 inner.forces(*begin, self.scratch)
                 self._follow(at, AT_STAGE)
