@@ -20,8 +20,8 @@ AREAS = {
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
     "quadratic_answers curved_contact",
-    "obstacles and friction": "contact contact_area contact_faces contact_stage contact_rollers contact_crossing "
-    "contact_friction face_friction contact_gradients own_obstacle poses far_from_origin",
+    "obstacles and friction": "contact mesh_obstacle contact_area contact_faces contact_stage contact_rollers "
+    "contact_crossing contact_friction face_friction contact_gradients obstacle_pairs own_obstacle poses far_from_origin",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction",
     "PyTorch, optimisations": "ensemble torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",
     "charts, maps, advice": "sweep study study_stability peers",

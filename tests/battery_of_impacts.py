@@ -1,11 +1,13 @@
 """Random impacts of small bodies on thin walls, needles, plates and balls, at rest and moving, judged by geometry alone.
 
-    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--rough] [--reduced] [--order 2] [--solver NAME]
+    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--rough] [--reduced] [--order 2] [--pairs]
+        [--meshed]
+        [--solver NAME]
 
 Each case runs once; where it raises, what the error advises is done and the case runs again, three times at most.
 --turning: obstacles turn about a point near them as well. --rough: they rub. --reduced: the body, or what comes first of it
 and is stiffer, moves by few numbers, in implicit steps and static solves. --order 2: of ten-node tetrahedra, on the
-same grids.
+same grids. --pairs: points and edges of obstacles act by pairs. --meshed: obstacles are triangles, a segment or a point.
 """
 
 import argparse
@@ -54,6 +56,8 @@ class Case:
     rough: bool = False
     reduced: str | None = None  # how a part of the body moves
     order: int = 1
+    pairs: bool = False
+    meshed: bool = False
     stiffness: float | None = None  # per area [N/m^3]
     substeps: int = 1  # of explicit solvers: times what stability asks for
     substep: float = float("inf")  # what explicit ones were advised [s]
@@ -78,6 +82,7 @@ class Case:
             self.rough and "rough",
             self.reduced,
             self.order == 2 and "ten nodes",
+            self.meshed and "meshed",
         ]
         return (
             f"{self.number}: {self.solver} {self.kind} {self.precision} {self.speed:.3g} m/s dt {self.dt:.3g} s E "
@@ -87,7 +92,15 @@ class Case:
 
 
 def draw(
-    number: int, seed: int, solvers, turning: bool = False, order: int = 1, reduced: bool = False, rough: bool = False
+    number: int,
+    seed: int,
+    solvers,
+    turning: bool = False,
+    order: int = 1,
+    reduced: bool = False,
+    rough: bool = False,
+    pairs: bool = False,
+    meshed: bool = False,
 ) -> Case:
     rng, names = np.random.default_rng([seed, number]), list(solvers)
     log = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))  # noqa: E731
@@ -108,6 +121,8 @@ def draw(
         rough=rough,
         reduced=("affine", "by functions", "by fields", "rigid")[(number + number // 6) % 4] if reduced else None,
         order=order,
+        pairs=pairs,
+        meshed=meshed,
     )
 
 
@@ -143,6 +158,8 @@ def build(case: Case):
         path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
     stiffness = case.stiffness or natural_stiffness(case, mesh, width)
     given, back = turning(case, path) if case.turning else (dict(path=path), lambda x, t: x - path(t))
+    if case.pairs and not case.meshed:  # meshes always do
+        given["by_pairs"] = True
     if case.rough:
         given |= dict(friction=0.5, friction_speed=0.01 * case.speed)
     obstacle = obstacle(width=width, stiffness_per_area=stiffness, **given)
@@ -199,6 +216,18 @@ def natural_stiffness(case: Case, mesh, width: float) -> float:
 
 def make_obstacle(case: Case, rng, width: float):
     """(obstacle as a function of its barrier, solid) about the origin."""
+    make, solid = analytic_obstacle(case, rng)
+    if not case.meshed:
+        return make, solid
+    if solid["kind"] == "capsule":  # a point or a segment
+        ends = np.array([solid["start"], solid["end"]])
+        parts = dict(segments=[[0, 1]]) if np.any(ends[0] != ends[1]) else dict(points=[0])
+        return (lambda **o: ds.MeshObstacle(ends, radius=solid["radius"], **parts, **o)), solid
+    box = ds.TetrahedralMesh.create_box(2, size=tuple(2 * solid["half"]), origin=tuple(-solid["half"]))
+    return (lambda **o: ds.MeshObstacle(box.vertices @ solid["axes"], box.surface_triangles, **o)), solid
+
+
+def analytic_obstacle(case: Case, rng):
     t, s = case.thickness, case.size
     if case.kind in ("wall", "plate"):
         wide = 20 * s if case.kind == "wall" else s * rng.uniform(0.3, 0.8)
@@ -317,6 +346,8 @@ def main() -> int:
     parser.add_argument("--turning", action="store_true")
     parser.add_argument("--rough", action="store_true")
     parser.add_argument("--reduced", action="store_true")
+    parser.add_argument("--pairs", action="store_true")
+    parser.add_argument("--meshed", action="store_true")
     parser.add_argument("--order", type=int, choices=(1, 2), default=1)
     given = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)
@@ -324,7 +355,7 @@ def main() -> int:
     # by few numbers: dealt in turn to those that solve for them
     solvers = {name: kind for name, kind in SOLVERS.items() if not (given.reduced and kind.explicit)}
     cases = (
-        draw(n, given.seed, solvers, given.turning, given.order, given.reduced, given.rough)
+        draw(n, given.seed, solvers, given.turning, given.order, given.reduced, given.rough, given.pairs, given.meshed)
         for n in given.only or range(given.cases)
     )
     table = battery(c for c in cases if not given.solver or c.solver in given.solver)

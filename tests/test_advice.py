@@ -312,6 +312,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("common/checked.py", "is a tensor with a graph"): "test_calls.py",
     ("mechanics/surfaces/surface_pairs.py", "take a width below"): "test_self_contact.py",
     ("mechanics/surfaces/surface_pairs.py", "take substeps of {} s"): "test_self_contact.py, battery_of_throws.py",
+    ("mechanics/surfaces/contact_stage.py", "take substeps of {} s"): "battery_of_throws.py",
     ("mechanics/surfaces/surface_pairs.py", "no step stops them"): "test_self_contact.py, battery_of_throws.py",
     ("diff_simulator.py", "a two-step method"): "test_torch_solvers.py",
     ("identification/descent.py", "take smaller steps"): "names neither an argument nor a number",

@@ -160,16 +160,16 @@ CASES = {
 
 def test_an_obstacle_made_far_away_is_measured_from_there():
     """A mesh in coordinates of a map, where it is or where its path has taken it."""
-    keys, cell = ([0, 1], np.stack([FAR, FAR])), 0.5 / 48
+    keys = [0, 1], np.stack([FAR, FAR])
     for away, path in ((FAR, None), (0, keys)):
         made = ds.MeshObstacle(MESH.vertices[:4] - [0, 3, 0] + away, MESH.surface_triangles[:4], path=path, **OWN)
         there = scene(made, mesh=THERE)
         derived = there.inputs.derive(there.inputs.at_times([0.0, 1.0]))
         position = derived.parameters[:3] + (0 if path is None else derived.path[0, 0])
-        grid = there.obstacles[0].kernel("f32").origin
-        at = position + grid + there.origin - FAR
-        np.testing.assert_allclose(at, np.array([0, -2.85, 0]) - 0.2 - 2 * cell, atol=1e-8)
-        assert np.abs(derived.parameters[:3]).max() < 10 and np.abs(grid).max() < 10
+        corners = there.obstacles[0]._tree.x
+        at = position + corners + there.origin - FAR
+        np.testing.assert_allclose(at, MESH.vertices[:4] - [0, 3, 0], atol=1e-8)
+        assert np.abs(derived.parameters[:3]).max() < 10 and np.abs(corners).max() < 10
 
 
 def test_a_shape_of_ones_own_says_what_is_a_place():

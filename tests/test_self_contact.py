@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from exact_predicates import ExactJudge
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
@@ -309,14 +310,13 @@ def test_a_width_beyond_many_elements_is_refused():
 
 
 def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
-    solver = crossed_edges(speed=400.0, substeps=1)
+    solver = crossed_edges(speed=400.0, substeps=1, contact="force")
     simulator = ds.Simulator(solver)
     with pytest.raises(ds.Tunnelling, match=r"substep of 0\.0001 s.*take substeps of"):
         simulator.run(20)
     simulator.check_surfaces()
-    weak = ds.Simulator(
-        ds.SemiImplicitSolver(crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)]), dt=DT, substeps=1)
-    )
+    scene = crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)])
+    weak = ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT, substeps=1, contact="force"))
     with pytest.raises(
         ds.Tunnelling, match=r"^step \d+, t = .*(edges|vertex).*may have gone through each other: their gap was .* m/s"
     ) as error:
@@ -327,11 +327,12 @@ def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
 
 def test_contact_too_stiff_for_its_step_says_so_and_its_advice_works():
     scene = crossed_edges().scene
-    stiff = ds.Simulator(ds.SemiImplicitSolver(scene.replace(terms=[ds.SelfContact(1e9, WIDTH)]), dt=DT, substeps=1))
+    scene = scene.replace(terms=[ds.SelfContact(1e9, WIDTH)])
+    stiff = ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT, substeps=1, contact="force"))
     with pytest.raises(ds.Tunnelling, match=r"at .* rad/s is too stiff for it: take substeps of") as error:
         stiff.run(200)
     step = error.value.stable_dt
-    shorter = ds.SemiImplicitSolver(stiff.solver.scene, dt=step)
+    shorter = ds.SemiImplicitSolver(stiff.solver.scene, dt=step, contact="force")
     simulator = ds.Simulator(shorter)
     simulator.run(round(3e-3 / step))
     simulator.check_surfaces()
@@ -344,7 +345,7 @@ def test_a_throw_goes_well_when_the_advice_is_taken(stiffness, dt):
 
     def throw():
         now = scene.replace(terms=[ds.SelfContact(of["stiffness"], WIDTH)])
-        simulator = ds.Simulator(ds.SemiImplicitSolver(now, dt=of["substep"], substeps=1))
+        simulator = ds.Simulator(ds.SemiImplicitSolver(now, dt=of["substep"], substeps=1, contact="force"))
         simulator.run(int(0.016 / of["substep"]))
         simulator.check_surfaces()
         return simulator
@@ -357,6 +358,25 @@ def test_a_throw_goes_well_when_the_advice_is_taken(stiffness, dt):
     of["stiffness"] = float(said[1]) if said else stiffness
     assert of["substep"] == pytest.approx(error.value.stable_dt, rel=0.01)
     assert throw().smallest_gap() > 0
+
+
+@pytest.mark.parametrize("stiffness, dt", [(1e-2, 4e-4), (1e7, 4e-4)])
+def test_the_stage_keeps_surfaces_apart_whatever_the_stiffness(stiffness, dt):
+    """Where a force would be too weak or too stiff for its step by far: no intersection, momenta to round-off, no energy
+    from nowhere but for the second order of turning surfaces."""
+    mesh = two_blocks().scene.mesh
+    scene = two_blocks().scene.replace(terms=[ds.SelfContact(stiffness, WIDTH)])
+    simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=dt))
+    judge = ExactJudge(mesh.vertices, mesh.surface_triangles, (), mesh.elements, np.arange(mesh.num_vertices))
+    energy, (p, L, size) = simulator.compute_energy(), momenta(simulator)
+    for _ in range(8):
+        simulator.run(3)
+        assert judge.count(simulator.positions) == 0 and simulator.smallest_gap() > 0
+    p1, L1, _ = momenta(simulator)
+    assert np.abs(p1 - p).max() <= 1e-12 * size and np.abs(L1 - L).max() <= 1e-12 * size
+    lower = mesh.vertex_sets["body_0"]
+    assert np.linalg.norm(simulator.velocities[lower].mean(0)) > 0.1  # they met
+    assert simulator.compute_energy() <= 1.02 * energy
 
 
 def test_one_per_scene_and_gap_needs_it():

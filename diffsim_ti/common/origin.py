@@ -23,9 +23,9 @@ def far_part(x: np.ndarray, length: float) -> np.ndarray:
 
 
 def middle_far_part(points: np.ndarray) -> np.ndarray:
-    """That of the middle of points, shape (k, 3) [m], by their extent."""
+    """That of the middle of points, shape (k, 3) [m], by their extent; of one point, by a metre."""
     low, high = points.min(0), points.max(0)
-    return far_part(0.5 * (low + high), float((high - low).max()))
+    return far_part(0.5 * (low + high), float((high - low).max()) or 1.0)
 
 
 def positions_of(scene, rest: np.ndarray, u: np.ndarray) -> np.ndarray:

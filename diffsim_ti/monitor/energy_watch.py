@@ -92,6 +92,7 @@ class EnergyWatch:
         share, energies = min(0.5, 0.01 * gap / np.abs(drift).max()), []
         for sign in (1, -1):
             self.ws.collisions.put(self.ws.arrays.poses.moved(places, drift, sign * share))
+            self.ws.potential.place(u_star)
             energies.append(self.ws.potential.energy()[0])
         self.ws.collisions.put(places)
         return (energies[0] - energies[1]) / (2 * share)

@@ -425,7 +425,8 @@ class Simulator(metaclass=Public):
         return quantities.energy(self.workspace)
 
     def smallest_gap(self) -> float:
-        """Smallest distance [m] of surface primitives that share no vertex; infinite beyond the reach of SelfContact."""
+        """Smallest distance [m] of surface primitives that share no vertex, and to points and edges of obstacles that act by
+        pairs; infinite beyond the reach of SelfContact and of these."""
         if self.workspace.pairs is None:
             raise ValueError(
                 "this scene has no SelfContact: add it to the scene's terms to measure gaps between surfaces"

@@ -55,7 +55,7 @@ class SceneArrays:
         self.own = {name: kind for x in self._all for name, kind in x.derived.items()}  # their numbers
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene, presses)
-        rows = scene.inputs.parameters
+        self._rows = rows = scene.inputs.parameters
         self.obstacles = self._counterparts(scene)
         self.curved, self.bend = are_treated_as_curved(mesh, self.contacts, bend), bend
         self._features = dict(
@@ -105,8 +105,11 @@ class SceneArrays:
         if not isinstance(self.place, slice):
             corner_of = self.nodes * self.place[corner_of // self.nodes] + corner_of % self.nodes
             corner_of = corner_of[np.lexsort((corner_of, np.repeat(np.arange(n), np.diff(start))))]
-        if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
+        self.parameters_of_self_contact = slice(0, 0)
+        if self.self_contact:
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
+        if self.self_contact or any(term.primitives is not None for term in self.contacts):
+            # each surface vertex gathers one corner more, after those of its tetrahedra
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
         self.first_corner = num_corners  # of interactions
@@ -144,8 +147,11 @@ class SceneArrays:
             rows = scene.inputs.parameters.of(term)
             counterpart = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
             if isinstance(term, Obstacle):
-                counterpart = replace(counterpart, per_area=term.per_area, turns=term.turns)
-            if counterpart.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
+                kind = dict(per_area=term.per_area, turns=term.turns, by_pairs=term.by_pairs)
+                counterpart = replace(counterpart, **kind)
+            if (
+                counterpart.size + term.num_extra != rows.stop - rows.start
+            ):  # it would read, and add to, another term's rows
                 raise AssertionError(
                     f"the kernel of {term!r} has {counterpart.size} numbers, its term {rows.stop - rows.start}"
                 )
@@ -187,6 +193,9 @@ class SceneArrays:
         self.rows = values.parts()
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in (*PARTS, *self.own) if name != "mass"}
+        if any(term.num_extra for term in self.contacts):
+            numbers = [values.parameters[self._rows.of(term)] for term in self.contacts]
+            self.tables = np.concatenate([t.table_at(x) for t, x in zip(self.contacts, numbers)])
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
         if not (self.contacts or self.self_contact or any(x.reads_rest for x in self.features().interactions)):
             sources["rest"] = np.zeros((1, 3)), self.vector

@@ -29,11 +29,12 @@ class SelfContact(Term):
     sets of vertices or tetrahedra, {("palm", "ball"): 0.6}, and other pairs have no friction; a pair whose corners are
     in several sets belongs to those of its vertex, or of each edge's first one, and of the triangle's first one.
     friction_speed [m/s]: the speed of sliding below which friction is smoothed, and with which what is held may creep:
-    mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each pass that adds
-    no energy, whatever the step (friction_kernels.py); in implicit ones a force, with N and the normal from where
-    the step begins. Its forces F act at the two ends of the gap d: a couple d x F, which changes angular momentum by
-    less than the width times the impulse of friction. Edges that pass each other are bumps, which take energy: a slab on a
-    slope went as with 0.0005 more friction at a width of 4 mm, and as with 0.0001 at 1 mm, whatever friction_speed and step.
+    mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each pass that
+    adds no energy, whatever the step (friction_kernels.py), with N as the stage of contact finds it or, where contact
+    is a force, from where the pass begins; in implicit ones a force, with N and the normal from where the step begins.
+    Its forces F act at the two ends of the gap d: a couple d x F, which changes angular momentum by less than the
+    width times the impulse of friction. Edges that pass each other are bumps, which take energy: a slab on a slope
+    went as with 0.0005 more friction at a width of 4 mm, and as with 0.0001 at 1 mm, whatever friction_speed and step.
     A narrower and stiffer barrier is smoother.
 
     Pairs of one body whose distance D at rest is below twice the width, neighbours along its surface or walls of a slit,
@@ -48,8 +49,10 @@ class SelfContact(Term):
 
     Inputs with gradient: "self_contact_stiffness", "self_contact_width", with friction "self_contact_friction_speed" and
     "self_contact_friction", of a dict shape (pairs,); or "<name>.stiffness" and so on.
-    One per scene. Implicit solvers keep surfaces apart during the whole motion of every step; ImplicitMidpointSolver raises
-    Tunnelling where the end of a step lies beyond a contact.
+    One per scene. In explicit steps it is a stage that no step is too large for (`contact` and `contact_damping` of
+    their solvers): what the stiffness cannot hold is lost as in an inelastic impact. Implicit solvers keep surfaces
+    apart during the whole motion of every step; ImplicitMidpointSolver raises Tunnelling where the end of a step lies
+    beyond a contact.
 
     Raises ValueError for stiffness, width or friction_speed <= 0, friction < 0, names that are no sets, sets of a dict that
     share a vertex, and, when a run starts, for a width beyond four mean edges of the surface, for primitives that touch at

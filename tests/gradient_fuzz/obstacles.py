@@ -100,9 +100,10 @@ def place(
     else:
         vertices, triangles = box_surface()
         depth = MESH_SIZE @ np.abs(MESH_TURN.inv().apply(n)) / 2
-        position = foot - depth * n + 0.5 * CELL * aside
-        term = ds.MeshObstacle(vertices, triangles, position=position, resolution=8, **options)
-        distance = lambda y: box_distance(MESH_TURN.inv().apply(y - position), MESH_SIZE)  # noqa: E731
+        radius = 0.1 * CELL * rng.uniform(0, 1)
+        position = foot - (depth + radius) * n + 0.5 * CELL * aside
+        term = ds.MeshObstacle(vertices, triangles, position=position, radius=radius, shapeable=True, **options)
+        distance = lambda y: box_distance(MESH_TURN.inv().apply(y - position), MESH_SIZE) - radius  # noqa: E731
     return Placed(term, kind, distance, width, options.get("friction_speed", 0.0))
 
 

@@ -25,8 +25,8 @@ def rise(t, fp: ti.template()):
 
 
 def firmer(force) -> bool:
-    """Whether points are the firmer, the narrower their obstacle is; a spline's t ends with its grid."""
-    return force.per_area and not force.grain
+    """Whether points are the firmer, the narrower their obstacle is."""
+    return force.per_area
 
 
 @ti.func

@@ -17,9 +17,9 @@ faces around it, as if distances were linear within them; a point says how much 
 s + t being the distance that the corners let expect. The areas of a face's lattice points sum up to the face's, those of
 the corners included, and give each corner its third of it, so that nothing counts twice: where phi = 1 what the corners
 said of a point is taken back, and its own energy stands. What is much narrower than a face touches little of it, and has
-to stop as much of the body as vertices carry: phi grows on as 1 + 8 t^2, which refinement takes back. (Not so before a
-mesh, whose distances end with its grid.) The sum does not grow with the number of points, but for r,
-which is 0.16 w at most and lets a point touch what lies between it and the next.
+to stop as much of the body as vertices carry: phi grows on as 1 + 8 t^2, which refinement takes back. The sum
+does not grow with the number of points, but for r, which is 0.16 w at most and lets a point touch what lies between it and
+the next.
 The points of a face lie on a lattice, a quarter of a width apart or closer, but for its largest number; corners are none of
 them.
 """

@@ -8,7 +8,8 @@ from diffsim_ti import runtime
 class ImpulseRecord:
     """Impulses [N s] of obstacles on vertices: those of the contact stage in `impulse` (contact_impulses.py), those of
     points within faces in `of_faces`, shape (frames, obstacles that reach there, num_vertices, 3), those of friction there
-    in `of_friction`, of obstacles with friction, on the surface's vertices.
+    in `of_friction`, of obstacles with friction, on the surface's vertices, and those of pairs with points and edges of
+    obstacles in `of_pairs`, shape (frames, obstacles by pairs, 2: by push and by friction, surface vertices, 3).
 
     Raises ValueError where obstacles act as forces, and while it runs where two of them push on the faces around one vertex.
     """
@@ -20,6 +21,8 @@ class ImpulseRecord:
                 "explicit solvers note what obstacles with a distance do, and one of this scene is a force alone: take an "
                 "implicit solver for ContactForce and ContactTraction"
             )
+        obstacles = workspace.pairs.obstacles if workspace.pairs else None
+        self.by_pairs = [part.k for part in obstacles.corners.parts] if obstacles else []
         reaching = [g.number + k for g in features.groups if features.reaches(g) for k in range(g.count)]
         self.reaching = reaching if workspace.faces else []
         self.with_friction = list(workspace.faces.friction.number) if workspace.faces else []
@@ -36,12 +39,14 @@ class ImpulseRecord:
         runtime.fill(self.impulse, 0)
         self.of_faces = np.zeros((self.num_frames, len(self.reaching), self.arrays.num_vertices, 3))
         self.of_friction = np.zeros((self.num_frames, len(self.with_friction), len(self.surface), 3))
+        self.of_pairs = np.zeros((self.num_frames, len(self.by_pairs), 2, len(self.surface), 3))
 
     def put(self, impulses: np.ndarray) -> None:
         """Set them; shape as `collect` gives."""
         runtime.fill(self.impulse, impulses.reshape(-1, *self._shape[3:]))
         self.of_faces = impulses[:, self.reaching, 0].copy()
         self.of_friction = impulses[:, self.with_friction, 1][:, :, self.surface].copy()
+        self.of_pairs = impulses[:, self.by_pairs][:, :, :, self.surface].copy()
 
     def collect(self) -> np.ndarray:
         """Shape (frames, obstacles, 2: by push and by friction, num_vertices, 3), float64; the first frame has none."""
@@ -49,6 +54,8 @@ class ImpulseRecord:
         out[:, self.reaching, 0] += self.of_faces
         for k, o in enumerate(self.with_friction):
             out[:, o, 1, self.surface] += self.of_friction[:, k]
+        for k, o in enumerate(self.by_pairs):
+            out[:, o][:, :, self.surface] += self.of_pairs[:, k]
         return out
 
     # ---- of faces ----------------------------------------------------------------------------------------------------

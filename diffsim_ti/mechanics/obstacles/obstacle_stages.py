@@ -230,7 +230,7 @@ class ObstacleStages(ObstacleFunctions):
         far = d - width if ti.static(self.features.stages) else d  # a stage acts where a pass leads to
         if d < width or move.dot(move) >= far * far:
             approach = g.force.approach(scene.parameters, first, X, u, move)
-            reached = ti.min(d, d + approach)
+            reached = g.force.reached(scene.parameters, first, X, u, move, d, approach)
             if reached < width:
                 rigidity = self.on_area(g, i, g.force.rigidity(scene.parameters, first, X, u), scene)
                 omega2 = self.felt_by(i, scene) * rigidity

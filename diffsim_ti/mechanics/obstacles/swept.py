@@ -117,7 +117,7 @@ class SweptKernels(ObstacleFunctions):
                 low = ti.max(low, of_corners - arch / ti.cast(1 << (2 * level), self.fp))
             if ti.static(g.force.convex):
                 low = ti.max(low, d + along)
-            last = level == levels or r <= ti.cast(ti.static(g.force.grain), self.fp)
+            last = level == levels
             if last:  # by the plane there; what lies between is nearer than its middle by little
                 low = ti.max(low, d + along, ti.cast(0.05, self.fp) * d)
             if last or low >= wanted or low >= half * nearest:

@@ -31,8 +31,10 @@ def check_bodies(scene: "Scene", contact: str) -> None:
     if scene.holds_volumes:
         raise ValueError(f"{said} and FilledChamber do not go together in explicit steps: take an implicit solver")
     self_contact = scene.term(SelfContact)
-    if self_contact and self_contact.has_friction:
+    rough = [term for term in scene.terms if term.primitives is not None and term.has_friction]
+    rough = [self_contact] if self_contact and self_contact.has_friction else rough
+    if rough:
         raise ValueError(
-            f"{said} have no friction in SelfContact in explicit steps, which slows every vertex by itself: leave it "
-            "out, or take an implicit solver"
+            f"{said} have no friction in {type(rough[0]).__name__} in explicit steps, which slows every vertex by itself: "
+            "leave it out, or take an implicit solver"
         )

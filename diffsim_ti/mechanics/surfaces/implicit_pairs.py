@@ -18,6 +18,7 @@ class ImplicitPairs(SurfacePairs):
 
     friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
+    blocked: np.ndarray | None = None  # corners of the pair that stopped the last march
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)
@@ -29,7 +30,7 @@ class ImplicitPairs(SurfacePairs):
         """A new pass from u: from here on all is a function of u, whatever came before."""
         self.fresh = False
         runtime.fill(self.next, u[None])
-        self._build(self.next, 0)
+        self.build(self.next, 0)
 
     def place(self, u) -> None:
         """Go to the displacements u[0]."""
@@ -54,22 +55,24 @@ class ImplicitPairs(SurfacePairs):
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
         largest such share only where they are about to meet. Marches along the step, with a new list at each halt."""
-        travel = self._travel(step[self.mesh.surface_vertices])
+        travel = self.travel(step[self.mesh.surface_vertices])
         if not travel.any():
             return most
         runtime.fill(self.step, step[None])
-        share = 0.0
+        share, self.blocked = 0.0, None
         for _ in range(self.longest_march):
             runtime.fill(self.next, (u + share * step)[None])
-            self._build(self.next, 0, wanted=(most - share) * travel)
+            self.build(self.next, 0, wanted=(most - share) * travel)
             self.forces(self.next, 0, self.a.corner, exact=True)
-            reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.width
+            reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
             unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
-            listed = self._shares().min(initial=np.inf)
+            shares = self._shares()
+            listed = shares.min(initial=np.inf)
             share += min(listed, unlisted)
             if share >= most:
                 return most
             if listed < unlisted:
+                self.blocked = runtime.fetch(self.list.pairs)[4 * int(shares.argmin()) :][:4]
                 return share
         return share
 

@@ -6,7 +6,6 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.terms.obstacles.friction import ARRAYS, dissipated, slip
-from diffsim_ti.terms.self_contact import SelfContact
 
 TINY = 1e-300
 
@@ -23,7 +22,8 @@ class LaggedFriction(PairFriction):
         super().__init__(pairs)
         self.corners, self.w, self.n = np.zeros((0, 4), int), np.zeros((0, 4)), np.zeros((0, 3))
         self.L, self.x, self.per_gamma = np.zeros(0), np.zeros((self.a.num_vertices, 3)), 1.0
-        self.by_speed, self.u_begin = 0.0, None
+        self.by_speed, self.u_begin = np.zeros(len(self.speeds_at)), None
+        self.contact = np.zeros(0, int)  # its number of each pair
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
         """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above."""
@@ -34,14 +34,17 @@ class LaggedFriction(PairFriction):
         self.corners = runtime.fetch(self.pairs.list.pairs)[: 4 * count].reshape(-1, 4)[felt]
         self.w, pressing = whole(self.own.weights)[felt].astype(np.float64), pressing[felt].astype(np.float64)
         self.n, self.L = pressing[:, :3], pressing[:, 3]
+        surface = self.pairs.kinematic
+        self.contact = surface.numbers[self.corners[:, [0, 2]]].max(1) if surface else np.zeros(len(felt), int)
 
     def _measure_here(self) -> None:
         self.pairs.forces(self.pairs.next, 0, self.a.corner)
         self.measure(self.pairs.next, 0)
 
     @property
-    def speed(self) -> float:
-        return float(self.a.values.parameters[self.pairs.first + SelfContact.index.friction_speed])
+    def speed(self) -> np.ndarray:
+        """The friction speed [m/s] of each pair."""
+        return self.a.values.parameters[self.speeds_at][self.contact]
 
     def _sliding(self, u: np.ndarray) -> tuple:
         """(velocities of the corners, their difference across the gap, t, |t|, t / |t|, f / |t|, df / d|t|)"""
@@ -55,10 +58,14 @@ class LaggedFriction(PairFriction):
     def _across(self, x: np.ndarray) -> np.ndarray:
         return x - self.n * _dot(self.n, x)
 
-    def _scatter(self, at_corners: np.ndarray) -> np.ndarray:
-        out = np.zeros((self.a.num_vertices, *at_corners.shape[2:]))
-        np.add.at(out, self.corners, at_corners)
+    def _scatter(self, at_corners: np.ndarray, only: int | None = None) -> np.ndarray:
+        out, own = np.zeros((self.a.num_vertices, *at_corners.shape[2:])), self._of(only)
+        np.add.at(out, self.corners[own], at_corners[own])
         return out
+
+    def _of(self, only: int | None) -> slice | np.ndarray:
+        """Pairs of a contact, or all."""
+        return slice(None) if only is None else self.contact == only
 
     def energies(self, u: np.ndarray) -> np.ndarray:
         """Of each pair [J]: what sliding so would dissipate."""
@@ -68,9 +75,9 @@ class LaggedFriction(PairFriction):
         _, _, t, _, _, kappa, _ = self._sliding(u)
         return (-self.L * kappa)[:, None] * t
 
-    def forces(self, u: np.ndarray) -> np.ndarray:
-        """[N]"""
-        return self._scatter(self.w[:, :, None] * self._pulls(u)[:, None])
+    def forces(self, u: np.ndarray, only: int | None = None) -> np.ndarray:
+        """[N]; only: of the pairs of one contact."""
+        return self._scatter(self.w[:, :, None] * self._pulls(u)[:, None], only)
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
         """Sum of the sizes of the forces that meet at each vertex [N]."""
@@ -99,14 +106,16 @@ class LaggedFriction(PairFriction):
         self.pairs.begin(self.u_begin)
         self._measure_here()
 
-    def jvp(self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers) -> np.ndarray:
+    def jvp(
+        self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers, only=None
+    ) -> np.ndarray:
         """Change of the forces for those of u, of x, of where the pass begins, and of `numbers`, a Tangent."""
         self._back_to_begin()
         runtime.fill(self.pairs.step, du_begin[None])
         self.changes(self.pairs.next, 0, self.pairs.step, numbers)
         d_pressing = whole(self.own.pressing_dot)[self.felt].astype(np.float64)
         dw, dn, dL = whole(self.own.weights_dot)[self.felt].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
-        d_speed = float(runtime.fetch(numbers.parameters)[self.pairs.first + SelfContact.index.friction_speed])
+        d_speed = runtime.fetch(numbers.parameters)[self.speeds_at][self.contact]
         v, relative, t, s, e, kappa, slope = self._sliding(u)
         dv = (self.per_gamma * (du - dx))[self.corners]
         d_relative = np.einsum("pk,pkd->pd", self.w, dv) + np.einsum("pk,pkd->pd", dw, v)
@@ -115,16 +124,17 @@ class LaggedFriction(PairFriction):
         df = slope * (ds - s / self.speed * d_speed)
         r, dr = (-self.L * kappa)[:, None] * t, (-dL * kappa)[:, None] * t
         dr -= self.L[:, None] * ((df - kappa * ds)[:, None] * e + kappa[:, None] * dt)
-        return self._scatter(self.w[:, :, None] * dr[:, None] + dw[:, :, None] * r[:, None])
+        return self._scatter(self.w[:, :, None] * dr[:, None] + dw[:, :, None] * r[:, None], only)
 
-    def vjp(self, u: np.ndarray, forces_adj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def vjp(self, u: np.ndarray, forces_adj: np.ndarray, only: int | None = None) -> tuple[np.ndarray, ...]:
         """Adjoints of u, of x, of where the pass begins; adds those of the numbers and of the rest shape."""
         v, relative, t, s, e, kappa, slope = self._sliding(u)
-        g = forces_adj[self.corners]
+        g = np.zeros((*self.corners.shape, 3))
+        g[self._of(only)] = forces_adj[self.corners[self._of(only)]]
         r, r_adj = (-self.L * kappa)[:, None] * t, np.einsum("pk,pkd->pd", self.w, g)
         by_f = -self.L * _dot(e, r_adj)[:, 0]
         t_adj = (-self.L * kappa)[:, None] * r_adj + (by_f * (slope - kappa))[:, None] * e
-        self.by_speed -= float((by_f * slope * s / self.speed).sum())
+        np.add.at(self.by_speed, self.contact, -by_f * slope * s / self.speed)
         relative_adj = self._across(t_adj)
         n_adj = -t_adj * _dot(self.n, relative) - relative * _dot(self.n, t_adj)
         w_adj = np.einsum("pkd,pd->pk", g, r) + np.einsum("pkd,pd->pk", v, relative_adj)
@@ -137,12 +147,11 @@ class LaggedFriction(PairFriction):
 
     def clear_sums(self) -> None:
         super().clear_sums()
-        self.by_speed = 0.0
+        self.by_speed[:] = 0
 
-    def collect(self) -> np.ndarray:
-        out = super().collect()
-        out[0] += self.by_speed
-        return out
+    def collect(self, out: np.ndarray) -> None:
+        super().collect(out)
+        np.add.at(out, self.speeds_at, self.by_speed)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -132,6 +132,35 @@ class MotionKernels(ListedPair):
         return self.kernel("check", self.check_all, dict(u="vectors2"), own, **numbers)
 
     @ti.func
+    def find_all(self, scene: A, at: A, plan: A):
+        for k in ti.static(range(3)):
+            scene.flags[k] = 0
+        self.follow_frames(scene, at, plan)
+        self.compare_slacks(scene, at, plan)
+        self.find_farthest(scene, at, plan)
+        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
+            ti.loop_config(serialize=not self.parallel)
+            for p in range(first_of(kind, plan), behind(kind, plan)):
+                left, near = scene.plane[p][3] - self.width(p, scene), 0
+                if not scene.farthest[0] < left:
+                    if not ti.max(self.closing(kind, p, scene, at, plan), ti.cast(0, self.fp)) < left:
+                        near = 1
+                        scene.flags[2] = 1
+                scene.near[p] = near
+
+    @cached_property
+    def find(self) -> Kernel:
+        """`near`: which pairs may be nearer than their width, where `forces` left planes or here; flags: a vertex
+        has used up its slack (0), there is such a pair (2)."""
+        own = dict(body="ints", marked="ints", flags="ints", frame="vectors", farthest="scalars", near="ints")
+        own |= dict(before="vectors", built="vectors", slack="vectors")
+        numbers = dict.fromkeys(
+            ("num_bodies", "markers", "body_block", "body_blocks", "blocks", "size", "number"), "int"
+        )
+        numbers |= dict(lost="float")
+        return self.kernel("find", self.find_all, dict(u="vectors2"), own, **numbers)
+
+    @ti.func
     def measure(self, kind: A, p, scene: A):
         """Distance at rest of pair p, D, its unit normal and the weights of the corners; far for two bodies."""
         one, two = scene.place[scene.pairs[4 * p]], scene.place[scene.pairs[4 * p + 2]]
@@ -143,6 +172,9 @@ class MotionKernels(ListedPair):
             n = r / ti.max(D, ti.cast(self.tiny, self.fp))
             plane, weights = self.vec4(n[0], n[1], n[2], D), w
         scene.rest_plane[p], scene.rest_weights[p] = plane, weights
+        if ti.static(self.mixed):
+            if scene.per_area[self.contact_of(p, scene)] == 0:
+                scene.area[p] = ti.cast(1, self.fp)
 
     @ti.func
     def begin_all(self, scene: A, at: A, plan: A):
@@ -158,4 +190,5 @@ class MotionKernels(ListedPair):
     @cached_property
     def begin(self) -> Kernel:
         """A new list: where the surface is, how far apart pairs are at rest, and no planes yet."""
-        return self.kernel("begin", self.begin_all, dict(u="vectors2"), dict(built="vectors", body="ints"))
+        own = dict(per_area="ints") if self.mixed else {}
+        return self.kernel("begin", self.begin_all, dict(u="vectors2"), dict(built="vectors", body="ints") | own)

@@ -9,10 +9,12 @@ from diffsim_ti import runtime
 from diffsim_ti.common.public import Public
 from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
 from diffsim_ti.mechanics.surfaces.buffers import branches, whole
-from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE
+from diffsim_ti.mechanics.surfaces.listed_pair import MANY, OPPOSITE
 from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
+from diffsim_ti.mechanics.surfaces.obstacle_corners import ContactNumbers, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
+from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.terms.obstacles.barrier import beta, curvature_at
@@ -39,7 +41,8 @@ class Overlap(ValueError):
 
 
 class SurfacePairs:
-    """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py).
+    """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py), or with obstacles that act by
+    pairs, whose corners are vertices of the surface too (obstacle_corners.py).
 
     The list holds all pairs that were within the width and the slacks of their vertices when it was made, and holds good
     until a vertex has used up one of its two slacks: the one towards its own body by moving relative to that body, the one
@@ -59,17 +62,20 @@ class SurfacePairs:
 
     def __init__(self, arrays, parallel: bool):
         self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
-        self.mesh, self.first, self.parallel = mesh, arrays.parameters_of_self_contact.start, parallel
+        self.kinematic = mesh if isinstance(mesh, SurfaceWithObstacles) else None
+        self.contacts = ContactNumbers(mesh, arrays) if self.kinematic else None
+        self.mesh, self.parallel = mesh, parallel
+        self.first = MANY if self.kinematic else arrays.parameters_of_self_contact.start
         self.kernels = kernels_of(PairKernels, arrays.precision, self.first, parallel)
         self.motion = kernels_of(MotionKernels, arrays.precision, self.first, parallel)
-        edges = surface_edges(mesh)
+        edges = mesh.edges if self.kinematic else surface_edges(mesh)
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
         self.edges, self.term = edges, term
         self.body = np.full(mesh.num_vertices, -1)
-        self.body[mesh.surface_vertices] = np.unique(pieces(mesh)[mesh.surface_vertices], return_inverse=True)[1]
-        self.list = CandidatePairs(
-            mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body, arrays.precision, parallel
-        )
+        body = mesh.pieces() if self.kinematic else pieces(mesh)
+        self.body[mesh.surface_vertices] = np.unique(body[mesh.surface_vertices], return_inverse=True)[1]
+        surface = mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body
+        self.list = CandidatePairs(*surface, arrays.precision, parallel, self.kinematic)
         self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vec4
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
@@ -77,42 +83,58 @@ class SurfacePairs:
         self.num_bodies, self.marked = len(marked), runtime.upload(marked.ravel(), ti.i32)
         bodies, blocks = branches(self.num_bodies), -(-n // BLOCK)
         upper = branches(blocks)
-        self._sums = dict(body_block=bodies["size"], body_blocks=bodies["number"], blocks=blocks, **upper)
+        self.sizes_of_sums = dict(body_block=bodies["size"], body_blocks=bodies["number"], blocks=blocks, **upper)
         self.frame = runtime.array(vector, self.num_bodies + 2 + 2 * bodies["number"])
         self.farthest = runtime.array(self.kernels.fp, 1 + blocks + upper["number"])
         self.touched = runtime.array(ti.i32, n)
         self.fresh, self.age, self.builds = False, 0, 0
         self._checked_rest = self._scratch = None
-        self.friction = self.friction_kind(self) if term.has_friction else None
+        has_friction = len(self.contacts.mu) > 0 if self.kinematic else term.has_friction
+        self.friction = self.friction_kind(self) if has_friction else None
+
+    def _number(self, place: int) -> float:
+        return float(self.a.values.parameters[self.a.parameters_of_self_contact.start + place])
 
     @property
     def width(self) -> float:
-        return float(self.a.values.parameters[self.first + SelfContact.index.width])
+        """The width [m] of pairs of bodies; without these the largest."""
+        return self._number(SelfContact.index.width) if self.term else float(self.contacts.widths[1:].max())
 
     @property
-    def stiffness(self) -> float:
-        return float(self.a.values.parameters[self.first + SelfContact.index.stiffness])
+    def least_width(self) -> float:
+        if not self.kinematic:
+            return self.width
+        return float(self.contacts.widths[0 if self.term else 1 :].min())
+
+    def _stiffness_and_width(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of pairs of the list, without their shares."""
+        own, values = PairNumbers(self).of(np.arange(len(pairs)), pairs), self.a.values.parameters
+        return own.area * values[own.stiffness], values[own.width]
 
     def load(self, u) -> None:
         """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""
         self.fresh = False
+        if self.kinematic:
+            self.contacts.load(self.a.values.parameters)
         checked = (self.a.values.rest, self.width)
         if self._checked_rest is None or self._checked_rest[0] is not checked[0] or self._checked_rest[1] != checked[1]:
             rest_state = runtime.array(self.kernels.vec4, 1, self.a.num_vertices)
             runtime.fill(rest_state, 0)
             self._check_rest(rest_state)
             self._checked_rest = checked
-        self._build(u, 0)
+        self.build(u, 0)
         self.check_apart(u)
 
     def _check_rest(self, u) -> None:
+        if not self.term:
+            return
         largest = self.most_edges * self.list.typical
         if self.width > largest:
             raise ValueError(
                 f"self-contact of width {self.width:.3g} m: more than {self.most_edges:g} times the mean edge of the "
                 f"surface, so that most of its pairs would be near at rest; take a width below {largest:.3g} m"
             )
-        self._build(u, 0)
+        self.build(u, 0)
         plane = whole(self.rest_plane)[: self.list.count]
         if plane.size and not plane[:, 3].min() > 0:
             worst, pairs = plane[:, 3].argmin(), runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
@@ -124,13 +146,12 @@ class SurfacePairs:
     def check_apart(self, u) -> None:
         """Raise Overlap if surfaces touch or pass through each other at u[0]."""
         if not self.fresh or self.age:
-            self._build(u, 0)
+            self.build(u, 0)
         found = self.list.first_piercing(self.a.rest, u, 0)
         if found:
-            edge, triangle = self.edges[found[0]], self.mesh.surface_triangles[found[1]]
+            edge, triangle = self._part("edge", self.edges[found[0]]), self.mesh.surface_triangles[found[1]]
             raise Overlap(
-                f"surfaces pass through each other: edge {_numbers(edge)} and triangle {_numbers(triangle)}; "
-                "move the bodies apart"
+                f"surfaces pass through each other: {edge} and triangle {_numbers(triangle)}; move the bodies apart"
             )
         gaps, pairs = self._distances(u)
         if gaps.size and not gaps.min() > 0:
@@ -140,21 +161,26 @@ class SurfacePairs:
     def forget(self, u) -> None:
         """The state was set from outside."""
         self.age = 0
-        self._build(u, 0)
+        self.build(u, 0)
         self.check_apart(u)
+
+    obstacles = None  # whose corners are vertices of the surface: of pairs with vertices that no node gives
+
+    def follow(self, rows: np.ndarray, m: int) -> None:
+        """Obstacles are where rows of poses say."""
 
     def run(self, kernel, at: dict, *more, **numbers) -> None:
         """Launch a kernel of pairs, with the arrays `at`, and `more` of the scene."""
-        k, a = self.list, self.a
+        k, a, mine = self.list, self.a, (self.contacts,) if self.kinematic else ()
         numbers |= dict(num_surface=k.num_surface, first_out=a.first_contact_corner)
-        scene = *more, k, self, SimpleNamespace(rest=a.rest, parameters=a.parameters)
+        scene = *more, k, self, *mine, SimpleNamespace(rest=a.rest, parameters=a.parameters)
         self._launch(kernel, scene=scene, at=SimpleNamespace(**at))(
             **dict(num_vt=k.num_vt, num_pairs=k.count) | numbers
         )
 
     # ---- the list ---------------------------------------------------------------------------------------------------
 
-    def _build(self, u, slot: int, wanted=0.0) -> None:
+    def build(self, u, slot: int, wanted=0.0) -> None:
         """The list at u[slot]; slacks follow the motion, or cover `wanted`, shape (n, 2) [m]."""
         x = runtime.fetch(u, slot)[self.mesh.surface_vertices]
         if not np.all(np.isfinite(x)):  # the guard of the run will say so
@@ -176,8 +202,11 @@ class SurfacePairs:
         """Slacks [m] of the surface vertices towards their own body and others, shape (n, 4), for displacements x."""
         slack, least = np.zeros((len(x), 4)), self.least_slack * self.width
         slack[:, :2] = wanted
+        if self.kinematic:
+            own = self.kinematic.owner
+            slack[:, 2] = np.where(own > 0, np.maximum(self.contacts.reach[own] - self.width, 0), 0)
         if self.fresh and self.age:
-            overall, last = self._travel(x - runtime.fetch(self.built)), self._travel(x - runtime.fetch(self.before))
+            overall, last = self.travel(x - runtime.fetch(self.built)), self.travel(x - runtime.fetch(self.before))
             pace = np.maximum(overall / self.age, last)
             pace += pace.mean(0)  # the mean, for what will be hit
             passes = self.typical_slack * self.width / max(float(np.median(pace.max(1))), 1e-300)
@@ -188,7 +217,7 @@ class SurfacePairs:
             slack[:, k] = slack[:, k].clip(least, max(least, 0.5 * (largest * self.list.typical - self.width)))
         return slack
 
-    def _travel(self, move: np.ndarray) -> np.ndarray:
+    def travel(self, move: np.ndarray) -> np.ndarray:
         """Lengths of surface vertices' motions relative to their body's and to the mean of all, shape (n, 2)."""
         frame = move[runtime.fetch(self.marked).reshape(self.num_bodies, -1)].mean(1)
         origins = frame[self.body[self.mesh.surface_vertices]], frame.mean(0)
@@ -198,9 +227,11 @@ class SurfacePairs:
         """Let go of the arrays that forces were computed from."""
         self._launch.clear()
 
-    def _check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
+    def check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
-        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width, **self._sums)
+        bodies = dict(
+            num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.least_width, **self.sizes_of_sums
+        )
         self.run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_pairs=num_pairs, **bodies)
         flags = runtime.view(self.flags)
         stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
@@ -208,18 +239,18 @@ class SurfacePairs:
 
     def ensure(self, u, slot: int) -> None:
         """Make the list anew if it does not hold at u[slot]."""
-        if not self.fresh or self._check(u, slot, 0, 0)[0]:
+        if not self.fresh or self.check(u, slot, 0, 0)[0]:
             self.age = 0  # a jump says nothing of the pace
-            self._build(u, slot)
+            self.build(u, slot)
 
     def check_pass(self, u, slot: int, h: float) -> None:
         """After a pass of length h [s] to u[slot]: raise Tunnelling if a pair may have crossed."""
         self.age += 1
-        stale, lost, crossed = self._check(u, slot, self.list.num_vt, self.list.count)
+        stale, lost, crossed = self.check(u, slot, self.list.num_vt, self.list.count)
         if (lost or crossed) and np.all(np.isfinite(runtime.fetch(u, slot))):
             self._refuse(runtime.fetch_row(u, slot), h, crossed)
         if stale:
-            self._build(u, slot)
+            self.build(u, slot)
 
     def _refuse(self, u: np.ndarray, h: float, crossed: bool) -> None:
         surface = self.mesh.surface_vertices
@@ -228,11 +259,17 @@ class SurfacePairs:
         self.fresh = False
         pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
         plane = whole(self.plane)[: self.list.count].astype(np.float64)
+        closing = np.full(len(pairs), -np.inf)
+        for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
+            for a, b in OPPOSITE[kind]:
+                change = ((moved[pairs[part, b]] - moved[pairs[part, a]]) * plane[part, :3]).sum(1)
+                closing[part] = np.maximum(closing[part], change)
         fastest = self._fastest(plane[:, 3], pairs)
-        stiffness, enough = self._resolved(moved[surface] / h, h, fastest)
+        worst = int((closing - plane[:, 3]).argmax()) if len(pairs) else None
+        stiffness, enough = self._resolved(moved[surface] / h, h, fastest, worst, pairs)
         remedy = f"take substeps of {enough:.3g} s"
         if stiffness is not None:
-            remedy = f"no step stops them: raise the contact's stiffness to {stiffness:.3g} N/m and {remedy}"
+            remedy = f"no step stops them: raise {self._stiffer(stiffness, worst, pairs)} and {remedy}"
         elif fastest * h > 1:
             remedy = f"contact at {fastest:.3g} rad/s is too stiff for it: {remedy}"
         if not crossed:
@@ -244,12 +281,6 @@ class SurfacePairs:
             )
             error.stable_dt, error.stiffness = enough, stiffness
             raise error
-        closing = np.full(len(pairs), -np.inf)
-        for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
-            for a, b in OPPOSITE[kind]:
-                change = ((moved[pairs[part, b]] - moved[pairs[part, a]]) * plane[part, :3]).sum(1)
-                closing[part] = np.maximum(closing[part], change)
-        worst = int((closing - plane[:, 3]).argmax())
         error = Tunnelling(
             f"{self._name(worst, pairs)} may have gone through each other: their gap was {plane[worst, 3]:.3g} m, and they "
             f"closed by {closing[worst]:.3g} m ({closing[worst] / h:.3g} m/s) in one substep of {h:.3g} s; {remedy}"
@@ -257,7 +288,7 @@ class SurfacePairs:
         error.stable_dt, error.stiffness = enough, stiffness
         raise error
 
-    def _resolved(self, v: np.ndarray, h: float, fastest: float) -> tuple[float | None, float]:
+    def _resolved(self, v: np.ndarray, h: float, fastest: float, worst, pairs) -> tuple[float | None, float]:
         """(stiffness [N/m] that stops surface vertices of velocities v [m/s], None if the present one does; a substep [s]).
 
         The barrier k w^2 beta(s) of a pair takes HELD times m V^2 / 2, m the heaviest vertex, V how fast they meet: of all
@@ -272,7 +303,9 @@ class SurfacePairs:
         start = float(np.linalg.norm(start - start.mean(0), axis=1).max(initial=0))
         own = frames if fastest * h > 1 and len(frames) > 1 else v
         speed = max(2 * start, 2 * float(np.linalg.norm(own - own.mean(0), axis=1).max(initial=0)), 1e-300)
-        k, w, energy = self.stiffness, self.width, 0.5 * HELD * mass * speed**2
+        k, w = self._stiffness_and_width(pairs)
+        k, w = (float(x[worst]) for x in (k, w)) if worst is not None else (1.0, self.width)
+        energy = 0.5 * HELD * mass * speed**2
         shares = np.geomspace(0.02, 1, 400)
         s, stiffness = float(np.interp(-energy / (k * w * w), -beta(shares), shares)), None
         if energy > k * w * w * beta(0.02):
@@ -280,19 +313,40 @@ class SurfacePairs:
         omega = np.sqrt((stiffness or k) * light * curvature_at(s))
         return stiffness, float(min(0.5 / max(omega, 1e-300), 0.1 * w / speed, 0.5 * h))
 
+    def _stiffer(self, stiffness: float, worst, pairs: np.ndarray) -> str:
+        """In words, the number that gives the worst pair a stiffness [N/m]."""
+        number = int(self.kinematic.numbers[pairs[worst][[0, 2]]].max()) if self.kinematic and worst is not None else 0
+        if not number:
+            return f"the contact's stiffness to {stiffness:.3g} N/m"
+        part = self.kinematic.corners.parts[number - 1]
+        if not part.force.per_area:
+            return f"the stiffness of {part.term!r} to {stiffness:.3g} N/m"
+        area = float(whole(self.list.area)[worst])
+        return f"the stiffness_per_area of {part.term!r} to {stiffness / area:.3g} N/m^3"
+
     def _fastest(self, gaps: np.ndarray, pairs: np.ndarray) -> float:
         """A frequency [rad/s] of pairs that press, of the lightest vertex against the stiffest pair."""
         at_rest = whole(self.rest_plane)[: self.list.count, 3].astype(np.float64)
-        share = np.minimum(1, at_rest / (2 * self.width))  # listed_pair.py
-        stiffness = self.stiffness / share * curvature_at(gaps / (share * self.width))
+        k, width = self._stiffness_and_width(pairs)
+        share = np.minimum(1, at_rest / (2 * width))  # listed_pair.py
+        stiffness = k / share * curvature_at(gaps / (share * width))
         lightness = runtime.fetch(self.a.inverse_mass).astype(np.float64)[pairs].max(1)
         return float(np.sqrt((stiffness * lightness).max(initial=0)))
 
     def _name(self, pair: int, pairs: np.ndarray) -> str:
         c = pairs[pair]
         if pair < self.list.num_vt:
-            return f"vertex {c[0]} and triangle {_numbers(c[1:])}"
+            return f"{self._part('vertex', c[:1])} and triangle {_numbers(c[1:])}"
+        if self.kinematic and self.kinematic.name(c[2]):
+            return f"edge {_numbers(c[:2])} and {self._part('edge', c[2:])}"
         return f"edges {_numbers(c[:2])} and {_numbers(c[2:])}"
+
+    def _part(self, kind: str, corners: np.ndarray) -> str:
+        """A vertex or an edge in words."""
+        obstacle = self.kinematic.name(corners[0]) if self.kinematic else None
+        if obstacle is None:
+            return f"{kind} {_numbers(corners) if len(corners) > 1 else corners[0]}"
+        return f"an edge of {obstacle!r}" if len(corners) > 1 else f"a point of {obstacle!r}"
 
     # ---- forces -----------------------------------------------------------------------------------------------------
 
@@ -300,14 +354,20 @@ class SurfacePairs:
         """Contact forces at u[slot], to the last corners of `out`."""
         self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
 
-    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0), has_planes=False) -> None:
-        """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width).
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False, only=None) -> None:
+        """Change of the contact forces for changes w[0] of the positions (and of the rest shape and all parameters).
 
-        has_planes: `forces` were last computed at u[slot].
+        has_planes: `forces` were last computed at u[slot]. only: of the pairs of one contact.
         """
         at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
-        numbers = dict(zip(("d_stiffness", "d_width"), parameters_dot))
-        numbers |= dict(by_rest=int(rest_dot is not None), has_planes=int(has_planes))
+        numbers = dict(d_stiffness=0.0, d_width=0.0, by_rest=int(rest_dot is not None), has_planes=int(has_planes))
+        if self.kinematic:
+            self.contacts.load_change(self.a.values.parameters, parameters_dot)
+            at |= dict(numbers_dot=self.contacts.numbers_dot)
+            numbers |= dict(only=-1 if only is None else only)
+        elif parameters_dot is not None:
+            change = parameters_dot[self.a.parameters_of_self_contact][:2]
+            numbers |= dict(zip(("d_stiffness", "d_width"), map(float, change)))
         self.run(self.kernels.products, at, slot=slot, **numbers)
 
     def clear_sums(self) -> None:
@@ -317,18 +377,23 @@ class SurfacePairs:
         if self.friction:
             self.friction.clear_sums()
 
-    def vjp(self, u, slot: int, w, out) -> None:
+    def vjp(self, u, slot: int, w, out, only: int | None = None) -> None:
         """The product with the adjoint w[0] of the forces; adds the adjoints of stiffness, width and rest shape."""
-        self.product(u, slot, w, out)
+        self.product(u, slot, w, out, only=only)
         self.run(self.kernels.add_sums, dict(out=out), slot=slot)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of (stiffness, width, those of friction) and of the rest shape, (num_vertices, 3), by the forces alone;
-        float64."""
-        rest = np.zeros((self.mesh.num_vertices, 3))
+        """Adjoints of all parameters and of the rest shape, (num_vertices, 3), by the forces and friction; float64."""
+        rest, out = np.zeros((self.mesh.num_vertices, 3)), np.zeros_like(self.a.values.parameters)
         rest[self.mesh.surface_vertices] = runtime.fetch(self.rest_adj)
-        numbers = whole(self.sums).astype(np.float64).sum(0)[:2]
-        return np.concatenate([numbers, self.friction.collect()]) if self.friction else numbers, rest
+        sums = whole(self.sums).astype(np.float64)
+        if self.kinematic:
+            self.contacts.collect(self.a.values.parameters, sums[: len(self.mesh.surface_vertices)], out)
+        else:
+            out[self.a.parameters_of_self_contact][:2] = sums.sum(0)[:2]
+        if self.friction:
+            self.friction.collect(out)
+        return out, rest
 
     # ---- to look at -------------------------------------------------------------------------------------------------
 

@@ -68,6 +68,8 @@ class ExplicitSolver(Solver):
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
         are `reduced` take obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
+        SelfContact acts likewise: as a stage in parts of each pass (surfaces/contact_stage.py), which keeps surfaces apart
+        whatever its stiffness, with friction in it; as a force by "force" and in scenes with reduced sets.
         In both, what is narrower than faces acts on points within them in a stage of its own, which integrates the pass
         again in as many parts as barrier and speed ask for (explicit_face_kernels.py), and then friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
@@ -114,6 +116,7 @@ class ExplicitSolver(Solver):
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
         alone = (
             self.scene.term(SelfContact)
+            or any(term.primitives is not None for term in self.scene.terms)
             or has_face_contact(self.scene)
             or any(x.apart for x in self.scene.interactions)
             or self.scene.reduced
@@ -185,8 +188,19 @@ class ExplicitWorkspace(Workspace):
         self.check_apart()
 
     @property
+    def stages_pairs(self) -> bool:
+        return bool(self.pairs) and self.solver.stages_contact and not self.scene.reduced
+
+    @property
     def has_unnoted_work(self) -> bool:
-        """Whether forces without an energy act vertex by vertex, whose work passes do not note."""
+        """Whether forces without an energy act vertex by vertex, or obstacles that move by pairs, whose work passes do not
+        note."""
+        if (
+            self.pairs
+            and self.pairs.obstacles
+            and any(x.term.path is not None for x in self.pairs.obstacles.corners.parts)
+        ):
+            return True
         on_host = (x for x in self.scene.interactions if x.on_host)
         return any(x.in_kernels and not len(x.vertices) and not f.has_energy for x, f in zip(on_host, self.hosts))
 

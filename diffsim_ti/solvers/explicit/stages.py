@@ -7,6 +7,7 @@ from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
 from diffsim_ti.mechanics.obstacles.face_contact_derivatives import FaceContactAdjoint, FaceContactTangent
 from diffsim_ti.mechanics.obstacles.face_contact_points import FaceContactPoints
 from diffsim_ti.mechanics.stage import Passes, Stage
+from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.stages import SurfaceForces, SurfaceFriction
 
 # stages whose tangents and adjoints have buffers: what makes these of them for a run
@@ -46,8 +47,11 @@ class KickDrift(Stage):
 
 def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
-    forces = SurfaceForces(ws.pairs) if ws.pairs else None
-    friction = SurfaceFriction(ws.pairs) if ws.pairs and ws.pairs.friction else None
+    forces = friction = None
+    if ws.stages_pairs:
+        forces = PairContact(ws.pairs, ws.solver.contact_damping)
+    elif ws.pairs:
+        forces, friction = SurfaceForces(ws.pairs), SurfaceFriction(ws.pairs) if ws.pairs.friction else None
     every = forces, ws.volumes, friction, ws.chambers, ws.faces, KickDrift()
     return [stage for stage in every if stage]
 

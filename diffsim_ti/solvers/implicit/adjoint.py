@@ -128,16 +128,18 @@ class ImplicitAdjoint(RecordedPasses):
         self.p = self.p + runtime.fetch_row(self._law.y, 0)
 
     def _pull_back_contacts(self, j: int, save_every: int) -> tuple[tuple | None, tuple | None]:
-        """Adjoints of what the forces of obstacles in pass j depend on (SharesAdjoint), and friction between surfaces
-        (LaggedFriction.vjp), where a loss names them."""
+        """Adjoints of what the forces of obstacles in pass j depend on (SharesAdjoint), and of what pairs do
+        (LaggedFriction.vjp, PairShares.vjp), where a loss names them."""
         seed, friction = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else (None, None)
         seen = None if seed is None else self._shares.pull_back(seed)
-        if friction is None:
-            return seen, None
-        p = self.potential
-        from_friction = p.surface_friction.vjp(p.held_at, friction)
-        p.place(self.u_star)
-        return seen, from_friction
+        p, by_pairs, found = self.potential, self.ws.pair_shares, []
+        if by_pairs and seed is not None:
+            found.append(by_pairs.vjp(seed))
+        if friction is not None:
+            found.append(np.array(p.surface_friction.vjp(p.held_at, friction, 0 if by_pairs else None)))
+        if found:
+            p.place(self.u_star)
+        return seen, tuple(sum(found)) if found else None
 
     def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
@@ -194,7 +196,10 @@ class ImplicitAdjoint(RecordedPasses):
             by_lag = by_lag + by_place
         if self.path is not None:
             by_poses = runtime.fetch(self.poses).astype(np.float64).sum(1)
-            ws.collisions.vjp(by_poses + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
+            by_poses = by_poses + by_begin + (0.0 if seen is None else seen[3])
+            if ws.pairs and ws.pairs.obstacles:
+                by_poses = by_poses + ws.pairs.obstacles.take_rows()
+            ws.collisions.vjp(by_poses, j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
         self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()
@@ -270,7 +275,8 @@ class ImplicitAdjoint(RecordedPasses):
             out.parameters[features.drag] = self.rate
         rest = self.frames[0].sum(0)
         if self.ws.pairs:
-            out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()
+            by_parameters, by_pairs = self.ws.pairs.collect()
+            out.parameters += by_parameters
             rest = rest + by_pairs
         if self.ws.potential.faces and features.areas:
             by_areas = runtime.fetch(self.face_areas).astype(np.float64)

@@ -69,9 +69,11 @@ class ImplicitTangent(RecordedPasses):
         held = ws.with_frozen(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
         if ws.rigid:
             held = ws.rigid.held_jvp(held, self.du, tangent.rest)
+        poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
+        of_obstacles = dict(poses_dot=poses) if ws.pairs and ws.pairs.obstacles else {}
         if surface_friction:
-            from_friction = surface_friction.jvp(ws.potential.held_at, held, dx, self.du, self.numbers)
+            from_friction = surface_friction.jvp(ws.potential.held_at, held, dx, self.du, self.numbers, **of_obstacles)
             ws.potential.place(self.u_star)
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
@@ -79,7 +81,6 @@ class ImplicitTangent(RecordedPasses):
         if tangent.growths is not None:
             moved = ws.growth_of(tangent.growths, j, s)
             runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
-        poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
         if poses is not None:
             runtime.fill(self.poses, poses)
         if self._presses:
@@ -87,14 +88,8 @@ class ImplicitTangent(RecordedPasses):
         if ws.strains:
             ws.strains.jvp(s, (self.u, self.du), (self.before, self.tangent_before), self)
         if ws.pairs:
-            ws.pairs.product(
-                ws.potential.u,
-                0,
-                ws.potential.w,
-                a.corner,
-                self.numbers.rest,
-                tangent.parameters[a.parameters_of_self_contact],
-            )
+            moved = self.numbers.rest, tangent.parameters
+            ws.pairs.product(ws.potential.u, 0, ws.potential.w, a.corner, *moved, **of_obstacles)
         self._jvp(**ws.potential.sizes())
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + self.mass_dot * self.weight(share)
@@ -114,7 +109,7 @@ class ImplicitTangent(RecordedPasses):
             self.chamber_record.note(j, save_every, change)
         d_star = held + d_star
         if self.contacts:
-            self._note_contacts(j, save_every, d_star, dx)
+            self._note_contacts(j, save_every, d_star, dx, poses)
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
@@ -124,13 +119,20 @@ class ImplicitTangent(RecordedPasses):
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before
 
-    def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray, dx: np.ndarray) -> None:
+    def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray, dx: np.ndarray, poses) -> None:
         """Change of the forces of obstacles, and of friction between surfaces, in pass j, u* changing by d_star."""
         p = self.ws.potential
         runtime.fill(p.w, d_star[None])
         record = dict(tangent=(SimpleNamespace(lag=self.lag, poses=self.poses, pressed=self.pressed), self.numbers))
-        friction = lambda: p.surface_friction.jvp(p.held_at, d_star, dx, self.du, self.numbers)  # noqa: E731
-        self.contacts.add(j, save_every, self.stage.static, lambda: self._shares.forces("jvp", **record), friction)
+        along, by_pairs = (d_star, dx, self.du, self.numbers), self.ws.pair_shares
+        of_bodies = dict(poses_dot=poses, only=0) if by_pairs else {}
+
+        def change():
+            out = self._shares.forces("jvp", **record)
+            return out + by_pairs.jvp(*along, self.tangent.parameters, poses) if by_pairs else out
+
+        friction = lambda: p.surface_friction.jvp(p.held_at, *along, **of_bodies)  # noqa: E731
+        self.contacts.add(j, save_every, self.stage.static, change, friction)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""

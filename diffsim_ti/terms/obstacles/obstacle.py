@@ -13,6 +13,7 @@ from diffsim_ti.terms.described import chosen_width, place, positive
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
+from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.terms.obstacles.stiffness import approach, over_time, pressed_by, stiffness_of_impact
 from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_path
@@ -59,6 +60,12 @@ class Obstacle(Term):
     the obstacle as it was made to c + t + R (x - c), with constant angular velocity between keyframes and within steps.
     Quaternions take the short way; rotation vectors on one axis keep their turns, less than one in a step.
     about [m]: the point c.
+    by_pairs: whether a ball, capsule or box acts on faces and edges of bodies between their vertices as bodies act on each
+    other, exactly: a ball's centre on triangles, at the distance less the radius; of a capsule its axis on edges and its
+    ends on triangles, of a box its twelve edges and eight corners. Energy of a pair as of a vertex, m b(d) with m of
+    `SelfContact`; the stiffness per area is multiplied by the triangle's area in the mesh, or by a third of that of the
+    triangles at the edge. Mesh obstacles always do so with what is sharp of them. Otherwise points within faces feel what
+    is narrower than these.
 
     Inputs with gradient: the shape's own numbers, "barrier_stiffness_per_area" or "barrier_stiffness", "barrier_width",
     with friction also "friction" and "friction_speed", with a path "<shape>_path", shape (steps + 1, 3), of a pose
@@ -76,6 +83,7 @@ class Obstacle(Term):
 
     acts_on_surface = True
     counterpart: type  # the device counterpart of the shape
+    all_primitives: "Primitives | None" = None  # of the shape
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -94,7 +102,13 @@ class Obstacle(Term):
         name: str | None = None,
         stiffness_per_area: float | None = None,
         about: ArrayLike | None = None,
+        by_pairs: bool = False,
     ):
+        self.by_pairs = bool(by_pairs)
+        if self.by_pairs and self.all_primitives is None:
+            raise ValueError(
+                f"{type(self).__name__}: by_pairs is for shapes of points and edges, and this one has none: leave it out"
+            )
         if isinstance(shape, dict):  # {name: value}, with nothing more to say of them
             shape = [Input(plain, value) for plain, value in shape.items()]
         stiff = self._stiffness(stiffness, stiffness_per_area)
@@ -154,6 +168,11 @@ class Obstacle(Term):
     def about(self) -> np.ndarray:
         """The point that it turns about [m], as it was made."""
         return self.values[self.about_name] if self.turns else np.zeros(3)
+
+    @property
+    def primitives(self) -> "Primitives | None":
+        """By which it acts on faces and edges of bodies; None where by its distance alone."""
+        return self.all_primitives if self.by_pairs else None
 
     @property
     def has_friction(self) -> bool:
@@ -246,7 +265,7 @@ class Obstacle(Term):
 
     @property
     def variant(self) -> tuple:
-        return self.has_friction, self.path is not None, self.per_area, self.turns
+        return self.has_friction, self.path is not None, self.per_area, self.turns, self.by_pairs
 
     def kernel(self, precision: str) -> ObstacleForce:
         return self.counterpart(precision, self.has_friction)

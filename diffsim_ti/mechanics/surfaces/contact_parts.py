@@ -1,0 +1,385 @@
+"""Contact of near pairs in a part of an explicit pass, on the host in float64: what the contact stage of pairs repeats.
+
+In a part of length h nodes of mass m would move by f = alpha v, points x = C X with them (curved_pairs.py; C = 1 where faces
+are flat). Pair p presses along its normal n_p with its weights w_p, B = w C, from a distance d_p to
+
+    y_p = d_p + n_p . B z,    z = f + alpha (1 + c) / 2 delta,    delta = (h / m) sum_p P_p B_p^T n_p,
+
+P the push of secant.py: one convex problem for all pairs, so that there is one z. Then the velocity gains delta, and what
+friction takes (friction_kernels.py) with the normal forces P, and nodes drift by alpha (v + (1 + c) / 2 delta + friction).
+Impulses of a pair sum up to zero, so that momentum is kept to round-off. Angular momentum is, too, with normals and weights
+taken where f has gone the share (1 - c) / 2, for X + that share of f is where delta acts; they are taken at the beginning
+where c = 1.
+
+Beneath WALL of its width a pair meets a second barrier of stiffness (mean mass) / h^2, whose push is of the end alone and
+stops what comes at a width in h: as stiff as the part can feel, and without effect on what is as far apart as contact should
+be. So surfaces stay apart whatever the stiffness, and what it cannot hold is lost as in an inelastic impact.
+"""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from diffsim_ti.mechanics.surfaces import host_geometry as geometry
+from diffsim_ti.mechanics.surfaces.host_geometry import TINY, dot
+from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE
+from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
+
+WALL = 1e-3  # share of the width
+MOST_ROUNDS = 60
+DENSE = 1000  # unknowns up to which a dense matrix is factored
+SURE = 1e-9  # relative change of distances at which Newton's method takes its last step
+
+
+@dataclass
+class NearPairs:
+    """What does not change in a pass: corners (pairs, 4) among the points, which are of edges, their scale (proximity.py);
+    C (points, nodes) or None, what nodes may do (nodes, 3, 3) or None."""
+
+    corners: np.ndarray
+    edges: np.ndarray
+    scale: np.ndarray
+    num_points: int
+    C: object
+    free: np.ndarray | None
+
+    def points(self, nodes: np.ndarray) -> np.ndarray:
+        return nodes if self.C is None else self.C @ nodes
+
+    def nodes(self, points: np.ndarray) -> np.ndarray:
+        return points if self.C is None else self.C.T @ points
+
+    def freed(self, x: np.ndarray) -> np.ndarray:
+        return x if self.free is None else np.einsum("nij,nj->ni", self.free, x)
+
+    def relative(self, points: np.ndarray) -> np.ndarray:
+        """Of corners 1 to 3 relative to corner 0."""
+        at = points[self.corners]
+        return at[:, 1:] - at[:, :1]
+
+    def scattered(self, at_corners: np.ndarray) -> np.ndarray:
+        """Sums at the points of vectors of corners, (pairs, 4, 3)."""
+        out = np.zeros((self.num_points, 3))
+        np.add.at(out, self.corners, at_corners)
+        return out
+
+    def weighed(self, w: np.ndarray):
+        """B, (pairs, nodes), CSR."""
+        from scipy.sparse import csr_matrix
+
+        count = len(self.corners)
+        out = csr_matrix((w.ravel(), self.corners.ravel(), 4 * np.arange(count + 1)), (count, self.num_points))
+        return out if self.C is None else (out @ self.C).tocsr()
+
+    def parted(self, normals: np.ndarray, *places: np.ndarray) -> np.ndarray:
+        """The smallest distance along the normals of corners of different primitives, at the worst of some places."""
+        out = np.full(len(normals), np.inf)
+        for x in places:
+            for kind, pairs in enumerate((~self.edges, self.edges)):
+                heights = dot(normals[pairs, None], x[self.corners[pairs]])
+                for a, b in OPPOSITE[kind]:
+                    out[pairs] = np.minimum(out[pairs], heights[:, a] - heights[:, b])
+        return out
+
+
+@dataclass
+class Part:
+    """Part `begin` .. `begin + share` of a pass; c: its damping; e, b: what contact has added to displacements and
+    velocities before it; xi: its solution."""
+
+    begin: float
+    share: float
+    c: float
+    e: np.ndarray
+    b: np.ndarray
+    xi: np.ndarray | None = None
+
+    @property
+    def theta(self) -> float:
+        """The share of the free motion after which normals are taken."""
+        return 0.5 * (1 - self.c)
+
+
+class PartSolver:
+    """Takes parts of a pass; `of`, its numbers, has x, motion (nodes, 3): where nodes are, how they move without contact;
+    inverse (nodes,): 1 / mass; stiffness, width, radius, mu, speed (pairs,); wall; h, alpha; seeds: adjoints of `impulses`,
+    (which pairs, of push, of friction)."""
+
+    def __init__(self, near: NearPairs):
+        self.near = near
+
+    # ---- forward -------------------------------------------------------------------------------------------------------
+
+    def look(self, part: Part, of) -> SimpleNamespace:
+        """Where pairs are, and how they would go."""
+        near, at = self.near, SimpleNamespace()
+        at.h, at.alpha = part.share * of.h, part.share * of.alpha
+        at.f = part.share * of.motion + at.alpha * part.b
+        at.X = of.x + part.begin * of.motion + part.e
+        at.points = near.points(at.X + part.theta * at.f)
+        at.y = near.relative(at.points)
+        at.w, at.r, at.g = geometry.nearest(at.y, near.edges)
+        at.d = np.sqrt(dot(at.r, at.r))
+        at.n = at.r / at.d[:, None]
+        at.m = geometry.fading(at.y, near.edges, near.scale)
+        at.B = near.weighed(at.w)
+        at.moved = at.B @ at.f
+        at.begin = at.d - of.radius - part.theta * dot(at.n, at.moved)
+        at.free = at.d - of.radius + (1 - part.theta) * dot(at.n, at.moved)
+        at.root = np.sqrt(at.alpha * 0.5 * (1 + part.c) * at.h * of.inverse)
+        return at
+
+    def pushes(self, part: Part, of, at, y):
+        """(P, its derivatives by d, y, width, and of width times the wall)"""
+        s, t, w = at.begin / of.width, y / of.width, of.width
+        p, by_s, by_t = geometry.push(s, t, part.c)
+        wall = of.wall / at.h**2
+        q, by_q = -geometry.slope(t / WALL), -geometry.curvature(t / WALL) / WALL
+        k = of.stiffness
+        P = at.m * w * (k * p + wall * q)
+        by_width = at.m * (k * (p - s * by_s - t * by_t) + wall * (q - t * by_q))
+        return P, at.m * k * by_s, at.m * (k * by_t + wall * by_q), by_width, p, q
+
+    def jacobian(self, part: Part, at):
+        """Rows n B, times the roots of alpha (1 + c) / 2 h / m, of what nodes may do."""
+        from scipy.sparse import csr_matrix
+
+        B, near = at.B, self.near
+        row = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
+        along = at.n[row] if near.free is None else np.einsum("pi,pij->pj", at.n[row], near.free[B.indices])
+        data = (B.data * at.root[B.indices])[:, None] * along
+        columns = 3 * B.indices[:, None] + np.arange(3)
+        return csr_matrix((data.ravel(), columns.ravel(), 3 * B.indptr), (B.shape[0], 3 * B.shape[1]))
+
+    @staticmethod
+    def inverse(J, K: np.ndarray):
+        """x to (1 + J^T K J)^-1 x."""
+        from scipy.sparse import diags
+        from scipy.sparse.linalg import splu
+
+        some = np.flatnonzero(K > 0)
+        if not some.size:
+            return lambda x: x
+        J = J[some]
+        own, columns = np.unique(J.indices, return_inverse=True)
+        J = type(J)((J.data, columns.ravel(), J.indptr), (some.size, own.size))
+        H = J.T @ diags(K[some]) @ J
+        if own.size <= DENSE:
+            H = H.toarray()
+            H[np.diag_indices(own.size)] += 1
+            factors = cho_factor(H, lower=True, overwrite_a=True, check_finite=False)
+            act = lambda x: cho_solve(factors, x, check_finite=False)  # noqa: E731
+        else:
+            H = (H + diags(np.ones(own.size))).tocsc()
+            act = splu(H, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True)).solve
+
+        def product(x):
+            out = x.copy()
+            out[own] = act(x[own])
+            return out
+
+        return product
+
+    def solve(self, part: Part, of, at) -> np.ndarray | None:
+        """xi, z - f over the roots, where pushes balance it; None where they are not found."""
+        J = self.jacobian(part, at)
+        xi = np.zeros(J.shape[1])
+        y = at.free
+        P, _, by_y = self.pushes(part, of, at, y)[:3]
+        for _ in range(MOST_ROUNDS):
+            r = xi - J.T @ P
+            if not r.any():
+                return xi
+            step = -self.inverse(J, -by_y)(r)
+            change, before, share = J @ step, -r @ step, 1.0
+            if np.all(np.abs(change) <= SURE * (np.abs(y) + np.abs(at.begin))):
+                return xi + step
+            change_xi = xi @ step, step @ step
+            while True:
+                y_next = y + share * change
+                P, _, by_y = self.pushes(part, of, at, y_next)[:3]
+                if change_xi[0] + share * change_xi[1] - P @ change <= 0.5 * before or share < 1e-9:
+                    break
+                share *= 0.5
+            xi, y = xi + share * step, y_next
+        return None
+
+    def take(self, part: Part, of, at) -> tuple[np.ndarray, np.ndarray]:
+        """(e, b) after the part, for its xi: at.P and others are noted. Of complex numbers xi follows what it is of."""
+        near = self.near
+        if np.iscomplexobj(at.free) or np.iscomplexobj(of.stiffness):
+            self._follow(part, of, at)
+        else:
+            at.zeta = at.root[:, None] * part.xi.reshape(-1, 3)
+            at.end = at.free + dot(at.n, at.B @ at.zeta)
+            at.P = self.pushes(part, of, at, at.end)[0]
+        at.pressed = at.B.T @ (at.P[:, None] * at.n)
+        at.delta = at.h * of.inverse[:, None] * near.freed(at.pressed)
+        at.rubbed = self._rub(part, of, at) if of.rough else 0 * at.delta
+        blend = 0.5 * (1 + part.c)
+        at.w_drift = part.b + blend * at.delta + at.rubbed
+        return part.e + at.alpha * at.w_drift, part.b + at.delta + at.rubbed
+
+    def impulses(self, at, own: np.ndarray, of) -> tuple[np.ndarray, np.ndarray]:
+        """What some pairs gave the nodes in a part that was taken [N s], by push and by friction."""
+        B = at.B[np.flatnonzero(own)]
+        pushed = at.h * (B.T @ (at.P[own, None] * at.n[own]))
+        rubbed = B.T @ at.impulse[own] if of.rough else 0 * pushed
+        return self.near.freed(pushed), self.near.freed(rubbed)
+
+    def _follow(self, part: Part, of, at) -> None:
+        real = SimpleNamespace(**{k: x.real if isinstance(x, np.ndarray) else x for k, x in vars(at).items()})
+        real.B, real.h, real.alpha = at.B.real, at.h, np.real(at.alpha)
+        own = SimpleNamespace(**{k: np.real(x) for k, x in vars(of).items()})
+        J, xi = self.jacobian(part, real), part.xi.reshape(-1, 3)
+        base = real.root[:, None] * xi
+
+        def residual(zeta):
+            at.end = at.free + dot(at.n, at.B @ zeta)
+            at.P = self.pushes(part, of, at, at.end)[0]
+            back = self.near.freed(at.B.T @ (at.P[:, None] * at.n))
+            return zeta - (at.root**2)[:, None] * back
+
+        by_y = self.pushes(part, own, real, real.free + dot(real.n, real.B @ base))[2]
+        # (1 + A J^T K J)^-1 of the change of the residual, in the roots' numbers: only the imaginary part is wanted
+        r = residual(base).imag
+        safe = np.where(real.root > 0, real.root, 1)[:, None]
+        change = -self.inverse(J, -by_y)((r / safe).ravel()).reshape(-1, 3) * real.root[:, None]
+        at.zeta = base + 1j * change
+        residual(at.zeta)
+
+    def _rub(self, part: Part, of, at) -> np.ndarray:
+        """What friction adds to velocities."""
+        near = self.near
+        at.V = of.motion / of.alpha + part.b
+        at.v = at.B @ at.V
+        across = dot(at.n, at.v)
+        at.t = at.v - across[:, None] * at.n
+        at.s = np.sqrt(dot(at.t, at.t))
+        at.load = of.mu * at.P
+        at.sizes = at.B.copy()
+        at.sizes.data = np.where(at.B.data.real < 0, -at.B.data, at.B.data)
+        at.S = at.sizes.T @ at.load
+        at.bound = at.h * (at.sizes @ (of.inverse * at.S))
+        at.kappa, at.share_of_mu, at.ratio, at.slip = slip(at.s, at.bound, of.speed, TINY, ARRAYS)
+        at.impulse = (-at.h * at.load * at.kappa)[:, None] * at.t
+        at.rub_sum = at.B.T @ at.impulse
+        return of.inverse[:, None] * near.freed(at.rub_sum)
+
+    # ---- adjoint -------------------------------------------------------------------------------------------------------
+
+    def back(self, part: Part, of, e_adj: np.ndarray, b_adj: np.ndarray, adj) -> tuple[np.ndarray, np.ndarray]:
+        """(adjoints of e, b before the part) for those after it; adds those of what `of` holds to `adj`."""
+        near, at = self.near, self.look(part, of)
+        self.take(part, of, at)
+        blend, inverse = 0.5 * (1 + part.c), of.inverse[:, None]
+        by_alpha = (e_adj * at.w_drift).sum()
+        e_prev, b_prev = e_adj.copy(), b_adj + at.alpha * e_adj
+        delta_adj, rub_adj = b_adj + at.alpha * blend * e_adj, b_adj + at.alpha * e_adj
+        by = SimpleNamespace(
+            w=np.zeros_like(at.w), n=np.zeros_like(at.n), d=0 * at.d, P=0 * at.d, m=0 * at.d, motion=0 * at.X
+        )
+        at_corners = lambda nodes: near.points(nodes)[near.corners]  # noqa: E731
+        if of.rough:
+            b_prev += self._rub_back(of, at, rub_adj, by, adj, at_corners)
+        # delta
+        freed = near.freed(delta_adj)
+        pulled = at.h * inverse * freed
+        Bq = at.B @ pulled
+        by.P += dot(at.n, Bq)
+        by.n += at.P[:, None] * Bq
+        by.w += at.P[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(pulled))
+        adj.inverse += at.h * dot(freed, at.pressed)
+        for own, pushed, _ in of.seeds:
+            q = at.h * near.freed(pushed)
+            Bq = own[:, None] * (at.B @ q)
+            by.P += dot(at.n, Bq)
+            by.n += at.P[:, None] * Bq
+            by.w += (own * at.P)[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(q))
+        # P at the solution
+        _, by_begin, by_y, by_width, p, q = self.pushes(part, of, at, at.end)
+        J = self.jacobian(part, at)
+        nu = at.root[:, None] * self.inverse(J, -by_y)(J.T @ (by_y * by.P)).reshape(-1, 3)
+        Bnu = at.B @ nu
+        of_nu = dot(nu, at.pressed)
+        adj.inverse += np.divide(of_nu, of.inverse, out=np.zeros_like(of_nu), where=of.inverse > 0)
+        by_alpha += of_nu.sum() / at.alpha
+        by.n += at.P[:, None] * Bnu
+        by.w += at.P[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(nu))
+        by.P += dot(at.n, Bnu)
+        y_adj, s_adj = by_y * by.P, by_begin * by.P
+        wall = of.wall / at.h**2
+        adj.stiffness += at.m * of.width * p * by.P
+        adj.width += by_width * by.P
+        adj.wall += (at.m * of.width * q * by.P).sum() / at.h**2
+        by.m += of.width * (of.stiffness * p + wall * q) * by.P
+        # y = d + n . B ((1 - theta) f + zeta), begin = d - theta n . B f
+        by.d += y_adj + s_adj
+        adj.radius -= y_adj + s_adj
+        along = y_adj[:, None] * ((1 - part.theta) * at.moved + at.B @ at.zeta)
+        by.n += along - (s_adj * part.theta)[:, None] * at.moved
+        lever = (1 - part.theta) * at.f + at.zeta
+        by.w += y_adj[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(lever))
+        by.w -= (part.theta * s_adj)[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(at.f))
+        f_adj = at.B.T @ (((1 - part.theta) * y_adj - part.theta * s_adj)[:, None] * at.n)
+        # the pairs' geometry
+        r_adj = (by.n - dot(at.n, by.n)[:, None] * at.n) / at.d[:, None] + by.d[:, None] * at.n
+        y_of = geometry.nearest_vjp(at.y, near.edges, at.w, at.r, at.g, by.w, r_adj)
+        y_of += geometry.fading_vjp(at.y, near.edges, near.scale, by.m)
+        X_adj = near.nodes(near.scattered(np.concatenate([-y_of.sum(1, keepdims=True), y_of], 1)))
+        f_adj += part.theta * X_adj
+        adj.x += X_adj
+        adj.motion += part.begin * X_adj + part.share * f_adj + by.motion
+        by_alpha += (f_adj * part.b).sum()
+        adj.alpha += part.share * by_alpha
+        return e_prev + X_adj, b_prev + at.alpha * f_adj
+
+    def _rub_back(self, of, at, rub_adj, by, adj, at_corners) -> np.ndarray:
+        """Adjoint of b by friction."""
+        near, inverse = self.near, of.inverse[:, None]
+        freed = near.freed(rub_adj)
+        pulled = inverse * freed
+        adj.inverse += dot(freed, at.rub_sum)
+        r_adj = at.B @ pulled
+        by.w += np.einsum("pd,pkd->pk", at.impulse, at_corners(pulled))
+        for own, _, rubbed in of.seeds:
+            q = near.freed(rubbed)
+            r_adj = r_adj + own[:, None] * (at.B @ q)
+            by.w += own[:, None] * np.einsum("pd,pkd->pk", at.impulse, at_corners(q))
+        e = at.t / np.maximum(at.s, TINY)[:, None]
+        L = at.h * at.load
+        G = -L * dot(e, r_adj)
+        by_load, by_bound = -at.h * at.kappa * dot(at.t, r_adj), -G * at.slip * at.share_of_mu
+        adj.speed -= G * at.slip * at.ratio
+        t_adj = (-L * at.kappa)[:, None] * r_adj + (G * (at.slip - at.kappa))[:, None] * e
+        across = dot(at.n, t_adj)
+        v_adj = t_adj - across[:, None] * at.n
+        by.n += -dot(at.n, at.v)[:, None] * t_adj - across[:, None] * at.v
+        by.w += np.einsum("pd,pkd->pk", v_adj, at_corners(at.V))
+        V_adj = at.B.T @ v_adj
+        # the bound
+        back = at.sizes.T @ by_bound
+        S_adj = at.h * of.inverse * back
+        adj.inverse += at.h * at.S * back
+        by_load += at.sizes @ S_adj
+        row = np.repeat(np.arange(at.B.shape[0]), np.diff(at.B.indptr))
+        column = at.B.indices
+        of_entries = at.h * by_bound[row] * (of.inverse * at.S)[column] + at.load[row] * S_adj[column]
+        entries = at.B.copy()
+        entries.data = np.sign(at.B.data) * of_entries
+        by.w += self._at_corners_of(entries)
+        by.P += of.mu * by_load
+        adj.mu += at.P * by_load
+        by.motion += V_adj / of.alpha
+        adj.alpha -= (V_adj * of.motion).sum() / of.alpha**2
+        return V_adj
+
+    def _at_corners_of(self, entries) -> np.ndarray:
+        """Adjoint of the corners' weights for that of B's entries."""
+        near = self.near
+        if near.C is not None:
+            entries = (entries @ near.C.T).tocsr()
+        row = np.arange(len(near.corners))
+        return np.stack([np.asarray(entries[row, near.corners[:, k]]).ravel() for k in range(4)], 1)

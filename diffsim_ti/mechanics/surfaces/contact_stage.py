@@ -1,0 +1,497 @@
+"""Contact of surfaces with themselves and each other as a stage of explicit passes, which no step is too large for.
+
+After the kick by all other forces and the drift, pairs that are near before it or would be after it act on what moved: the
+pass is gone through in parts (contact_parts.py) that move near surfaces by a share of the width, and not farther than half
+way to each other, where contact damping is that of the solver; or shorter ones with full damping, each of which leaves
+surfaces apart. Vertices of no near pair keep what they had, bit by bit.
+"""
+
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.stage import Passes, Stage
+from diffsim_ti.mechanics.surfaces.buffers import whole
+from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSolver
+from diffsim_ti.mechanics.surfaces.host_geometry import dot, nearest
+from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
+from diffsim_ti.mechanics.surfaces.stages import moment_of
+from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
+from diffsim_ti.runtime.slots import VertexRows
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
+
+LONGEST, RESOLVED = 0.2, 0.02  # of the width that near surfaces move in a part; and where it need not be resolved
+HALF = 0.5  # share of a distance by which a resolved part may close it before normals are taken
+MOST_LISTS = 6  # made for one pass
+MOST_LOOKS = 200  # at the pairs of a pass
+SHORTEST = 2.0**-14  # share of a pass
+
+
+@dataclass
+class ContactPass:
+    """What was done in a recorded pass: to which nodes, from where, and the state that the drift had led to."""
+
+    solver: PartSolver
+    nodes: np.ndarray
+    pairs: np.ndarray
+    start: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    parts: list[Part]
+    b: np.ndarray  # what velocities gained
+    rest: tuple  # of pairs: plane and weights at rest, which coefficient of friction
+
+
+class PairContact(Stage):
+    """The stage, of the pairs of a workspace (surface_pairs.py, curved_pairs.py)."""
+
+    def __init__(self, pairs, damping: float):
+        self.damping = damping
+        self.pairs, self.inner, self.a = pairs, getattr(pairs, "inner", pairs), pairs.a
+        a, mesh = self.a, self.a.mesh
+        self.matrix, self.obstacles = getattr(pairs, "matrix", None), pairs.obstacles
+        self.rows, num_nodes = VertexRows(a, mesh.surface_vertices), mesh.num_vertices
+        self.num_own = len(mesh.surface_vertices)
+        self.nodes = mesh.surface_vertices  # of bodies; corners of obstacles, of infinite mass, follow all vertices
+        if self.obstacles:
+            num_nodes += self.obstacles.corners.count
+            self.matrix = self.pairs.finer.mesh.with_corners
+            self.nodes = np.append(self.nodes, np.arange(mesh.num_vertices, num_nodes))
+        self.node_place = np.full(num_nodes, -1)
+        self.node_place[self.nodes] = np.arange(len(self.nodes))
+        self.kept: dict[int, ContactPass | None] = {}
+        self.partly_fixed = bool(len(a.supports.partly_fixed))
+        self.free = a.supports.freedom(num_nodes) if self.partly_fixed else None
+        self.numbers, self.rough = PairNumbers(self.inner), self.inner.friction is not None
+        runtime.fill(a.corner, 0)
+        corners = self.inner.a.first_contact_corner + self.inner.list.num_surface
+        self.scratch = runtime.array(self.inner.kernels.vec4, corners)  # for forces, which are not looked at
+        self.begin = runtime.array(a.vector, 1, a.num_vertices)
+        runtime.fill(self.begin, 0)
+        self.clear()
+
+    # ---- passes --------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def do(self, at: Passes):
+        pairs, inner, u, now = self.pairs, self.inner, at.history.u, at.now
+        self._follow(at, AT_BEGIN)
+        if at.launch is None:
+            pairs.ensure(u, at.slot)
+        fine = self._fine(u, at.slot)
+        inner.forces(*fine, self.scratch)
+        start = self._places(u, at.slot)
+        yield
+        self._follow(at, AT_STAGE)
+        if at.stride:
+            self.kept[at.end] = None
+        try:
+            if now.alpha > 0:
+                self._act(at, start)
+            inner.check_pass(*self._fine(u, at.end), now.h)
+        except Tunnelling as error:
+            raise at.ws.dated(error, at.j, at.num_passes) from None
+
+    def _follow(self, at: Passes, m: int) -> None:
+        """Obstacles are where a pass begins (AT_BEGIN), or at its end."""
+        if self.obstacles:
+            self.pairs.follow(self.a.poses.value(self.a.rows["path"], moment_of(at)), m)
+
+    def _places(self, u, slot: int) -> np.ndarray:
+        """Displacements of the nodes in a slot, and of corners of obstacles."""
+        own = self.rows.get(u, slot)
+        return np.concatenate([own, self.obstacles.displacements]) if self.obstacles else own
+
+    def _fine(self, u, slot: int) -> tuple:
+        return (u, slot) if self.matrix is None else (self.pairs.fine(u, slot), 0)
+
+    def _look(self, u, slot: int) -> tuple[bool, bool]:
+        """(whether the list does not hold where the pass led, whether pairs of it may be near)"""
+        inner = self.inner
+        inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
+        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, lost=0.0, **inner.sizes_of_sums)
+        inner.run(inner.motion.find, dict(u=u), slot=slot, **bodies)
+        flags = runtime.view(inner.flags)
+        stale, _, near = runtime.fetch(inner.flags) if flags is None else flags
+        return bool(stale), bool(near)
+
+    def _act(self, at: Passes, start: np.ndarray) -> None:
+        """What contact does to a pass from `start`; anew with a longer list where one does not hold to the end."""
+        inner, history, surface = self.inner, at.history, self.inner.mesh.surface_vertices
+        u, v = self._places(history.u, at.end), self.rows.get(history.v, at.end)
+        stale, any_near = self._look(*self._fine(history.u, at.end))
+        one, wanted, lists = None, 0.0, MOST_LISTS if stale or any_near else 0
+        for _ in range(lists):
+            if stale:
+                moved = runtime.fetch_row(*self._fine(history.u, at.end))[surface] - runtime.fetch(inner.before)
+                wanted = np.maximum(wanted, 1.1 * inner.travel(moved))
+                self.rows.put(history.u, at.end, u[: self.num_own])
+                self.rows.put(history.v, at.end, v)
+                self.rows.put(self.begin, 0, start[: self.num_own])
+                self._follow(at, AT_BEGIN)
+                begin = self._fine(self.begin, 0)
+                inner.age = 0  # the slacks are those wanted, whatever the pace before
+                inner.build(*begin, wanted=wanted)
+                inner.forces(*begin, self.scratch)
+                self._follow(at, AT_STAGE)
+                _, any_near = self._look(*self._fine(history.u, at.end))
+            one = self._contact(at, start, u, v) if any_near else None
+            if at.stride:
+                self.kept[at.end] = one
+            _, stale, _ = inner.check(*self._fine(history.u, at.end), 0, 0)
+            if not stale:
+                break
+        if one and at.ws.impulses:
+            of = self._numbers(one, at.now)
+            self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
+
+    def _contact(self, at: Passes, start, u, v) -> ContactPass | None:
+        """The stage, with the list as it is: of the pairs that would come near, and of those that do by what it does."""
+        one, u_next, flagged = None, u, self._flagged()
+        chosen, seen = np.zeros(self.inner.list.count, bool), flagged
+        for _ in range(MOST_LISTS):
+            more = flagged[self._comes_near(self._pass(flagged, start, u_next, v), at.now)]
+            if np.all(chosen[more]):
+                break
+            chosen[more] = True
+            one = self._pass(np.flatnonzero(chosen), start, u, v)
+            e, one.b = self._go(one, self._numbers(one, at.now))
+            u_next, v_next, own = u.copy(), v.copy(), one.nodes < self.num_own
+            u_next[one.nodes[own]] += e[own]
+            v_next[one.nodes[own]] += at.now.decay * one.b[own]
+            self.rows.put(at.history.u, at.end, u_next[: self.num_own])
+            self.rows.put(at.history.v, at.end, v_next)
+            self._look(*self._fine(at.history.u, at.end))
+            flagged = self._flagged()
+            seen = np.union1d(seen, flagged)
+        self._mark_done(seen)
+        return one
+
+    def _of_obstacles(self, impulses, at: Passes, one: ContactPass):
+        """(frame, place among the obstacles by pairs, which pairs are its) of each that is noted."""
+        frame = impulses.frame_of(at.numbers)
+        for k in range(len(impulses.by_pairs) if frame is not None else 0):
+            own = one.rest[2].contact == k + 1
+            if own.any():
+                yield frame, k, own
+
+    def _note(self, impulses, at: Passes, one: ContactPass, of, taken: list, changes: bool = False) -> None:
+        """Note what each obstacle did; taken: (part, where it looked), which are taken here unless changes are noted."""
+        for frame, k, own in self._of_obstacles(impulses, at, one):
+            bodies = one.nodes < self.num_own
+            for part, look in taken:
+                if not changes:
+                    one.solver.take(part, of, look)
+                for side, given in enumerate(one.solver.impulses(look, own, of)):
+                    given = given.imag / 1e-30 if changes else given
+                    impulses.of_pairs[frame, k, side, one.nodes[bodies]] += given[bodies]
+
+    def _seeds(self, impulses, at: Passes, one: ContactPass) -> list:
+        """Adjoints of what each obstacle did."""
+        out, bodies = [], one.nodes < self.num_own
+        for frame, k, own in self._of_obstacles(impulses, at, one) if impulses else ():
+            seeds = np.zeros((2, len(one.nodes), 3))
+            seeds[:, bodies] = impulses.of_pairs[frame, k][:, one.nodes[bodies]]
+            out.append((own, *seeds))
+        return out
+
+    def _flagged(self) -> np.ndarray:
+        """Numbers of the pairs that may come near, as `_look` found them."""
+        return np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
+
+    def _comes_near(self, one: ContactPass, now) -> np.ndarray:
+        """Which pairs come nearer than their width from `start` to `u`, by looks so often that none misses a crossing: of
+        the state alone, however old the list is."""
+        near, of = one.solver.near, self._numbers(one, now)
+        begin, motion = near.relative(near.points(of.x)), near.relative(near.points(of.motion))
+        looks = 1 + np.minimum(MOST_LOOKS, 2 * np.sqrt((motion**2).sum(-1)).max(1, initial=0) / of.width).astype(int)
+        out, left = np.zeros(len(one.pairs), bool), np.arange(len(one.pairs))
+        for k in range(int(looks.max(initial=0)) + 1):
+            left = left[(looks[left] >= k) & ~out[left]]
+            if not left.size:
+                break
+            y = begin[left] + (k / looks[left])[:, None, None] * motion[left]
+            _, r, _ = nearest(y, near.edges[left])
+            out[left] = dot(r, r) < (of.width + of.radius)[left] ** 2
+        return out
+
+    def _mark_done(self, near: np.ndarray) -> None:
+        """The stage has looked after these: `check_pass` need not."""
+        plane = whole(self.inner.plane)
+        plane[near, 3] = 1e30
+        if runtime.view(self.inner.plane) is None:
+            runtime.fill(self.inner.plane, plane)
+
+    def _pass(self, near: np.ndarray, start, u, v) -> ContactPass:
+        inner = self.inner
+        corners = runtime.fetch(inner.list.pairs)[: 4 * inner.list.count].reshape(-1, 4)[near]
+        edges = near >= inner.list.num_vt
+        scale = np.zeros(len(near))
+        scale[edges] = whole(inner.list.scale)[near[edges] - inner.list.num_vt]
+        points, local = np.unique(corners, return_inverse=True)
+        C, nodes = None, points
+        if self.matrix is not None:
+            C = self.matrix[points]
+            nodes = np.unique(C.indices)
+            C = C[:, nodes].tocsr()
+        free = None if self.free is None else self.free[nodes]
+        own = NearPairs(local.reshape(-1, 4), edges, scale, len(points), C, free)
+        rest = whole(inner.rest_plane)[near].astype(float), whole(inner.rest_weights)[near].astype(float)
+        place, numbers = self.node_place[nodes], self.numbers.of(near, corners)
+        return ContactPass(PartSolver(own), place, corners, start[place], u, v, [], None, (*rest, numbers))
+
+    def _numbers(self, one: ContactPass, now, changes=None) -> SimpleNamespace:
+        """What parts read; changes: of it, as imaginary parts of the size `TINY`."""
+        a, own = self.a, one.rest[2]
+        nodes, numbers = self.nodes[one.nodes], a.values.parameters.astype(float)
+        rest, mass, inverse_mass, radius = a.values.rest - a.origin, a.values.mass, self.inverse, 0.0
+        if self.obstacles:
+            corners = self.obstacles.corners
+            rest, radius = np.concatenate([rest, corners.made(numbers)]), np.append(0.0, corners.radii(numbers))
+            mass, inverse_mass = (np.append(x, np.zeros(corners.count)) for x in (mass, inverse_mass))
+            radius = radius[own.contact]
+        start, end, h_alpha, D = one.start, one.u[one.nodes], now.alpha, one.rest[0][:, 3]
+        if changes is not None:
+            numbers, rest, mass = numbers + changes.parameters, rest + changes.rest, mass + changes.mass
+            start, end, h_alpha = start + changes.start, end + changes.end, h_alpha + changes.alpha
+            radius = radius + changes.radius[own.contact]
+            D = D + np.einsum("pd,pk,pkd->p", one.rest[0][:, :3], one.rest[1], changes.fine_rest[one.pairs])
+        k, W = own.area * numbers[own.stiffness], numbers[own.width]
+        half = 0.5 * D / W
+        share = np.where(half.real < 1, half, 1)
+        inverse = np.where(inverse_mass[nodes] > 0, 1 / np.where(mass[nodes] > 0, mass[nodes], 1), 0)
+        mu, rubs = np.zeros(len(one.pairs), numbers.dtype), own.mu >= 0
+        mu[rubs] = numbers[own.mu[rubs]]
+        speed = np.where(rubs, numbers[own.speed], 1.0)
+        return SimpleNamespace(
+            x=rest[nodes] + start, motion=end - start, inverse=inverse, h=now.h, alpha=h_alpha, stiffness=k / share,
+            width=share * W, mu=mu, speed=speed, wall=mass[self.a.mesh.surface_vertices].mean(), rough=self.rough,
+            share=share, k=k, W=W, D=D, radius=radius, seeds=(),
+        )  # fmt: skip
+
+    @property
+    def inverse(self) -> np.ndarray:
+        return self.a.inverse_of(self.a.values.mass)
+
+    def _go(self, one: ContactPass, of) -> tuple[np.ndarray, np.ndarray]:
+        """(e, b) of the pass, whose parts are noted."""
+        solver, e = one.solver, np.zeros_like(of.motion)
+        b, begin, share, shortened = e.copy(), 0.0, 1.0, False
+        while begin < 1:
+            share = min(share, 1 - begin)
+            tried = self._try(solver, of, begin, share, e, b)
+            if tried is None:
+                share, shortened = 0.5 * share, True
+                if share < SHORTEST:
+                    self._refuse(one, of)
+                continue
+            part, e, b = tried
+            one.parts.append(part)
+            begin, share, shortened = begin + share, share if shortened else 2 * share, False
+        return e, b
+
+    def _try(self, solver: PartSolver, of, begin, share, e, b):
+        """(the part, e, b after it), or None where it is too long."""
+        part, near = Part(begin, share, self.damping, e, b), solver.near
+        move = near.relative(near.points(share * (of.motion + of.alpha * b)))
+        farthest = np.sqrt((move**2).sum(-1).max(1) / of.width**2).max()
+        if farthest > LONGEST:
+            return None
+        X = near.points(of.x + begin * of.motion + e)
+        at = solver.look(part, of)
+        if self.damping < 1:
+            before = near.parted(at.n, X) - of.radius
+            if not np.all((before > 0) & (at.d - of.radius > HALF * before)):
+                if farthest > RESOLVED:
+                    return None
+                part.c = 1.0
+                at = solver.look(part, of)
+        part.xi = solver.solve(part, of, at)
+        if part.xi is None:
+            return None
+        e_next, b_next = solver.take(part, of, at)
+        end = near.points(of.x + (begin + share) * of.motion + e_next)
+        if not self._stays_apart(near, at, X, end, of.radius):
+            return None
+        return part, e_next, b_next
+
+    def _stays_apart(self, near: NearPairs, at, X: np.ndarray, end: np.ndarray, radius) -> bool:
+        """Whether a plane parts each pair where a part begins and where it ends, and so all the way."""
+        room = self.rounding * (1 + np.abs(end).max()) + np.broadcast_to(radius, len(near.corners))
+        doubtful = np.flatnonzero(~(near.parted(at.n, X, end) > room))
+        if not doubtful.size:
+            return True
+        some = NearPairs(
+            near.corners[doubtful], near.edges[doubtful], near.scale[doubtful], near.num_points, None, None
+        )
+        best = np.full(doubtful.size, -np.inf)
+        for x in (X, end):
+            _, r, _ = nearest(some.relative(x), some.edges)
+            d = np.sqrt((r * r).sum(1))
+            best = np.maximum(best, some.parted(r / np.maximum(d, 1e-300)[:, None], X, end))
+        return bool(np.all(best > room[doubtful]))
+
+    def _refuse(self, one: ContactPass, of) -> None:
+        near = one.solver.near
+        move = near.relative(near.points(of.motion))
+        speed = float(np.sqrt((move**2).sum(-1)).max()) / of.h
+        corners = one.pairs[int((move**2).sum(-1).max(1).argmax())]
+        self.inner.fresh = False
+        error = Tunnelling(
+            f"contact of width {np.min(of.W):.3g} m does not keep surfaces apart near vertices {corners.tolist()}, which "
+            f"meet at {speed:.3g} m/s: take substeps of {0.25 * of.h:.3g} s"
+        )
+        error.stable_dt, error.stiffness = 0.25 * of.h, None
+        raise error
+
+    @property
+    def rounding(self) -> float:
+        return 1e-6 * 2.0**-3 if self.a.precision == "f32" else 1e-15
+
+    # ---- tangent -------------------------------------------------------------------------------------------------------
+
+    def _alone(self, at: Passes, one: ContactPass | None):
+        """The record without what the stage did."""
+        return nullcontext() if one is None else self.rows.replaced(at.history, at.end, one.u[: self.num_own], one.v)
+
+    @contextmanager
+    def tangent(self, at: Passes):
+        one, run, now = self.kept.get(at.end), at.run, at.now
+        self._follow(at, AT_STAGE)
+        before = self.rows.get(run.u, 0) if one else None
+        with self._alone(at, one):
+            yield
+        if one is None:
+            return
+        tiny, t = 1e-30j, run.tangent
+        after, change = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
+        rest = runtime.fetch(run.numbers.rest).astype(float) if t.rest is None else np.asarray(t.rest, float)
+        parameters = np.asarray(t.parameters, float)[: len(self.a.values.parameters)]
+        rate, first, last, mass, radius = run.rate_dot, before, after, t.mass, np.zeros(1)
+        if self.obstacles:
+            poses = self.a.poses.jvp(self.a.rows["path"], t.path, moment_of(at))
+            at_end, at_begin, _ = self.obstacles.changes(parameters, poses)
+            first, last = np.concatenate([before, at_begin]), np.concatenate([after, at_end])
+            rest, mass = (np.concatenate([x, np.zeros((len(at_end), *x.shape[1:]))]) for x in (rest, mass))
+            radius = np.append(0.0, self.obstacles.corners.radii_jvp(self.a.values.parameters, parameters))
+        dots = SimpleNamespace(
+            parameters=tiny * parameters, rest=tiny * rest, mass=tiny * mass, radius=tiny * radius,
+            start=tiny * first[one.nodes], end=tiny * last[one.nodes], alpha=tiny * rate * now.alpha_by_rate,
+            fine_rest=tiny * (rest if self.matrix is None else self.matrix @ rest),
+        )  # fmt: skip
+        of = self._numbers(one, now, dots)
+        e = b = np.zeros_like(of.motion)
+        looks = []
+        for part in one.parts:
+            own = Part(part.begin, part.share, part.c, e, b, part.xi)
+            looks.append((own, one.solver.look(own, of)))
+            e, b = one.solver.take(own, of, looks[-1][1])
+        if run.impulses:
+            self._note(run.impulses, at, one, of, looks, changes=True)
+        decay = now.decay + tiny * rate * now.decay_by_rate
+        own = one.nodes < self.num_own
+        after[one.nodes[own]] += e[own].imag / 1e-30
+        change[one.nodes[own]] += (decay * b[own]).imag / 1e-30
+        self.rows.put(run.u, 0, after)
+        self.rows.put(run.v, 0, change)
+
+    # ---- adjoint -------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def adjoint(self, at: Passes):
+        one, run, now = self.kept.get(at.end), at.run, at.now
+        if one is None:
+            yield
+            return
+        run.complete()
+        self._follow(at, AT_STAGE)
+        p, q = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
+        of = self._numbers(one, now)
+        of.seeds = self._seeds(run.impulses, at, one)
+        own, count = one.nodes < self.num_own, len(one.nodes)
+        nodes = one.nodes[own]
+        adj = SimpleNamespace(
+            x=np.zeros_like(of.motion), motion=np.zeros_like(of.motion), inverse=np.zeros(count), alpha=0.0,
+            stiffness=np.zeros(len(one.pairs)), width=np.zeros(len(one.pairs)), mu=np.zeros(len(one.pairs)),
+            speed=np.zeros(len(one.pairs)), radius=np.zeros(len(one.pairs)), wall=0.0,
+        )  # fmt: skip
+        e_adj, b_adj = np.zeros((2, count, 3))
+        e_adj[own], b_adj[own] = p[nodes], now.decay * q[nodes]
+        by_decay = float((q[nodes] * one.b[own]).sum())
+        for part in one.parts[::-1]:
+            e_adj, b_adj = one.solver.back(part, of, e_adj, b_adj, adj)
+        self.by_rate += now.alpha_by_rate * adj.alpha + now.decay_by_rate * by_decay
+        by_start = (adj.x - adj.motion)[own]
+        p[nodes] += adj.motion[own]
+        self.rows.put(run.u, 0, p)
+        self._add(one, of, adj, own)
+        if self.obstacles:
+            self._add_obstacles(at, one, adj, own)
+        with self._alone(at, one):
+            yield
+        p = self.rows.get(run.u, 0)
+        p[nodes] += by_start
+        self.rows.put(run.u, 0, p)
+
+    def _add_obstacles(self, at: Passes, one: ContactPass, adj, own: np.ndarray) -> None:
+        """Adjoints of where corners of obstacles were, and of radii."""
+        obstacles, place = self.obstacles, one.nodes[~own] - self.num_own
+        by_begin, by_end = np.zeros((2, obstacles.corners.count, 3))
+        by_begin[place], by_end[place] = (adj.x - adj.motion)[~own], adj.motion[~own]
+        obstacles.add_places(by_begin, AT_BEGIN)
+        obstacles.add_places(by_end, AT_STAGE)
+        by_radii = np.zeros(1 + len(obstacles.corners.parts))
+        np.add.at(by_radii, one.rest[2].contact, adj.radius)
+        obstacles.corners.add_radii(self.a.values.parameters, by_radii[1:], self.by_numbers)
+        by_rows = obstacles.take_rows()
+        if self.by_path is not None:
+            self.a.poses.vjp(self.a.rows["path"], by_rows, moment_of(at), self.by_path)
+
+    def _add(self, one: ContactPass, of, adj, own: np.ndarray) -> None:
+        """Adjoints of the numbers, of masses and of the rest shape."""
+        surface = self.a.mesh.surface_vertices
+        nodes, numbers = self.nodes[one.nodes[own]], one.rest[2]
+        self.by_mass[nodes] -= (of.inverse**2 * adj.inverse)[own]
+        self.by_mass[surface] += adj.wall / len(surface)
+        self.by_rest[nodes] += adj.x[own]
+        # stiffness k / share, width share W, share = min(1, D / (2 W))
+        by_share = np.where(of.share < 1, of.W * adj.width - of.k / of.share**2 * adj.stiffness, 0)
+        np.add.at(self.by_numbers, numbers.stiffness, numbers.area * adj.stiffness / of.share)
+        np.add.at(self.by_numbers, numbers.width, of.share * adj.width - by_share * of.share / of.W)
+        by_D = 0.5 * by_share / of.W
+        if by_D.any():
+            plane, weights = one.rest[:2]
+            at_corners = (by_D[:, None] * weights)[:, :, None] * plane[:, None, :3]
+            np.add.at(self.by_fine_rest, one.pairs, at_corners)
+        if self.rough:
+            rubs = numbers.mu >= 0
+            np.add.at(self.by_numbers, numbers.speed[rubs], adj.speed[rubs])
+            np.add.at(self.by_numbers, numbers.mu[rubs], adj.mu[rubs])
+
+    def clear(self) -> None:
+        a, path = self.a, self.a.rows.get("path")
+        self.by_numbers, self.by_mass, self.by_rate = np.zeros(len(a.values.parameters)), np.zeros(a.num_vertices), 0.0
+        self.by_rest, self.by_fine_rest = np.zeros((a.num_vertices, 3)), np.zeros((self.inner.mesh.num_vertices, 3))
+        self.by_path = np.zeros(path.shape) if self.obstacles and path is not None else None
+        if self.obstacles:
+            self.obstacles.clear()
+
+    def collect(self, out: Derived) -> None:
+        out.parameters += self.by_numbers
+        by_fine = (
+            self.by_fine_rest if self.matrix is None else (self.matrix.T @ self.by_fine_rest)[: self.a.num_vertices]
+        )
+        if self.obstacles:
+            out.parameters += self.obstacles.by_parameters
+        if self.by_path is not None:
+            out.path += self.by_path
+        out.rest = self.by_rest + by_fine + out.rest
+        out.mass = out.mass + self.by_mass
+        drag = self.a.features().drag
+        if drag >= 0:
+            out.parameters[drag] += self.by_rate

@@ -1,0 +1,189 @@
+"""Triangles, segments and points as obstacles: exact distances, inside and outside, sharp edges, what passes through."""
+
+import numpy as np
+import pytest
+import taichi as ti
+from contact_scenes import box_surface, tetrahedron
+
+import diffsim_ti as ds
+from diffsim_ti import runtime
+from diffsim_ti.terms.obstacles import shapes
+
+SIZE, AT = np.array([0.9, 0.6, 0.8]), np.array([0.36, -0.31, 0.22])
+CORNERS, TRIANGLES = box_surface(SIZE, -SIZE / 2)
+BARRIER = dict(stiffness=300.0, width=0.2)
+RNG = np.random.default_rng(5)
+PLACES = AT + RNG.uniform(-1.2, 1.2, (300, 3)) * SIZE
+SHEET = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1.0]])
+SQUARE = [[0, 1, 2], [0, 2, 3]]
+
+
+def box(**options):
+    return ds.Box(AT, SIZE, **BARRIER | options)
+
+
+def meshed_box(**options):
+    return ds.MeshObstacle(CORNERS, TRIANGLES, AT, **BARRIER | options)
+
+
+def segment_distance(x, a, b):
+    share = np.clip((x - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+    return np.linalg.norm(x - a - share[:, None] * (b - a), axis=1)
+
+
+def sheet_distance(x):
+    return np.linalg.norm(
+        np.stack([np.maximum(np.abs(x[:, 0]) - 1, 0), x[:, 1], np.maximum(np.abs(x[:, 2]) - 1, 0)]), axis=0
+    )
+
+
+def gaps(term, places, precision="f64"):
+    """Distances by the device counterpart."""
+    fp, numbers = runtime.PRECISIONS[precision], np.concatenate([v.ravel() for v in term.values.values()])
+    vec, counterpart = ti.types.vector(4, fp), term.kernel(precision, table=len(numbers))
+
+    @ti.kernel
+    def look(parameters: ti.types.ndarray(fp, 1), x: ti.types.ndarray(vec, 1), out: ti.types.ndarray(fp, 1)):
+        for i in range(x.shape[0]):
+            out[i] = counterpart.gap(parameters, 0, x[i], vec(0))
+
+    out = runtime.array(fp, len(places))
+    look(runtime.upload(np.append(numbers, term.table), fp), runtime.upload(places, vec), out)
+    return runtime.fetch(out)
+
+
+A, B, C = np.array([[0.0, 0, 0], [0.6, 0.2, 0.1], [-0.3, 0.4, 0.2]])
+EXACT = {
+    "a box": (meshed_box(), box().distance),
+    "unwelded": (ds.MeshObstacle(CORNERS[TRIANGLES].reshape(-1, 3), np.arange(36).reshape(12, 3), AT), box().distance),
+    "thick": (meshed_box(radius=0.1), lambda x: box().distance(x) - 0.1),
+    "a room": (ds.MeshObstacle(CORNERS, TRIANGLES[:, ::-1], AT), lambda x: -box().distance(x)),
+    "a sheet": (ds.MeshObstacle(SHEET, SQUARE, AT), lambda x: sheet_distance(x - AT)),
+    "segments": (
+        ds.MeshObstacle([A, B, C], segments=[[0, 1], [1, 2]], radius=0.05),
+        lambda x: np.minimum(segment_distance(x, A, B), segment_distance(x, B, C)) - 0.05,
+    ),
+    "points": (ds.MeshObstacle([A, B, C]), lambda x: np.linalg.norm(x[:, None] - [A, B, C], axis=2).min(1)),
+    "all of them": (
+        ds.MeshObstacle([*SHEET, A, B, C], SQUARE, segments=[[4, 5]], points=[6]),
+        lambda x: np.minimum(np.minimum(sheet_distance(x), segment_distance(x, A, B)), np.linalg.norm(x - C, axis=1)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_distances_are_exact(name):
+    """On the host and, of one with and one without an inside, on the device, in float32 to its round-off."""
+    term, exact = EXACT[name]
+    np.testing.assert_allclose(term.distance(PLACES), exact(PLACES), atol=1e-14)
+    if name == "thick":
+        np.testing.assert_allclose(gaps(term, PLACES), exact(PLACES), atol=1e-14)
+    if name == "all of them":
+        np.testing.assert_allclose(gaps(term, PLACES, "f32"), exact(PLACES), atol=1e-6)
+
+
+def test_a_large_tree_finds_what_a_look_at_all_finds():
+    """A bumpy ball of 960 triangles, felt from both sides as one of them is missing."""
+    x, t = shapes.ball((0, 0, 0), 0.5)
+    x = x * (1 + 0.1 * RNG.uniform(-1, 1, (len(x), 1)))
+    term = ds.MeshObstacle(x, t[1:])
+    places = RNG.uniform(-1, 1, (200, 3))
+    one_by_one = np.min([ds.MeshObstacle(x[row], [[0, 1, 2]]).distance(places) for row in t[1:]], 0)
+    np.testing.assert_allclose(term.distance(places), one_by_one, atol=1e-14)
+    np.testing.assert_allclose(gaps(term, places), one_by_one, atol=1e-14)
+
+
+def fallen(terms, solver, steps=12, **options):
+    scene = ds.Scene(
+        tetrahedron(options.pop("lift", 0.15)),
+        ds.StableNeoHookean(2e4, 0.3),
+        100.0,
+        [ds.Gravity(), *np.atleast_1d(terms)],
+        precision="f64",
+        initial_velocities=options.pop("velocity", (0.5, -1.0, 0.2)),
+    )
+    simulator = ds.Simulator(solver(scene, dt=4e-3, **options))
+    simulator.run(steps)
+    return simulator
+
+
+@pytest.mark.parametrize("solver, options", [(ds.VelocityVerletSolver, dict(substeps=8)), (ds.ImplicitEulerSolver, {})])
+def test_a_meshed_box_is_the_analytic_one(solver, options):
+    """Flat regions count once, whatever triangles they consist of."""
+    rough = dict(friction=0.4, friction_speed=0.05)
+    found, expected = (
+        fallen(make(**rough), solver, **options) for make in (meshed_box, lambda **o: box(by_pairs=True, **o))
+    )
+    assert found.contact_resolution.smallest_gap < 0.15 if options else True
+    np.testing.assert_allclose(found.positions, expected.positions, atol=1e-9)
+
+
+def test_flat_and_finely_bent_edges_do_not_act_by_pairs():
+    """Diagonals of a square, and edges over which faces do not see a ball bend."""
+    body = tetrahedron(2.0)
+    edges = lambda term: ds.Scene(body, ds.LinearElastic(1e4, 0.3), 100.0, [term]).obstacles[0].primitives  # noqa: E731
+    assert len(edges(meshed_box()).edges) == 12 and len(edges(meshed_box()).points) == 8
+    assert len(edges(ds.MeshObstacle(SHEET - [0, 1, 0], SQUARE, **BARRIER)).edges) == 4
+    x, t = shapes.ball((0, -8.0, 0), 7.0)
+    assert edges(ds.MeshObstacle(x.round(9), t, stiffness=300.0, width=0.3)) is None
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sheet_is_felt_from_both_sides(sign):
+    sheet = ds.MeshObstacle(SHEET, SQUARE, path=lambda t: [0, 0.5 * sign * t, 0], **BARRIER | dict(width=0.05))
+    lift = 0.02 if sign > 0 else -0.52
+    simulator = fallen(sheet, ds.SemiImplicitSolver, lift=lift, velocity=(0, -sign, 0), substeps=8)
+    sides = simulator.positions[:3, 1] if sign > 0 else simulator.positions[3:, 1]
+    assert np.all(sign * (sides - 0.5 * sign * 0.048) > 0) and simulator.contact_resolution.smallest_gap > 0
+
+
+def test_what_is_not_nearest_is_not_passed_through_either(monkeypatch):
+    """A fast vertex next to a point, with a sheet on its way, none of whose edges acts by pairs."""
+    monkeypatch.setattr(ds.MeshObstacle, "settled", ds.Sphere.settled)
+    parts = ds.MeshObstacle([*SHEET, [1.3, 0.24, 0.0]], SQUARE, points=[4], **BARRIER | dict(width=1e-3))
+    with pytest.raises(ds.Crossing, match="vertex 0 gets .* m behind MeshObstacle"):
+        fallen(parts, ds.SemiImplicitSolver, lift=0.3, velocity=(0, -400.0, 0), steps=2, substeps=4)
+
+
+def test_an_inside_is_refused_and_a_sheet_has_none():
+    body = tetrahedron(0.0)
+    scene = lambda term: ds.Scene(body, ds.LinearElastic(1e4, 0.3), 100.0, [term])  # noqa: E731
+    low = body.vertices.mean(0) + [0, 0.1, 0] - SIZE / 2
+    with pytest.raises(ValueError, match="the body starts on or in MeshObstacle"):
+        scene(ds.MeshObstacle(*box_surface(SIZE, low), **BARRIER))
+    x, t = box_surface(SIZE, low)
+    scene(ds.MeshObstacle(x, t[:, ::-1], **BARRIER))  # a room
+    scene(ds.MeshObstacle(x, t[1:], **BARRIER))  # open
+
+
+def test_gradients_by_the_shape_through_sliding_over_an_edge():
+    """Vertices, place, radius and friction; Taylor's remainder falls with the square of the step."""
+    ends = np.array([[-0.5, -0.3, -1], [0.25, -0.01, -1], [1, -0.3, -1]])
+    roof = np.concatenate([ends, ends + [0, 0, 2.5]])
+    term = ds.MeshObstacle(
+        roof, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]], radius=0.01, shapeable=True, **BARRIER | dict(width=0.1)
+    )
+    law, options = ds.StableNeoHookean(2e4, 0.3), dict(precision="f64", initial_velocities=(1.5, -1.0, 0.0))
+    of = lambda term: ds.Scene(tetrahedron(0.1), law, 100.0, [ds.Gravity(), term], **options)  # noqa: E731
+    names = ["mesh_vertices", "mesh_position", "mesh_radius", "barrier_width"]
+    rollout = ds.Rollout(ds.SemiImplicitSolver(of(term), dt=2e-3, substeps=4), 20, gradients=names)
+    report = ds.check_gradients(rollout, verbose=False)
+    assert report.passed and ds.dot_product_test(rollout) < 1e-12
+    for row in report.rows:
+        assert row.relative_error < 1e-6 and row.analytic != 0, str(report)
+    other = roof + 0.002 * RNG.standard_normal(roof.shape)  # as if it had been made so
+    moved = rollout.forward(mesh_vertices=other).positions
+    again = ds.MeshObstacle(other, term._made.triangles, radius=0.01, **BARRIER | dict(width=0.1))
+    expected = ds.Rollout(ds.SemiImplicitSolver(of(again), dt=2e-3, substeps=4), 20).forward().positions
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
+
+
+def test_resolution_is_not_asked_for():
+    with pytest.warns(DeprecationWarning, match="resolution has no meaning, for distances are exact") as caught:
+        ds.MeshObstacle(CORNERS, TRIANGLES, (0, 0, 0), 8)
+    assert caught[0].filename == __file__
+
+
+def test_a_table_that_float32_cannot_count_is_refused():
+    with pytest.raises(ValueError, match="float32 cannot count .* pass precision='f64', or fewer"):
+        meshed_box().kernel("f32", table=2**24)

@@ -1,0 +1,127 @@
+"""Points and edges of obstacles against faces and edges of bodies: exact gaps, forces, gradients, refusals."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from impact_judge import Judge
+
+import diffsim_ti as ds
+from diffsim_ti import verify
+from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
+from diffsim_ti.terms.obstacles.barrier import beta
+
+SIZE, WIDTH, PER_AREA, GAP = 0.1, 4e-3, 5e6, 1.5e-3
+BARRIER = dict(width=WIDTH, stiffness_per_area=PER_AREA)
+
+
+def cube(*terms, lift=0.0, velocity=(0.2, -0.5, 0.1)) -> ds.Scene:
+    """Eight vertices and twelve triangles, whose bottom is y = lift."""
+    mesh = ds.TetrahedralMesh.create_box(2, SIZE).translated([0, lift, 0])
+    material = ds.StableNeoHookean(5e4, 0.3)
+    return ds.Scene(mesh, material, 1000.0, list(terms), precision="f64", initial_velocities=velocity)
+
+
+def below(kind: str, gap: float = GAP):
+    """An obstacle that no vertex of the cube feels, by a gap below the middle of its bottom, or of an edge of it."""
+    if kind == "pin":
+        return ds.MeshObstacle([[0.02, -gap, 0.07]], **BARRIER)
+    if kind == "ball":
+        return ds.Sphere((0.02, -gap - 0.01, 0.07), 0.01, by_pairs=True, **BARRIER)
+    if kind == "wire":
+        return ds.Capsule((0.02, -gap - 2e-3, 0.06), (0.06, -gap - 2e-3, 0.08), 2e-3, by_pairs=True, **BARRIER)
+    down, turned = -gap - np.sqrt(0.5) * 0.2, (np.pi / 4, 0, 0)  # an edge along x, across the side x = 0 of the bottom
+    return ds.Box((0, down, 0.04), (0.06, 0.2, 0.2), turned, by_pairs=True, **BARRIER)
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+@pytest.mark.parametrize("kind", ["pin", "ball", "wire", "edge of a box"])
+def test_gaps_are_exact(kind, solver):
+    """Where today's nearest vertex is 20 widths away; a point presses with the stiffness of its triangle's area."""
+    simulator = ds.Simulator(solver(cube(below(kind)), dt=1e-5))
+    assert simulator.smallest_gap() == pytest.approx(GAP, abs=1e-12)
+    stored = simulator.compute_energy().parts["contact"]
+    if kind in ("pin", "ball"):
+        expected = PER_AREA * SIZE**2 / 2 * WIDTH**2 * float(beta(GAP / WIDTH))
+        assert stored == pytest.approx(expected, rel=1e-9)
+    assert stored > 0
+
+
+@lru_cache
+def caught(solver=ds.ImplicitEulerSolver, steps=8, dt=1e-3, outputs=(), **options):
+    """A cube that falls on a wire that turns between its vertices, and would meet itself; all rub."""
+    turn = lambda t: (6e-3 * np.sin(30 * t), 0.1 * t, 0.02 * t, 0.5 * t, 3 * t, t)  # noqa: E731
+    ends = (-0.03, -0.0115, 0.033), (0.13, -0.013, 0.042)
+    rough = dict(friction=0.3, friction_speed=0.05, by_pairs=True, **BARRIER)
+    wire = ds.Capsule(*ends, 0.01, path=turn, about=(0.05, -0.02, 0.05), name="wire", **rough)
+    scene = cube(wire, ds.SelfContact(1e3, 2e-3, friction=0.2))
+    rollout = ds.Rollout(solver(scene, dt=dt, **options), steps, gradients="all", outputs=list(outputs), save_every=1)
+    return rollout, rollout.forward()
+
+
+FORCES = (
+    ds.ContactForce("wire", name="force"),
+    ds.ContactForce("wire", "friction", name="dragged", per_vertex=True),
+    ds.ContactForce("wire", "normal", about=(0, 0, 0), name="moment"),
+)
+
+
+EXPLICIT = dict(solver=ds.SemiImplicitSolver, steps=40, dt=2e-4, outputs=FORCES)
+IMPLICIT = dict(outputs=FORCES, tolerance=1e-12)
+
+
+@pytest.mark.parametrize("options, rounding", [(EXPLICIT, 1e-14), (IMPLICIT, 1e-9)])
+def test_obstacles_give_the_body_the_momentum_that_contact_force_says(options, rounding):
+    rollout, frames = caught(**options)
+    mass = rollout.scene.inputs.derive(rollout.values).mass[:, None]
+    gained = np.diff((mass * frames.velocities).sum(1), axis=0)
+    np.testing.assert_allclose(
+        rollout.solver.dt * frames["force"][1:], gained, atol=rounding * np.abs(gained).max(), rtol=0
+    )
+    assert np.abs(frames["dragged"]).max() > 0.1 and frames.velocities[-1, :, 1].mean() > -0.3
+
+
+def test_gradients_of_places_and_forces_agree_with_differences():
+    """By all inputs of the wire, its path, its radius and the point that it turns about among them, at once."""
+    rollout, frames = caught(**IMPLICIT)
+    rng = np.random.default_rng(0)
+    seeds = {name: rng.standard_normal(frames[name].shape) for name in ("positions", "force", "dragged", "moment")}
+    seeds["positions"] *= 1e3
+    gradients = rollout.vjp(frames, **seeds)
+    names = [name for name in rollout.wanted if name.startswith("wire.") or name == "rest_positions"]
+    sizes = {name: verify.input_scale(rollout, name) for name in names}
+    way = {name: sizes[name] * rng.standard_normal(gradients[name].shape) for name in names}
+    analytic = sum(float((gradients[name] * way[name]).sum()) for name in names)
+
+    def loss(t):
+        there = rollout.forward(**{name: rollout.values[name] + t * way[name] for name in names})
+        return sum(float((there[name] * seed).sum()) for name, seed in seeds.items())
+
+    coarse, fine = ((loss(h) - loss(-h)) / (2 * h) for h in (2e-6, 1e-6))
+    assert len(names) > 7
+    assert analytic == pytest.approx((4 * fine - coarse) / 3, rel=1e-6)
+
+
+def test_the_adjoint_of_explicit_steps_is_the_transpose_of_their_tangent():
+    assert verify.dot_product_test(caught(**EXPLICIT)[0]) < 1e-11
+
+
+def test_nothing_passes_what_moves_up_through_it():
+    """A wire that no vertex meets comes up into a cube that falls."""
+    up = lambda t: (0, 0.8 * t, 0)  # noqa: E731
+    start, end = np.array([-0.05, -0.012, 0.03]), np.array([0.15, -0.012, 0.06])
+    wire = ds.Capsule(start, end, 4e-3, by_pairs=True, path=up, width=WIDTH, stiffness_per_area=5e7)
+    simulator = ds.Simulator(ds.ImplicitEulerSolver(cube(wire), dt=5e-3))
+    solid = dict(kind="capsule", start=start, end=end, radius=4e-3)
+    judge = Judge(simulator.scene.mesh.surface_triangles, solid, simulator.positions)
+    for _ in range(12):
+        simulator.step()
+        assert judge.after_step(simulator.positions, np.array(up(simulator.time))) is None
+    assert simulator.velocities[:, 1].mean() > 0.3
+
+
+def test_refusals_name_what_they_are_about():
+    with pytest.raises(Overlap, match=r"an edge of Box.* and triangle \(\d+, \d+, \d+\); move"):
+        ds.Simulator(ds.ImplicitEulerSolver(cube(below("edge of a box", -1e-3)), dt=1e-3))
+    with pytest.raises(ValueError, match="HalfSpace: by_pairs is for shapes of points and edges"):
+        ds.HalfSpace(by_pairs=True)
