@@ -1,4 +1,4 @@
-"""Whether surfaces pass through each other, by exact arithmetic: the judge of contact, which shares no code with the package.
+"""Whether surfaces pass through each other, by exact arithmetic: a judge that shares no code with the package.
 
 Coordinates are taken as the binary fractions that they are. The sign of a determinant comes from floating point where its
 error bound leaves no doubt, else from integers of any length.
@@ -154,8 +154,8 @@ class ExactJudge:
         self.by_triangles, self.by_tetrahedra = Tree(self.triangles, x), Tree(self.tetrahedra, x)
 
     def pierced(self, x) -> np.ndarray:
-        """Edges and triangles without a common vertex that touch or pierce each other at x, shape (k, 2): rows of `edges` and
-        of `triangles`. No such pair: surfaces do not intersect, but one may lie wholly within another (`inside`)."""
+        """Edges and triangles without a common vertex that touch or pierce each other at x, shape (k, 2): rows of `edges`
+        and of `triangles`. Without such pairs surfaces do not intersect, but one may lie wholly within another (`inside`)."""
         x = np.asarray(x, np.float64)
         self.by_triangles.fit(x)
         ends = x[self.edges]
@@ -168,7 +168,7 @@ class ExactJudge:
         return np.stack([e[meet], t[meet]], 1)
 
     def inside(self, x) -> np.ndarray:
-        """`points` within or on tetrahedra of which they are no corner, at x, shape (k, 2): vertices, rows of `tetrahedra`."""
+        """`points` within or on tetrahedra of which they are no corner, at x, shape (k, 2): (vertex, row of `tetrahedra`)."""
         x = np.asarray(x, np.float64)
         self.by_tetrahedra.fit(x)
         i, t = self.by_tetrahedra.overlaps(x[self.points], x[self.points])
