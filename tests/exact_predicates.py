@@ -155,7 +155,7 @@ class ExactJudge:
 
     def pierced(self, x) -> np.ndarray:
         """Edges and triangles without a common vertex that touch or pierce each other at x, shape (k, 2): rows of `edges`
-        and of `triangles`. Without such pairs surfaces do not intersect, but one may lie wholly within another (`inside`)."""
+        and of `triangles`. Without such pairs surfaces do not intersect; one may lie wholly within another (`inside`)."""
         x = np.asarray(x, np.float64)
         self.by_triangles.fit(x)
         ends = x[self.edges]
@@ -168,7 +168,7 @@ class ExactJudge:
         return np.stack([e[meet], t[meet]], 1)
 
     def inside(self, x) -> np.ndarray:
-        """`points` within or on tetrahedra of which they are no corner, at x, shape (k, 2): (vertex, row of `tetrahedra`)."""
+        """`points` within or on tetrahedra of which they are no corner, at x, shape (k, 2): vertex, row of `tetrahedra`."""
         x = np.asarray(x, np.float64)
         self.by_tetrahedra.fit(x)
         i, t = self.by_tetrahedra.overlaps(x[self.points], x[self.points])
