@@ -15,6 +15,7 @@ def why_not(solver) -> str | None:
     if runtime.runs_on_cpu() and not scene.law.lanes:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
     terms = dict(self_contact=scene.term(SelfContact)) | {x.name: True for x in scene.interactions if x.apart}
+    terms |= dict(contact_by_pairs=any(term.primitives is not None for term in scene.terms))
     terms |= dict(contact_within_faces=has_face_contact(scene), mesh_obstacles=_tables(scene))
     terms |= dict(reduced_sets=scene.reduced)
     there = [name.replace("_", " ") for name, some in terms.items() if some]

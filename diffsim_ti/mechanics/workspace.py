@@ -17,7 +17,7 @@ from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.bending import Bending
 from diffsim_ti.state.history import History, first_bad_vertex
-from diffsim_ti.state.obstacle_poses import Moment
+from diffsim_ti.state.obstacle_poses import AT_STAGE, Moment
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactWatch
 
@@ -57,7 +57,7 @@ class Workspace:
             self.scene, solver.stages_contact, self.has_face_contact(self.scene, bend), explicit, not explicit, bend
         )
         self.parallel = solver.runs_parallel()
-        self.pairs = pairs_of(self.pairs_kind, self.arrays, self.parallel) if self.arrays.self_contact else None
+        self.pairs = pairs_of(self.pairs_kind, self.arrays, self.parallel)
         self.state = self.history(1)
         self.record: History | None = None
         self.frames = FrameArrays.of(self.arrays, 1, 1)
@@ -99,6 +99,8 @@ class Workspace:
     def place_obstacles(self, now: int) -> None:
         """Put obstacles where they are before pass `now`, for what looks at the state there."""
         self.arrays.place_obstacles(self.solver.schedule, now)
+        if self.pairs:
+            self.pairs.follow(runtime.fetch(self.arrays.offsets).astype(np.float64), AT_STAGE)
 
     @property
     def mass(self) -> Mass:

@@ -134,3 +134,20 @@ def three(name: str, given, one_will_do: bool = False) -> np.ndarray:
     if not np.all(np.isfinite(values)) or values.shape != (3,) and not (one_will_do and values.shape == ()):
         raise ValueError(f"{name} must be {'one or ' if one_will_do else ''}three finite numbers, got {shown(given)}")
     return np.broadcast_to(values, (3,))
+
+
+def curve_order(points: np.ndarray) -> np.ndarray:
+    """Indices of points, shape (n, 3), in the order of Morton's curve through their bounding box."""
+    lowest = points.min(0)
+    cells = (
+        ((points - lowest) * (2**20 / max(np.ptp(points, axis=0).max(), 1e-300))).astype(np.int64).clip(0, 2**20 - 1)
+    )
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        cells = (cells | (cells << shift)) & mask
+    return np.argsort(cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2), kind="stable")

@@ -77,7 +77,7 @@ class SelfContactForce(Output):
         out.scene, out.arrays, n = scene, SceneArrays(scene), scene.mesh.num_vertices
         out.num_obstacles = len(scene.obstacles)
         out.vertices = np.arange(n) if self.on is None else np.unique(scene.mesh.vertex_indices(self.on))
-        out.pairs, out.surface = pairs_of(ImplicitPairs, out.arrays, False), scene.mesh.surface_vertices
+        out.pairs, out.surface = pairs_of(ImplicitPairs, out.arrays, False, with_obstacles=False), scene.mesh.surface_vertices
         out.pair_friction = None if self.part == "normal" else out.pairs.friction
         return out
 
@@ -141,14 +141,13 @@ class SelfContactForce(Output):
         self.arrays.load(self.scene.inputs.derive(frames.inputs))
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         numbers, zero, out = Tangent(self.arrays, moved), np.zeros(frames.positions.shape), []
-        by = tuple(float(x) for x in moved.parameters[self.arrays.parameters_of_self_contact][:2])
         dx = zero if change.positions is None else change.positions
         dv = zero if change.velocities is None else change.velocities
         for k in range(len(zero)):
             (u, pair_friction), du, df = self._place(frames, k), dx[k] - moved.rest, np.zeros(zero.shape[1:])
             if self.part != "friction":
                 runtime.fill(self.pairs.step, du[None])
-                self.pairs.product(self.pairs.next, 0, self.pairs.step, self.arrays.corner, numbers.rest, by)
+                self.pairs.product(self.pairs.next, 0, self.pairs.step, self.arrays.corner, numbers.rest, moved.parameters)
                 df += self._at_corners()
             if self._is_noted(frames, k) and change.contact_forces is not None:
                 df = df + change.contact_forces[k, -1, 1]
@@ -185,7 +184,7 @@ class SelfContactForce(Output):
             rest -= by_u
         adjoint = derived.zeros()
         by_numbers, by_rest = self.pairs.collect()
-        adjoint.parameters[self.arrays.parameters_of_self_contact] = by_numbers
+        adjoint.parameters += by_numbers
         adjoint.rest = rest + by_rest
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         return Change(positions, velocities, inputs, contact_forces=noted)

@@ -105,8 +105,11 @@ class SceneArrays:
         if not isinstance(self.place, slice):
             corner_of = self.nodes * self.place[corner_of // self.nodes] + corner_of % self.nodes
             corner_of = corner_of[np.lexsort((corner_of, np.repeat(np.arange(n), np.diff(start))))]
-        if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
+        self.parameters_of_self_contact = slice(0, 0)
+        if self.self_contact:
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
+        if self.self_contact or any(term.primitives is not None for term in self.contacts):
+            # each surface vertex gathers one corner more, after those of its tetrahedra
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
         self.first_corner = num_corners  # of interactions
@@ -144,7 +147,8 @@ class SceneArrays:
             rows = scene.inputs.parameters.of(term)
             counterpart = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
             if isinstance(term, Obstacle):
-                counterpart = replace(counterpart, per_area=term.per_area, turns=term.turns)
+                kind = dict(per_area=term.per_area, turns=term.turns, by_pairs=term.primitives is not None)
+                counterpart = replace(counterpart, **kind)
             if counterpart.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
                 raise AssertionError(
                     f"the kernel of {term!r} has {counterpart.size} numbers, its term {rows.stop - rows.start}"

@@ -146,7 +146,7 @@ class Features:
 
     def reaches(self, group: ObstacleGroup) -> bool:
         """Whether obstacles may be nearer to a point within a face than to its corners."""
-        return self.curved or not group.force.hollow
+        return self.curved or not (group.force.hollow or group.force.by_pairs)
 
     def of_state(self) -> "Features":
         """What energies, forces and their derivatives in a given state see of it: scenes that differ in the rest share their

@@ -31,6 +31,7 @@ class Term(ABC):
     """
 
     acts_on_surface = False
+    primitives = None  # by which an obstacle acts on faces and edges of bodies too (terms/obstacles/primitives.py)
     interaction = None  # the kind of interaction (mechanics/interaction.py) that a term of a user brings with it
     path = None  # displacement over time, of an obstacle that moves
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device

@@ -14,6 +14,7 @@ from diffsim_ti.mechanics.obstacles.face_contact import FaceContact
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.patch_coupling import PatchCoupling
 from diffsim_ti.runtime.slots import copy_slot
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 
 class Potential:
@@ -76,9 +77,12 @@ class Potential:
         if len(poses):
             runtime.fill(self.poses, poses)
         if self.pairs:
+            self.pairs.follow(poses, AT_BEGIN)
             self.pairs.begin(u)
         if self.surface_friction:
             self.surface_friction.begin(u, x, per_gamma)
+        if self.pairs:
+            self.pairs.follow(poses, AT_STAGE)
 
     def place(self, u: np.ndarray) -> np.ndarray:
         """Go to displacement u [m]; returns it as the device holds it."""

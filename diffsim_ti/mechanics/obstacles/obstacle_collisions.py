@@ -9,7 +9,7 @@ from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mechanics.obstacles.blocked import Blocked
 from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
-from diffsim_ti.state.obstacle_poses import Moment
+from diffsim_ti.state.obstacle_poses import AT_STAGE, Moment
 from diffsim_ti.state.stage import Stage
 
 
@@ -62,6 +62,8 @@ class ObstacleCollisions:
         self.rows[::3] = places
         if len(places):
             runtime.fill(self.ws.potential.poses, self.rows)
+        if self.ws.pairs:
+            self.ws.pairs.follow(self.rows, AT_STAGE)
 
     def check_apart(self) -> None:
         """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""

@@ -14,6 +14,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mesh.geometry import curve_order
 from diffsim_ti.runtime import LANES, NUMPY, Kernel, kernels_of, number_type, vector_type
 
 A = ti.template()
@@ -99,13 +100,14 @@ class BoxKernels:
 
     @ti.func
     def slack_of(self, p, scene: A, tree: A):
-        """Largest slacks of the corners of primitive p, towards its own body and others, and the number of the body."""
+        """Largest slacks of the corners of primitive p, towards its own body and others, the number of the body, and what
+        its reach is larger by."""
         s = scene.place[tree.corners[self.size * p]]
         own, other = scene.slack[s][0], scene.slack[s][1]
         for k in ti.static(range(1, self.size)):
             slack = scene.slack[scene.place[tree.corners[self.size * p + k]]]
             own, other = ti.max(own, slack[0]), ti.max(other, slack[1])
-        return self.vector(own, other, ti.cast(scene.body[s], self.fp), ti.cast(0, self.fp))
+        return self.vector(own, other, ti.cast(scene.body[s], self.fp), scene.slack[s][2])
 
     @ti.func
     def box(self, p, scene: A, tree: A, plan: A):
@@ -115,7 +117,7 @@ class BoxKernels:
         for k in ti.static(range(1, self.size)):
             x = self.at(tree.corners[self.size * p + k], scene, plan)
             lo, hi = ti.min(lo, x), ti.max(hi, x)
-        wide = ti.cast(MARGIN, self.fp) * (ti.cast(0.5, self.fp) * plan.reach + ti.max(slack[0], slack[1]))
+        wide = ti.cast(MARGIN, self.fp) * (ti.cast(0.5, self.fp) * plan.reach + ti.max(slack[0], slack[1]) + slack[3])
         largest = ti.max(ti.abs(lo), ti.abs(hi))
         wide += ti.cast(self.rounding, self.fp) * ti.max(largest[0], ti.max(largest[1], largest[2]))
         widening = self.vector(wide, wide, wide, ti.cast(0, self.fp))
@@ -193,20 +195,3 @@ class BoxTree:
             subtrees = max(1, self.leaves // SUBTREES)
             roots = max(1, subtrees // SUBTREES)
         return dict(count=self.count, leaves=self.leaves, subtrees=subtrees, roots=roots)
-
-
-def curve_order(points: np.ndarray) -> np.ndarray:
-    """Indices of points, shape (n, 3), in the order of Morton's curve through their bounding box."""
-    lowest = points.min(0)
-    cells = (
-        ((points - lowest) * (2**20 / max(np.ptp(points, axis=0).max(), 1e-300))).astype(np.int64).clip(0, 2**20 - 1)
-    )
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        cells = (cells | (cells << shift)) & mask
-    return np.argsort(cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2), kind="stable")

@@ -25,7 +25,9 @@ class CandidatePairs:
 
     scale: of each edge pair, 1 / sqrt(10^-3 A^2 B^2) with the lengths A, B given. row, corner_of: the corners 4 p + k
     that meet at surface vertex s are corner_of[row[s] : row[s + 1]], in order. slack [m], of each surface vertex: what its
-    primitives' reach is larger by, towards those of the same body and of others; zero unless set. body: of each vertex.
+    primitives' reach is larger by, towards those of the same body and of others, and then in any case; zero unless set.
+    body: of each vertex. kinematic: what obstacles bring (kinematic_surface.py), None without; the last edges and vertices
+    of the surface are theirs, and its area is what each pair has of the body's surface.
     """
 
     def __init__(
@@ -37,22 +39,29 @@ class CandidatePairs:
         body: np.ndarray,
         precision: str,
         parallel: bool = True,
+        kinematic=None,
     ):
+        self.kinematic, has = kinematic, kinematic is not None
+        self.own, self.meet = (kinematic.own_edges, kinematic.meeting_edges) if has else (len(edges), len(edges))
         self.searches = [kernels_of(Search, precision, parallel, kind) for kind in (VERTEX_TRIANGLE, EDGE_EDGE)]
         self.piercing, self.lists = (
             kernels_of(Piercing, precision, parallel),
-            kernels_of(ListKernels, precision, parallel),
+            kernels_of(ListKernels, precision, parallel, has),
         )
         self.launch, self.fp = Launches(), runtime.PRECISIONS[precision]
         self.buffers = Buffers(self.launch, parallel)
-        self.trees = tuple(BoxTree(c, precision, parallel, self.launch) for c in (surface[:, None], triangles, edges))
-        self.surface, self.num_surface = self.trees[0].corners, len(surface)
-        self.lengths, self.typical = runtime.upload(lengths, self.fp), float(lengths.mean())
+        acting = kinematic.acting if has else surface  # on triangles
+        self.trees = tuple(BoxTree(c, precision, parallel, self.launch) for c in (acting[:, None], triangles, edges))
+        self.surface = runtime.upload(surface, ti.i32) if has else self.trees[0].corners
+        if has:
+            self.area_t, self.area_e = (runtime.upload(x, self.fp) for x in kinematic.areas)
+        self.num_surface = len(surface)
+        self.lengths, self.typical = runtime.upload(lengths, self.fp), float(lengths[: self.own].mean())
         place = np.full(len(body), -1)
         place[surface] = np.arange(len(surface))
         self.place, self.body = runtime.upload(place, ti.i32), runtime.upload(body[surface], ti.i32)
         self.slack = runtime.upload(np.zeros((len(surface), 4)), ti.types.vector(4, self.fp))
-        self.row_t, self.row_e = runtime.array(ti.i32, len(surface) + 1), runtime.array(ti.i32, len(edges) + 1)
+        self.row_t, self.row_e = runtime.array(ti.i32, len(acting) + 1), runtime.array(ti.i32, len(edges) + 1)
         self.row, self.cursor = (runtime.array(ti.i32, len(surface) + 1) for _ in range(2))
         self.most = runtime.array(ti.i32, 1)
         self.num_vt = self.num_ee = 0
@@ -63,6 +72,8 @@ class CandidatePairs:
         count, b = self.num_vt + self.num_ee, self.buffers
         self.pairs, self.corner_of = b.take("pairs", ti.i32, 4 * count), b.take("corners", ti.i32, 4 * count)
         self.scale = b.take("scale", self.fp, self.num_ee)
+        if self.kinematic is not None:
+            self.area = b.take("area", self.fp, count)
 
     @property
     def count(self) -> int:
@@ -71,6 +82,7 @@ class CandidatePairs:
     def _find(self, kind: int, of: BoxTree, among: BoxTree, row, scene, slot: int, reach: float):
         """Partners of each primitive of a tree, `room` places for each; their numbers, summed, in `row`."""
         counts = dict(slot=slot, count=of.count, leaves=of.leaves, groups=of.groups, their_leaves=among.leaves)
+        counts |= dict(own=self.own, meet=self.meet)
         while True:
             partner = self.buffers.take(f"partners {kind}", ti.i32, self.room[kind] * of.count)
             runtime.fill(self.most, 0)
@@ -95,7 +107,7 @@ class CandidatePairs:
         self._take()
         found = SimpleNamespace(partner_t=partner_t, partner_e=partner_e), self
         write = self.launch(self.lists.write, list=self, found=found, vertices=v, triangles=t, edges=e)
-        sizes = dict(num_surface=self.num_surface, num_edges=e.count, num_vt=self.num_vt)
+        sizes = dict(num_vertices=v.count, num_edges=e.count, num_vt=self.num_vt)
         write(room_t=self.room[0], room_e=self.room[1], factor=PARALLEL**-0.5, **sizes)
         corners = dict(count=4 * self.count, num_surface=self.num_surface)
         self.launch(self.lists.count, list=self)(**corners)
@@ -107,7 +119,8 @@ class CandidatePairs:
         _, t, e = self.trees
         pierced = runtime.array(ti.i32, e.count)
         records = dict(scene=SimpleNamespace(rest=rest, u=u), mine=e, theirs=t, out=SimpleNamespace(pierced=pierced))
-        self.piercing.find.bind(**records)(slot=slot, count=e.count, their_count=t.count, leaves=t.leaves)
+        first = 0 if self.meet else self.own
+        self.piercing.find.bind(**records)(slot=slot, count=e.count, their_count=t.count, leaves=t.leaves, first=first)
         found = runtime.fetch(pierced)[: e.count]
         worst = int(np.argmax(found >= 0))
         return (worst, int(found[worst])) if found[worst] >= 0 else None

@@ -40,11 +40,11 @@ def bits_from(first):
 
 @ti.func
 def reach_of(reach, mine, theirs):
-    """Reach of a pair of primitives with slacks (own body, others, number of the body)."""
+    """Reach of a pair of primitives with slacks (own body, others, number of the body, what its reach is larger by)."""
     slack = mine[1] + theirs[1]
     if mine[2] == theirs[2]:
         slack = mine[0] + theirs[0]
-    return reach + slack
+    return reach + slack + mine[3] + theirs[3]
 
 
 @ti.func
@@ -115,7 +115,7 @@ class Search(Pair):
                 reach = reach_of(plan.reach, mine.slacks[e], theirs.slacks[p])
                 if ti.static(self.kind == VERTEX_TRIANGLE):
                     near = self.near_triangle(e, p, reach, scene, mine, theirs, plan.slot)
-                elif e < p:
+                elif e < p and e < plan.own and (p < plan.meet or p >= plan.own):
                     near = self.near_edge(e, p, reach, scene, mine, plan.slot)
                 if near:
                     k = out.row[e]
@@ -156,12 +156,13 @@ class Search(Pair):
     def find(self) -> Kernel:
         """Partners of each primitive in the tree of `theirs`, in order, at most `room`, and their number.
 
-        Of two edges the smaller number gets the larger one. On a CPU they walk from their own leaf on, so that each two
+        Of two edges the smaller number gets the larger one; edges below `own` are of bodies, which meet each other only where
+        both are below `meet`. On a CPU they walk from their own leaf on, so that each two
         meet once; elsewhere each looks at all and adds to its own row alone, as software Vulkan (Mesa 22.3) leaves a
         loop at its second atomic.
         """
         arrays = dict(scene=PLACE, mine=TREE, theirs=TREE, out=dict.fromkeys(("row", "partner", "most"), "ints"))
-        numbers = dict.fromkeys(("slot", "count", "leaves", "groups", "their_leaves", "room"), "int")
+        numbers = dict.fromkeys(("slot", "count", "leaves", "groups", "their_leaves", "room", "own", "meet"), "int")
         return Kernel("find", self.search, self.precision, arrays, numbers | dict(reach="float"))
 
 
@@ -192,6 +193,8 @@ class Piercing:
             e, node = mine.order[k], 1
             i, j, lo, hi = mine.corners[2 * e], mine.corners[2 * e + 1], mine.items[2 * k], mine.items[2 * k + 1]
             out.pierced[e] = -1
+            if e < plan.first:
+                node = 0
             while node > 0:
                 if overlap(node, lo, hi, theirs.boxes):
                     if node < plan.leaves:
@@ -209,7 +212,7 @@ class Piercing:
 
     @cached_property
     def find(self) -> Kernel:
-        """pierced[e]: the triangle of largest number that edge e passes through, or -1."""
+        """pierced[e]: the triangle of largest number that edge e >= first passes through, or -1."""
         arrays = dict(scene=PLACE, mine=TREE, theirs=TREE, out=dict(pierced="ints"))
-        numbers = dict.fromkeys(("slot", "count", "their_count", "leaves"), "int")
+        numbers = dict.fromkeys(("slot", "count", "their_count", "leaves", "first"), "int")
         return Kernel("find_piercing", self.walk, self.precision, arrays, numbers)

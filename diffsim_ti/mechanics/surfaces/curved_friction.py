@@ -1,4 +1,4 @@
-"""Friction between curved surfaces: that of a finer surface (curved_pairs.py), whose vertices are sums over nodes, x = C X.
+"""Friction of pairs whose vertices are sums over nodes, x = C X + g, g of corners of obstacles (curved_pairs.py).
 
 In implicit passes all is a potential of the points, and friction on nodes C^T that on points. In explicit ones the pairs see
 velocities C v, and impulses j of points change those of nodes by M^-1 C^T j. The bound of friction_kernels.py that no
@@ -18,6 +18,7 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.lagged_friction import LaggedFriction
 from diffsim_ti.mechanics.surfaces.pair_friction import ratio_by_rate
 from diffsim_ti.runtime.slots import VertexRows
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 
 class CurvedLaggedFriction:
@@ -27,34 +28,56 @@ class CurvedLaggedFriction:
         self.pairs, self.inner, self.C = pairs, pairs.inner.friction, pairs.matrix
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
-        self.inner.begin(self.C @ u, self.C @ x, per_gamma)
+        """With obstacles where the pass begins; their corners have x = g - v / per_gamma, g where forces are taken."""
+        self.given, there = 0.0, self.C @ x
+        if self.pairs.obstacles:
+            obstacles, first = self.pairs.obstacles, self.pairs.finer.mesh.first
+            self.given = np.zeros_like(there)
+            self.given[first:] = obstacles.displacements_at(obstacles.rows)
+            there[first:] = self.given[first:] - obstacles.velocities() / per_gamma
+        self.inner.begin(self.pairs._spread(u), there, per_gamma)
+
+    def _fine(self, u: np.ndarray) -> np.ndarray:
+        return self.C @ u + self.given
 
     def energies(self, u: np.ndarray) -> np.ndarray:
-        return self.inner.energies(self.C @ u)
+        return self.inner.energies(self._fine(u))
 
     def forces(self, u: np.ndarray) -> np.ndarray:
-        return self.C.T @ self.inner.forces(self.C @ u)
+        return self.C.T @ self.inner.forces(self._fine(u))
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
-        return abs(self.C).T @ self.inner.sizes(self.C @ u)
+        return abs(self.C).T @ self.inner.sizes(self._fine(u))
 
     def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
-        return self.C.T @ self.inner.product(self.C @ u, self.C @ w, convex)
+        return self.C.T @ self.inner.product(self._fine(u), self.C @ w, convex)
 
     def clear_sums(self) -> None:
         """The finer surface has them."""
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """Those of points by squares of what nodes have of them."""
-        of_points = self.inner.blocks(self.C @ u)
+        of_points = self.inner.blocks(self._fine(u))
         return (self.C.power(2).T @ of_points.reshape(-1, 9)).reshape(-1, 3, 3)
 
-    def jvp(self, u, du, dx, du_begin, numbers) -> np.ndarray:
-        C = self.C
-        return C.T @ self.inner.jvp(C @ u, C @ du, C @ dx, C @ du_begin, self.pairs.fine_numbers(numbers))
+    def jvp(self, u, du, dx, du_begin, numbers, poses_dot=None) -> np.ndarray:
+        """poses_dot: changes of the rows of poses, None: zero."""
+        C, obstacles = self.C, self.pairs.obstacles
+        changes = [C @ du, C @ dx, C @ du_begin]
+        if obstacles:
+            given = obstacles.changes(self.pairs.parameters_of(numbers), poses_dot)
+            for change, corners in zip(changes, (given[0], given[0] - given[2] / self.inner.per_gamma, given[1])):
+                change[self.pairs.finer.mesh.first :] = corners
+        return C.T @ self.inner.jvp(self._fine(u), *changes, self.pairs.fine_numbers(numbers))
 
     def vjp(self, u: np.ndarray, forces_adj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return tuple(self.C.T @ by for by in self.inner.vjp(self.C @ u, self.C @ forces_adj))
+        found, obstacles = self.inner.vjp(self._fine(u), self.C @ forces_adj), self.pairs.obstacles
+        if obstacles:
+            by_u, by_x, by_begin = (by[self.pairs.finer.mesh.first :] for by in found)
+            obstacles.add_places(by_u + by_x, AT_STAGE)
+            obstacles.add_places(by_begin, AT_BEGIN)
+            obstacles.add_velocities(-by_x / self.inner.per_gamma)
+        return tuple(self.C.T @ by for by in found)
 
 
 class CurvedFriction:
@@ -76,7 +99,7 @@ class CurvedFriction:
         for array in (self.unread, self.no_mass, self.no_state):
             runtime.fill(array, 0)
         self.kept: dict[int, tuple | None] = {}  # of recorded passes, by slots: u and v before the stage, what v gained
-        self._mass = None
+        self._mass, self.obstacles, self.v_dot = None, pairs.obstacles, 0.0
 
     # ---- what points feel of the nodes' masses -----------------------------------------------------------------------
 
@@ -101,11 +124,17 @@ class CurvedFriction:
         """What nodes may do of vectors."""
         return np.einsum("nij,nj->ni", self.free, x)
 
-    def _at_points(self, of_nodes: np.ndarray) -> np.ndarray:
-        """Of all vertices of the finer surface, from vectors of the surface's nodes."""
+    def _at_points(self, of_nodes: np.ndarray, of_corners=0.0) -> np.ndarray:
+        """Of all vertices of the finer surface, from vectors of the surface's nodes, and of corners of obstacles."""
         out = np.zeros((1, self.pairs.finer.num_vertices, 3))
         out[0, self.points] = self.C @ of_nodes
+        if self.obstacles:
+            out[0, self.pairs.finer.mesh.first :] = of_corners
         return out
+
+    def _velocities(self, v: np.ndarray) -> np.ndarray:
+        """Of all vertices of the finer surface."""
+        return self._at_points(v, self.obstacles.velocities() if self.obstacles else 0.0)
 
     def _of_points(self, array) -> np.ndarray:
         """Sums for the surface's nodes, from vectors of all vertices of the finer surface."""
@@ -135,7 +164,7 @@ class CurvedFriction:
         if not (plan.alpha > 0 and self.in_friction):
             return
         u, v = self.rows.get(history.u, slot), self.rows.get(history.v, slot)
-        before = self._at_points(v)
+        before = self._velocities(v)
         runtime.fill(self.v, before)
         self.inner.run(self.inner.kernels.slide, self._state(), slot=0, keep=-1, **self.inner.pass_numbers(plan))
         gained = self.inverse * self.freed(self._impulses(self.v, before))
@@ -161,12 +190,17 @@ class CurvedFriction:
 
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
-    def begin_jvp(self, history, slot: int, u_dot, numbers) -> None:
+    def begin_jvp(self, history, slot: int, u_dot, numbers, poses_dot=None) -> None:
         self._begin(history, slot)
         if not self.in_friction:
             return
         own, moved = self.inner.own, self.pairs.fine_numbers(numbers)
-        self.inner.changes(self.pairs.fine(history.u, slot), 0, self.pairs.fine_change(u_dot), moved)
+        given = "unmoved"
+        if self.obstacles:
+            parameters_dot, given = self.pairs.parameters_of(numbers), "given_dot"
+            self.obstacles.change(parameters_dot, poses_dot)
+            self.v_dot = self.obstacles.changes(parameters_dot, poses_dot)[2]
+        self.inner.changes(self.pairs.fine(history.u, slot), 0, self.pairs.fine_change(u_dot, given), moved)
         change = self._where_friction_acts(own.load_dot)
         self.inverse_dot = -(self.inverse**2) * runtime.fetch(numbers.mass).astype(np.float64)[self.rows.nodes, None]
         spread = self._spread(change, self.inverse) + self._spread(self.load, self.inverse_dot)
@@ -177,8 +211,8 @@ class CurvedFriction:
         if kept is None:
             return
         dv = self.rows.get(v_dot, 0)
-        before = self._at_points(dv)
-        runtime.fill(self.v, self._at_points(kept[1]))
+        before = self._at_points(dv, self.v_dot)
+        runtime.fill(self.v, self._velocities(kept[1]))
         runtime.fill(self.dv, before)
         at = dict(du=self.unread, dv=self.dv, mass_dot=self.no_mass, parameters_dot=numbers.parameters)
         of_pass = self.inner.pass_numbers(plan)
@@ -211,18 +245,23 @@ class CurvedFriction:
         inner.take("weights_adj", "pressing_adj")
         inner.take("mu_adj", scalar=True)
         runtime.fill(own.pulled, self.C @ (self.inverse * self.freed(by_gained)))
-        runtime.fill(self.v, self._at_points(kept[1]))
+        runtime.fill(self.v, self._velocities(kept[1]))
         runtime.fill(self.dv, 0)
         at = self._state() | inner.adjoints | dict(v_adj=self.dv)
         inner.run(inner.kernels.pairs_vjp, at, slot=0, keep=0, **of_pass)
         self.rows.put(adjoint.v, 0, q + self._of_points(self.dv))
+        if self.obstacles:
+            self.obstacles.add_velocities(runtime.fetch_row(self.dv, 0)[self.pairs.finer.mesh.first :])
         by_load = self._where_friction_acts(own.load_adj)
         by_inverse = (self.size.T @ by_load) * (self.size.T @ self.load) / self.lightness
         self.by_mass[:, 0] -= self.inverse[:, 0] ** 2 * by_inverse
         runtime.fill(own.load_adj, self._spread(by_load, self.inverse))
         at = dict(place=self.pairs.fine(history.u, slot), **{k: inner.adjoints[k] for k in ("by_place", "by_mu")})
         inner.run(inner.kernels.measure_vjp, at, slot=0, begin=0, num_rows=inner.num_rows)
-        self.by_place = self.C.T @ runtime.fetch(inner.adjoints["by_place"]).astype(np.float64)
+        by_place = runtime.fetch(inner.adjoints["by_place"]).astype(np.float64)
+        self.by_place = self.C.T @ by_place
+        if self.obstacles:
+            self.obstacles.add_places(by_place[len(self.pairs.finer.mesh.body.surface_vertices) :])
 
     def add_place(self, adjoint) -> None:
         self.rows.put(adjoint.u, 0, self.rows.get(adjoint.u, 0) + self.by_place)

@@ -1,5 +1,6 @@
-"""Contact of curved surfaces with each other: pairs of a finer surface (mesh/collision_surface.py), whose vertices x = C X
-are sums over nodes. Displacements go to them by C, forces back by C^T; all between is that of linear tetrahedra."""
+"""Contact of surfaces whose vertices are not those of the mesh, x = C X + g: sums over nodes, of the finer surface of curved
+faces (mesh/collision_surface.py), and corners of obstacles, which their poses give (kinematic_surface.py). Displacements go
+to them by C and g, forces back by C^T; all between is that of linear tetrahedra."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +12,8 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import Launches
 from diffsim_ti.mechanics.surfaces.curved_friction import friction_of
+from diffsim_ti.mechanics.surfaces.kinematic_surface import KinematicSurface, ObstacleCorners, ObstacleMotion
+from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.runtime import Kernel, kernels_of, vector_type
 
@@ -18,10 +21,20 @@ A = ti.template()
 ROWS = dict(start="ints", index="ints", weight="scalars")
 
 
-def pairs_of(kind: type, arrays, parallel: bool):
-    """Pairs of a kind (surface_pairs.py, implicit_pairs.py), of a finer surface where faces are curved and smooth."""
-    cuts = cuts_of(arrays.mesh, arrays.self_contact, arrays.bend)
-    return CurvedPairs(kind, arrays, parallel, cuts) if cuts else kind(arrays, parallel)
+def pairs_of(kind: type, arrays, parallel: bool, with_obstacles: bool = True):
+    """Pairs of a kind (surface_pairs.py, implicit_pairs.py), of a finer surface where faces are curved and smooth, and with
+    the corners of obstacles; None where a scene has none."""
+    mesh, term, parts = arrays.mesh, arrays.self_contact, False
+    if with_obstacles and any(x.primitives is not None for x in arrays.contacts):
+        corners = ObstacleCorners(arrays)
+        parts = True
+    if not (term or parts):
+        return None
+    cuts = cuts_of(mesh, term, arrays.bend) if term else 0
+    surface = CollisionSurface(mesh, cuts) if cuts else mesh
+    if parts:
+        surface = KinematicSurface(surface, surface_edges(surface), corners, term)
+    return kind(arrays, parallel) if surface is mesh else CurvedPairs(kind, arrays, parallel, surface)
 
 
 @dataclass(frozen=True)
@@ -30,9 +43,10 @@ class Transfer:
 
     precision: str
     parallel: bool
+    has_given: bool = False  # whether vertices have a part that no node gives
 
-    def _kernel(self, name: str, body, source: str, target: str, **numbers) -> Kernel:
-        own = dict(rows=ROWS, at=dict(source=source, target=target))
+    def _kernel(self, name: str, body, source: str, target: str, given: dict | None = None, **numbers) -> Kernel:
+        own = dict(rows=ROWS, at=dict(source=source, target=target) | (given or {}))
         return Kernel(name, body, self.precision, own, dict(count="int") | numbers)
 
     vector = vector_type
@@ -44,12 +58,15 @@ class Transfer:
             total = self.vector(0)
             for m in range(rows.start[k], rows.start[k + 1]):
                 total += rows.weight[m] * at.source[plan.slot, rows.index[m]]
+            if ti.static(self.has_given):
+                total += at.given[k]
             at.target[0, k] = total
 
     @cached_property
     def refine(self) -> Kernel:
-        """target[0] = C source[slot]"""
-        return self._kernel("refine", self.refine_all, "vectors2", "vectors2", slot="int")
+        """target[0] = C source[slot] + given"""
+        given = dict(given="vectors") if self.has_given else {}
+        return self._kernel("refine", self.refine_all, "vectors2", "vectors2", given, slot="int")
 
     @ti.func
     def gather_all(self, rows: A, at: A, plan: A):
@@ -81,11 +98,11 @@ class Transfer:
 
 
 class FinerArrays:
-    """What pairs read of the arrays of a scene, for the vertices of its collision surface."""
+    """What pairs read of the arrays of a scene, for the vertices of another surface."""
 
     first_contact_corner = 0
 
-    def __init__(self, arrays, surface: CollisionSurface):
+    def __init__(self, arrays, surface: "CollisionSurface | KinematicSurface"):
         self.scene, self.mesh, self.precision = arrays, surface, arrays.precision
         self.self_contact, self.num_vertices = arrays.self_contact, surface.num_vertices
         self.parameters_of_self_contact = arrays.parameters_of_self_contact
@@ -93,7 +110,7 @@ class FinerArrays:
         self.supports = SimpleNamespace(partly_fixed=())  # nodes are held
         self.rest = runtime.array(arrays.vector, surface.num_vertices)
         self.corner = runtime.array(arrays.vector, len(surface.surface_vertices))
-        self._rest_of = None
+        self._taken = None
 
     @property
     def values(self):
@@ -110,19 +127,25 @@ class FinerArrays:
 
     def follow(self) -> None:
         """Take the rest shape that the scene has loaded."""
-        if self._rest_of is not self.values.rest:
-            self._rest_of = self.values.rest
-            runtime.fill(self.rest, self.mesh.matrix @ (self.values.rest - self.scene.origin))
+        if self._taken is not self.values:
+            self._taken, rest = self.values, self.mesh.matrix @ (self.values.rest - self.scene.origin)
+            if isinstance(self.mesh, KinematicSurface):
+                rest[self.mesh.first :] = self.mesh.corners.made(self.values.parameters)
+            runtime.fill(self.rest, rest)
 
 
 class CurvedPairs:
     """As SurfacePairs or ImplicitPairs, for arrays of the nodes. Numbers of vertices in messages that the mesh does not have
-    are those of the collision surface."""
+    are those of the collision surface.
 
-    def __init__(self, kind: type, arrays, parallel: bool, cuts: int):
-        surface = CollisionSurface(arrays.mesh, cuts)
+    obstacles: where corners of obstacles are (ObstacleMotion), None without.
+    """
+
+    def __init__(self, kind: type, arrays, parallel: bool, surface: "CollisionSurface | KinematicSurface"):
         self.a, self.finer, self.matrix = arrays, FinerArrays(arrays, surface), surface.matrix
-        self.inner, self.kernels = kind(self.finer, parallel), kernels_of(Transfer, arrays.precision, parallel)
+        self.obstacles = ObstacleMotion(surface, arrays) if isinstance(surface, KinematicSurface) else None
+        self.inner = kind(self.finer, parallel)
+        self.kernels = kernels_of(Transfer, arrays.precision, parallel, self.obstacles is not None)
         fp, vector, n = arrays.fp, arrays.vector, arrays.num_vertices
         self.down, self.up = _rows(surface.matrix, fp), _rows(surface.matrix.T.tocsr(), fp)
         of_corners = surface.matrix.T.tocsr()[arrays.mesh.surface_vertices][:, surface.surface_vertices]
@@ -135,24 +158,29 @@ class CurvedPairs:
 
     # ---- between nodes and points ------------------------------------------------------------------------------------
 
-    def _fine(self, u, slot: int, target):
+    def _fine(self, u, slot: int, target, given: str):
         self.finer.follow()
-        refine = self._launch(self.kernels.refine, rows=self.down, at=SimpleNamespace(source=u, target=target))
-        refine(count=self.finer.num_vertices, slot=slot)
+        more = {"given": getattr(self.obstacles, given)} if self.obstacles else {}
+        at = SimpleNamespace(source=u, target=target, **more)
+        self._launch(self.kernels.refine, rows=self.down, at=at)(count=self.finer.num_vertices, slot=slot)
         return target
 
     def fine(self, u, slot: int):
         """Displacements of the finer surface, from those of a slot."""
-        return self._fine(u, slot, self._u)
+        return self._fine(u, slot, self._u, "given")
 
-    def fine_change(self, w):
-        """Their changes, from w[0]."""
-        return self._fine(w, 0, self._w)
+    def fine_change(self, w, given: str = "unmoved"):
+        """Their changes, from w[0]; given: those of corners of obstacles."""
+        return self._fine(w, 0, self._w, given)
 
     def fine_numbers(self, numbers) -> SimpleNamespace:
         """What pairs of the finer surface read of changes of numbers."""
         runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(numbers.rest).astype(np.float64))
         return SimpleNamespace(rest=self._rest_dot, parameters=numbers.parameters)
+
+    def parameters_of(self, numbers) -> np.ndarray:
+        """Changes of all parameters, of a Tangent."""
+        return runtime.fetch(numbers.parameters)[: len(self.a.values.parameters)].astype(np.float64)
 
     def _gather(self, out) -> None:
         """From the points' corners to those of the nodes, the last ones of `out`."""
@@ -160,9 +188,26 @@ class CurvedPairs:
         gather = self._launch(self.kernels.gather, rows=self.to_corners, at=at)
         gather(count=self.num_corners, first=self.a.first_contact_corner)
 
-    def _spread(self, u: np.ndarray) -> np.ndarray:
+    def _spread(self, u: np.ndarray, to: np.ndarray | None = None) -> np.ndarray:
+        """Displacements of the finer surface, of corners of obstacles to where they are, or are said to be."""
         self.finer.follow()
-        return self.matrix @ u
+        out = self.matrix @ u
+        if self.obstacles:
+            out[self.finer.mesh.first :] = self.obstacles.displacements if to is None else to
+        return out
+
+    # ---- obstacles ---------------------------------------------------------------------------------------------------
+
+    def follow(self, rows: np.ndarray, m: int) -> None:
+        """Obstacles are where the rows number m of poses say (state/obstacle_poses.py)."""
+        if self.obstacles:
+            self.obstacles.follow(rows, m)
+
+    def _add_corners(self) -> None:
+        """Add what the points' corners say of obstacles, to their adjoints."""
+        if self.obstacles:
+            first = len(self.finer.mesh.body.surface_vertices)
+            self.obstacles.add_places(runtime.fetch(self.finer.corner)[first:].astype(np.float64))
 
     # ---- as of pairs of nodes ----------------------------------------------------------------------------------------
 
@@ -204,8 +249,14 @@ class CurvedPairs:
         self.inner.forces(self.fine(u, slot), 0, self.finer.corner, exact)
         self._gather(out)
 
-    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0), has_planes=False) -> None:
-        fine_u, fine_w, moved = self.fine(u, slot), self.fine_change(w), None
+    def product(
+        self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False, poses_dot=None
+    ) -> None:
+        """poses_dot: changes of the rows of poses, None: zero."""
+        if self.obstacles and parameters_dot is not None:
+            self.obstacles.change(parameters_dot, poses_dot)
+        given = "unmoved" if parameters_dot is None else "given_dot"
+        fine_u, fine_w, moved = self.fine(u, slot), self.fine_change(w, given), None
         if rest_dot is not None:
             runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(rest_dot).astype(np.float64))
             moved = self._rest_dot
@@ -216,14 +267,17 @@ class CurvedPairs:
         self.inner.clear_sums()
         if self.friction:
             self.friction.clear_sums()
+        if self.obstacles:
+            self.obstacles.clear()
 
     def vjp(self, u, slot: int, w, out) -> None:
         self.inner.vjp(self.fine(u, slot), 0, self.fine_change(w), self.finer.corner)
         self._gather(out)
+        self._add_corners()
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         numbers, rest = self.inner.collect()
-        return numbers, self.matrix.T @ rest
+        return numbers + self.obstacles.by_parameters if self.obstacles else numbers, self.matrix.T @ rest
 
     # ---- in Newton's method ------------------------------------------------------------------------------------------
 
@@ -249,14 +303,18 @@ class CurvedPairs:
         at = SimpleNamespace(source=self._blocks, target=out)
         self._launch(self.kernels.add_blocks, rows=self.up, at=at)(count=self.a.num_vertices)
 
-    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
-        return self.inner.safe_share(self._spread(u), self._spread(step), most)
+    def _step(self, step: np.ndarray, drift) -> np.ndarray:
+        return self._spread(step, 0.0 if drift is None else drift)
 
-    def is_collision_free(self, u: np.ndarray, step: np.ndarray) -> bool:
-        return self.inner.is_collision_free(self._spread(u), self._spread(step))
+    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None) -> float:
+        """drift: displacements of corners of obstacles meanwhile; None: they stand still."""
+        return self.inner.safe_share(self._spread(u), self._step(step, drift), most)
 
-    def check_end(self, u: np.ndarray, u_next: np.ndarray) -> None:
-        self.inner.check_end(self._spread(u), self._spread(u_next))
+    def is_collision_free(self, u: np.ndarray, step: np.ndarray, drift=None) -> bool:
+        return self.inner.is_collision_free(self._spread(u), self._step(step, drift))
+
+    def check_end(self, u: np.ndarray, u_next: np.ndarray, drift=None) -> None:
+        self.inner.check_end(self._spread(u), self._spread(u) + self._step(u_next - u, drift))
 
 
 def _rows(matrix, fp) -> SimpleNamespace:

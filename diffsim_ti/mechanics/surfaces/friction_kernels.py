@@ -73,20 +73,38 @@ class FrictionKernels(ListedPair):
 
     @ti.func
     def row(self, p, scene: A):
-        """Which coefficient pair p has, or -1."""
+        """Which coefficient pair p has, or -1; of contacts of obstacles they follow those of bodies."""
+        of_obstacle = -1
+        if ti.static(self.mixed):
+            of_obstacle = self.contact_of(p, scene) - 1
         a, b = scene.label[scene.place[scene.pairs[4 * p]]], scene.label[scene.place[scene.pairs[4 * p + 2]]]
-        return scene.row_of[a * self.num_labels + b]
+        out = scene.row_of[a * self.num_labels + b]
+        if of_obstacle >= 0:
+            out = scene.row_of[self.num_labels * self.num_labels + of_obstacle]
+        return out
+
+    @ti.func
+    def at_mu(self, row, scene: A):
+        """Where among the parameters a coefficient stands."""
+        out = self.first + SelfContact.index.friction + row
+        if ti.static(self.mixed):
+            out = scene.at_row[row]
+        return out
 
     @ti.func
     def mu(self, p, scene: A):
         k, out = self.row(p, scene), ti.cast(0, self.fp)
         if k >= 0:
-            out = scene.parameters[self.first + SelfContact.index.friction + k]
+            out = scene.parameters[self.at_mu(k, scene)]
         return out
 
     @ti.func
-    def speed(self, scene: A):
-        return scene.parameters[self.first + SelfContact.index.friction_speed]
+    def speed(self, p, scene: A, parameters: A):
+        """The friction speed of pair p among all parameters, or its change."""
+        number = self.first + SelfContact.index.friction_speed
+        if ti.static(self.mixed):
+            number = scene.at_number[3 * self.contact_of(p, scene) + 2]
+        return parameters[number]
 
     @ti.func
     def size(self, kind: A, w):
@@ -188,7 +206,7 @@ class FrictionKernels(ListedPair):
         t = v - n.dot(v) * n
         loads, lightness = self.at_corners(p, scene, scene.load), self.of_corners(p, scene, at.inverse_mass)
         c, s = plan.h * (self.size(kind, w) * loads).dot(lightness), ti.sqrt(t.norm_sqr())
-        kappa, f, y, B = slip_in_kernels(s, c, self.speed(scene), ti.cast(self.tiny, self.fp), KERNELS)
+        kappa, f, y, B = slip_in_kernels(s, c, self.speed(p, scene, scene.parameters), ti.cast(self.tiny, self.fp), KERNELS)
         return v, t, s, c, kappa, f, y, B
 
     @ti.func
@@ -254,13 +272,16 @@ class FrictionKernels(ListedPair):
         r1, r2, r3 = self.changes_at_rest(p, scene, at.rest_dot)
         rest = scene.rest_weights[p]
         d_rest = three(scene.rest_plane[p]).dot(rest[1] * r1 + rest[2] * r2 + rest[3] * r3)
-        d_stiffness, d_width = self.of_term(at.parameters_dot)
+        d_stiffness, d_width = self.of_term(p, scene, at.parameters_dot)
+        d_radius = ti.cast(0, self.fp)
+        if ti.static(self.mixed):
+            d_radius = at.numbers_dot[self.contact_of(p, scene)][2]
         dk, dw = self.numbers_jvp(p, scene, d_stiffness, d_width, d_rest)
         d_weights, dn, dN = self.pair.pressed_jvp(
-            kind, p, y1, y2, y3, dy1 + r1, dy2 + r2, dy3 + r3, dk, dw, scene, plan
+            kind, p, y1, y2, y3, dy1 + r1, dy2 + r2, dy3 + r3, dk, dw, d_radius, scene, plan
         )
         mu = self.mu(p, scene)
-        d_mu = at.parameters_dot[self.first + SelfContact.index.friction + self.row(p, scene)]
+        d_mu = at.parameters_dot[self.at_mu(self.row(p, scene), scene)]
         scene.weights_dot[p] = d_weights
         scene.pressing_dot[p] = self.vec4(dn[0], dn[1], dn[2], mu * dN + d_mu / mu * scene.pressing[p][3])
 
@@ -287,6 +308,7 @@ class FrictionKernels(ListedPair):
     def measure_jvp(self) -> Kernel:
         """Changes for those w of the displacements u[slot], of the rest shape and of the numbers."""
         at = dict(u="vectors2", w="vectors2", rest_dot="vectors", parameters_dot="scalars")
+        at |= dict(numbers_dot="vectors") if self.mixed else {}
         return self.kernel("measure_jvp", self.measure_all_jvp, at, OWN | DOT)
 
     # ---- of the stage ------------------------------------------------------------------------------------------------
@@ -305,7 +327,7 @@ class FrictionKernels(ListedPair):
         d_loads, d_mass = self.at_corners(p, scene, scene.load_dot), self.of_corners(p, scene, at.mass_dot)
         d_lightness = 0 - lightness * lightness * d_mass
         dc = plan.h * ((changes * loads + sizes * d_loads).dot(lightness) + (sizes * loads).dot(d_lightness))
-        df = B * (ds - f * dc - y * at.parameters_dot[self.first + SelfContact.index.friction_speed])
+        df = B * (ds - f * dc - y * self.speed(p, scene, at.parameters_dot))
         L, dL = plan.h * scene.pressing[p][3], plan.h * scene.pressing_dot[p][3]
         r = (L * kappa) * t
         dr = (dL * kappa) * t + L * ((df - kappa * ds) * e + kappa * dt)
@@ -391,7 +413,7 @@ class FrictionKernels(ListedPair):
             p, corner = scene.corner_of[k] >> 2, scene.corner_of[k] & 3
             if scene.pressing[p][3] > 0:
                 by_load += inverse * ti.abs(self.entry(scene.weights[p], corner)) * scene.numbers[p][1]
-                if corner == 0:
+                if corner == self.corner_of_contact(p, scene):
                     at.by_speed[s] = at.by_speed[s] + scene.numbers[p][0]
         scene.load_adj[s] = by_load
         at.by_mass[s] = at.by_mass[s] + -inverse * by_load * scene.load[s]
@@ -399,17 +421,17 @@ class FrictionKernels(ListedPair):
 
     @ti.func
     def measure_pair_vjp(self, kind: A, p, scene: A, at: A, plan: A):
-        w, pressing, zero = scene.weights[p], scene.pressing[p], ti.cast(0, self.fp)
+        w, pressing = scene.weights[p], scene.pressing[p]
         by_loads, of_pressing = self.at_corners(p, scene, scene.load_adj), scene.pressing_adj[p]
         w_adj = scene.weights_adj[p] + self.size(kind, pressing[3] * by_loads)
         by_load = of_pressing[3] + self.size(kind, w).dot(by_loads)
         mu = self.mu(p, scene)
         y1, y2, y3 = self.corners(p, scene, at.place, plan.begin)
-        h1, h2, h3, by_k, by_width = self.pair.pressed_vjp(
+        h1, h2, h3, by_k, by_width, by_radius = self.pair.pressed_vjp(
             kind, p, y1, y2, y3, w_adj, three(of_pressing), mu * by_load, scene, plan
         )
         by_stiffness, by_W, by_D = self.numbers_vjp(p, scene, by_k, by_width)
-        scene.numbers[p] = self.vec4(by_stiffness, by_W, by_D, zero)
+        scene.numbers[p] = self.vec4(by_stiffness, by_W, by_D, by_radius)
         scene.mu_adj[p] = by_load * pressing[3] / mu
         self.store(p, scene, 0 - h1, 0 - h2, 0 - h3)
 
@@ -422,7 +444,7 @@ class FrictionKernels(ListedPair):
             p, corner = scene.corner_of[k] >> 2, scene.corner_of[k] & 3
             if scene.pressing[p][3] > 0:
                 numbers = scene.numbers[p]
-                if corner == 0:
+                if corner == self.corner_of_contact(p, scene):
                     total += numbers
                     at_mu = s * plan.num_rows + self.row(p, scene)
                     at.by_mu[at_mu] = at.by_mu[at_mu] + scene.mu_adj[p]

@@ -26,14 +26,14 @@ class HessianKernels(ListedPair):
         """(weights of the corners, n, m phi''): the convex part of a pair's Hessian is m phi'' (w n)(w n)^T."""
         stiffness, width = self.numbers(p, scene)
         w, r, _ = self.nearest(kind, y1, y2, y3)
-        d = ti.sqrt(r.norm_sqr())
-        k = ti.cast(0, self.fp)
+        length, k = ti.sqrt(r.norm_sqr()), ti.cast(0, self.fp)
+        d = length - self.radius_of(p, scene)
         if d < width:
             k = stiffness * barrier.curvature(d / width, self.fp)
             if ti.static(kind == EDGE_EDGE):
                 m, _, _ = self.mollifier((self.scale_of(kind, p, scene, plan) * y1.cross(y3 - y2)).norm_sqr())
                 k *= m
-        return w, r / ti.max(d, ti.cast(1e-30, self.fp)), k
+        return w, r / ti.max(length, ti.cast(1e-30, self.fp)), k
 
     # ---- products ----------------------------------------------------------------------------------------------------
 

@@ -63,7 +63,7 @@ class ImplicitPairs(SurfacePairs):
             runtime.fill(self.next, (u + share * step)[None])
             self._build(self.next, 0, wanted=(most - share) * travel)
             self.forces(self.next, 0, self.a.corner, exact=True)
-            reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.width
+            reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
             unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
             listed = self._shares().min(initial=np.inf)
             share += min(listed, unlisted)

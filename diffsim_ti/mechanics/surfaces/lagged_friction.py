@@ -6,7 +6,6 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.terms.obstacles.friction import ARRAYS, dissipated, slip
-from diffsim_ti.terms.self_contact import SelfContact
 
 TINY = 1e-300
 
@@ -23,7 +22,8 @@ class LaggedFriction(PairFriction):
         super().__init__(pairs)
         self.corners, self.w, self.n = np.zeros((0, 4), int), np.zeros((0, 4)), np.zeros((0, 3))
         self.L, self.x, self.per_gamma = np.zeros(0), np.zeros((self.a.num_vertices, 3)), 1.0
-        self.by_speed, self.u_begin = 0.0, None
+        self.by_speed, self.u_begin = np.zeros(len(self.speeds_at)), None
+        self.contact = np.zeros(0, int)  # its number of each pair
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
         """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above."""
@@ -34,14 +34,17 @@ class LaggedFriction(PairFriction):
         self.corners = runtime.fetch(self.pairs.list.pairs)[: 4 * count].reshape(-1, 4)[felt]
         self.w, pressing = whole(self.own.weights)[felt].astype(np.float64), pressing[felt].astype(np.float64)
         self.n, self.L = pressing[:, :3], pressing[:, 3]
+        surface = self.pairs.kinematic
+        self.contact = surface.numbers[self.corners[:, [0, 2]]].max(1) if surface else np.zeros(len(felt), int)
 
     def _measure_here(self) -> None:
         self.pairs.forces(self.pairs.next, 0, self.a.corner)
         self.measure(self.pairs.next, 0)
 
     @property
-    def speed(self) -> float:
-        return float(self.a.values.parameters[self.pairs.first + SelfContact.index.friction_speed])
+    def speed(self) -> np.ndarray:
+        """The friction speed [m/s] of each pair."""
+        return self.a.values.parameters[self.speeds_at][self.contact]
 
     def _sliding(self, u: np.ndarray) -> tuple:
         """(velocities of the corners, their difference across the gap, t, |t|, t / |t|, f / |t|, df / d|t|)"""
@@ -106,7 +109,7 @@ class LaggedFriction(PairFriction):
         self.changes(self.pairs.next, 0, self.pairs.step, numbers)
         d_pressing = whole(self.own.pressing_dot)[self.felt].astype(np.float64)
         dw, dn, dL = whole(self.own.weights_dot)[self.felt].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
-        d_speed = float(runtime.fetch(numbers.parameters)[self.pairs.first + SelfContact.index.friction_speed])
+        d_speed = runtime.fetch(numbers.parameters)[self.speeds_at][self.contact]
         v, relative, t, s, e, kappa, slope = self._sliding(u)
         dv = (self.per_gamma * (du - dx))[self.corners]
         d_relative = np.einsum("pk,pkd->pd", self.w, dv) + np.einsum("pk,pkd->pd", dw, v)
@@ -124,7 +127,7 @@ class LaggedFriction(PairFriction):
         r, r_adj = (-self.L * kappa)[:, None] * t, np.einsum("pk,pkd->pd", self.w, g)
         by_f = -self.L * _dot(e, r_adj)[:, 0]
         t_adj = (-self.L * kappa)[:, None] * r_adj + (by_f * (slope - kappa))[:, None] * e
-        self.by_speed -= float((by_f * slope * s / self.speed).sum())
+        np.add.at(self.by_speed, self.contact, -by_f * slope * s / self.speed)
         relative_adj = self._across(t_adj)
         n_adj = -t_adj * _dot(self.n, relative) - relative * _dot(self.n, t_adj)
         w_adj = np.einsum("pkd,pd->pk", g, r) + np.einsum("pkd,pd->pk", v, relative_adj)
@@ -137,12 +140,11 @@ class LaggedFriction(PairFriction):
 
     def clear_sums(self) -> None:
         super().clear_sums()
-        self.by_speed = 0.0
+        self.by_speed[:] = 0
 
-    def collect(self) -> np.ndarray:
-        out = super().collect()
-        out[0] += self.by_speed
-        return out
+    def collect(self, out: np.ndarray) -> None:
+        super().collect(out)
+        np.add.at(out, self.speeds_at, self.by_speed)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

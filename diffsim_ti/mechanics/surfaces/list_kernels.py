@@ -17,16 +17,19 @@ class ListKernels:
 
     precision: str
     parallel: bool
+    has_areas: bool  # whether pairs take the area of the triangle, or of the first edge
 
     @ti.func
     def write_all(self, list: A, found: A, vertices: A, triangles: A, edges: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
-        for s in range(plan.num_surface):
+        for s in range(plan.num_vertices):
             for p in range(found.row_t[s], found.row_t[s + 1]):
                 other = found.partner_t[plan.room_t * s + p - found.row_t[s]]
                 list.pairs[4 * p] = vertices.corners[s]
                 for k in ti.static(range(3)):
                     list.pairs[4 * p + 1 + k] = triangles.corners[3 * other + k]
+                if ti.static(self.has_areas):
+                    list.area[p] = found.area_t[other]
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_edges):
             for q in range(found.row_e[e], found.row_e[e + 1]):
@@ -35,14 +38,18 @@ class ListKernels:
                     list.pairs[4 * p + k] = edges.corners[2 * e + k]
                     list.pairs[4 * p + 2 + k] = edges.corners[2 * other + k]
                 list.scale[q] = plan.factor / (found.lengths[e] * found.lengths[other])
+                if ti.static(self.has_areas):
+                    list.area[p] = found.area_e[e]
 
     @cached_property
     def write(self) -> Kernel:
         """Corners of each pair, four indices of vertices; and, of edges, 1 / sqrt(threshold of |a x b|^2)."""
         found = dict.fromkeys(("row_t", "row_e", "partner_t", "partner_e"), "ints") | dict(lengths="scalars")
         trees = dict.fromkeys(("vertices", "triangles", "edges"), dict(corners="ints"))
-        numbers = dict.fromkeys(("num_surface", "num_edges", "num_vt", "room_t", "room_e"), "int")
-        arrays = dict(list=dict(pairs="ints", scale="scalars"), found=found) | trees
+        numbers = dict.fromkeys(("num_vertices", "num_edges", "num_vt", "room_t", "room_e"), "int")
+        areas = dict.fromkeys(("area_t", "area_e"), "scalars") if self.has_areas else {}
+        written = dict(pairs="ints", scale="scalars") | (dict(area="scalars") if self.has_areas else {})
+        arrays = dict(list=written, found=found | areas) | trees
         return Kernel("write", self.write_all, self.precision, arrays, numbers | dict(factor="float"))
 
     @ti.func

@@ -14,12 +14,14 @@ from diffsim_ti.terms.self_contact import SelfContact
 
 A = ti.template()
 MARGIN = 1.001
+MANY = -1
 SAFE = 0.9  # share of its gap by which a pair may close in one pass
 # which corners belong to different primitives
 OPPOSITE = (((0, 1), (0, 2), (0, 3)), ((0, 2), (0, 3), (1, 2), (1, 3)))
 LIST = dict(pairs="ints", scale="scalars", surface="ints", place="ints", row="ints", corner_of="ints")  # broad_phase.py
 SCENE = LIST | dict(rest="vectors", parameters="scalars", corner="vectors", plane="vectors")
 SCENE |= dict(rest_plane="vectors", rest_weights="vectors")  # motion_kernels.py
+MIXED = dict(owner="ints", at_number="ints", at_row="ints", radius="scalars", area="scalars")  # kinematic_surface.py
 NUMBERS = dict.fromkeys(("slot", "num_vt", "num_pairs", "num_surface", "first_out"), "int")
 
 
@@ -57,6 +59,10 @@ class ListedPair(Pair):
     """Taichi functions of pair p of a list; those of edges follow those of vertex and triangle.
 
     first: where the scene's parameters begin with stiffness and width. parallel: loops run on all threads.
+    first = MANY: pairs are of several contacts (kinematic_surface.py). `owner` says of each surface vertex the number of its
+    contact: 0 of bodies, and so of pairs of them, 1 and on of obstacles. The places of stiffness, width and friction speed
+    of contact c among the parameters are at_number[3 c] and on, at_row says those of friction coefficients, radius[c] is
+    its radius; the stiffness of each pair is multiplied by its `area`.
     """
 
     first: int
@@ -64,25 +70,57 @@ class ListedPair(Pair):
 
     def kernel(self, name: str, body, at: dict, scene: dict | None = None, **numbers) -> Kernel:
         """A kernel on the arrays of SCENE and more, and on those it is called `at`."""
-        return Kernel(name, body, self.precision, dict(scene=SCENE | (scene or {}), at=at), NUMBERS | numbers)
+        arrays = SCENE | (MIXED if self.mixed else {}) | (scene or {})
+        return Kernel(name, body, self.precision, dict(scene=arrays, at=at), NUMBERS | numbers)
+
+    @property
+    def mixed(self) -> bool:
+        return self.first == MANY
 
     @ti.func
-    def of_term(self, parameters: A):
-        """(stiffness, width) of the term among all parameters."""
-        at_k, at_w = self.first + SelfContact.index.stiffness, self.first + SelfContact.index.width
-        return parameters[at_k], parameters[at_w]
+    def contact_of(self, p, scene: A):
+        """Number of the contact of pair p, whose other primitive has number 0."""
+        one, two = scene.place[scene.pairs[4 * p]], scene.place[scene.pairs[4 * p + 2]]
+        return ti.max(scene.owner[one], scene.owner[two])
+
+    @ti.func
+    def corner_of_contact(self, p, scene: A):
+        """The corner of pair p whose vertex says its contact, at which adjoints of the contact's numbers are summed."""
+        out = 0
+        if ti.static(self.mixed):
+            out = ti.select(scene.owner[scene.place[scene.pairs[4 * p + 2]]] > 0, 2, 0)
+        return out
+
+    @ti.func
+    def radius_of(self, p, scene: A):
+        out = ti.cast(0, self.fp)
+        if ti.static(self.mixed):
+            out = scene.radius[self.contact_of(p, scene)]
+        return out
+
+    @ti.func
+    def of_term(self, p, scene: A, parameters: A):
+        """(stiffness, width) of the contact of pair p among all parameters, or a change of these."""
+        k, W = ti.cast(0, self.fp), ti.cast(0, self.fp)
+        if ti.static(self.mixed):
+            number = 3 * self.contact_of(p, scene)
+            k, W = scene.area[p] * parameters[scene.at_number[number]], parameters[scene.at_number[number + 1]]
+        else:
+            k = parameters[self.first + SelfContact.index.stiffness]
+            W = parameters[self.first + SelfContact.index.width]
+        return k, W
 
     @ti.func
     def own_share(self, p, scene: A):
         """What pair p has of the scene's width: all, but no more than half of its distance at rest."""
-        _, W = self.of_term(scene.parameters)
+        _, W = self.of_term(p, scene, scene.parameters)
         return ti.min(ti.cast(1, self.fp), ti.cast(0.5, self.fp) * scene.rest_plane[p][3] / W)
 
     @ti.func
     def numbers(self, p, scene: A):
         """Stiffness and width of pair p (docstring of SelfContact)."""
         share = self.own_share(p, scene)
-        k, W = self.of_term(scene.parameters)
+        k, W = self.of_term(p, scene, scene.parameters)
         return k / share, share * W
 
     @ti.func
@@ -94,7 +132,7 @@ class ListedPair(Pair):
     def numbers_jvp(self, p, scene: A, d_stiffness, d_width, d_rest):
         """Changes of stiffness and width of pair p for those of the scene's and of the pair's distance at rest."""
         share, d_share = self.own_share(p, scene), ti.cast(0, self.fp)
-        k, W = self.of_term(scene.parameters)
+        k, W = self.of_term(p, scene, scene.parameters)
         if share < 1:
             d_share = (ti.cast(0.5, self.fp) * d_rest - share * d_width) / W
         return (d_stiffness - k / share * d_share) / share, share * d_width + W * d_share
@@ -103,10 +141,13 @@ class ListedPair(Pair):
     def numbers_vjp(self, p, scene: A, by_stiffness, by_width):
         """Adjoints of the scene's stiffness and width and of the pair's distance at rest."""
         share, by_share = self.own_share(p, scene), ti.cast(0, self.fp)
-        k, W = self.of_term(scene.parameters)
+        k, W = self.of_term(p, scene, scene.parameters)
         if share < 1:
             by_share = W * by_width - k / (share * share) * by_stiffness
-        return by_stiffness / share, share * (by_width - by_share / W), ti.cast(0.5, self.fp) * by_share / W
+        by_k = by_stiffness / share
+        if ti.static(self.mixed):
+            by_k *= scene.area[p]
+        return by_k, share * (by_width - by_share / W), ti.cast(0.5, self.fp) * by_share / W
 
     @ti.func
     def is_active(self, p, scene: A):

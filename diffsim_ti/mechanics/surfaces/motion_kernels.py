@@ -143,6 +143,9 @@ class MotionKernels(ListedPair):
             n = r / ti.max(D, ti.cast(self.tiny, self.fp))
             plane, weights = self.vec4(n[0], n[1], n[2], D), w
         scene.rest_plane[p], scene.rest_weights[p] = plane, weights
+        if ti.static(self.mixed):
+            if scene.per_area[self.contact_of(p, scene)] == 0:
+                scene.area[p] = ti.cast(1, self.fp)
 
     @ti.func
     def begin_all(self, scene: A, at: A, plan: A):
@@ -158,4 +161,5 @@ class MotionKernels(ListedPair):
     @cached_property
     def begin(self) -> Kernel:
         """A new list: where the surface is, how far apart pairs are at rest, and no planes yet."""
-        return self.kernel("begin", self.begin_all, dict(u="vectors2"), dict(built="vectors", body="ints"))
+        own = dict(per_area="ints") if self.mixed else {}
+        return self.kernel("begin", self.begin_all, dict(u="vectors2"), dict(built="vectors", body="ints") | own)

@@ -10,10 +10,11 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.friction_kernels import FrictionKernels
 from diffsim_ti.runtime import kernels_of
+from diffsim_ti.terms.self_contact import SelfContact
 
 
 class PairFriction:
-    """Of the pairs of a scene (surface_pairs.py), whose SelfContact has friction.
+    """Of the pairs of a scene (surface_pairs.py) some of whose contacts have friction.
 
     A pass begins with `measure`, after `pairs.forces`, and ends with `slide`.
     takes_pending: whether `slide_vjp` gathers what corners still hold of the adjoints.
@@ -24,15 +25,20 @@ class PairFriction:
     def __init__(self, pairs):
         self.pairs, a = pairs, pairs.a
         self.a, self.num_surface = a, len(a.mesh.surface_vertices)
-        labels, rows = pairs.term.labels(a.mesh)
+        labels, rows = np.zeros(self.num_surface, int), np.full((1, 1), -1)
+        if pairs.term and pairs.term.has_friction:
+            labels, rows = pairs.term.labels(a.mesh)
         self.num_rows, partly_fixed = int(rows.max()) + 1, bool(len(a.supports.partly_fixed))
+        row_of = rows.ravel()
+        if pairs.contacts:
+            self.num_rows, row_of = len(pairs.contacts.mu), np.concatenate([row_of, pairs.contacts.row_of])
         self.kernels = kernels_of(FrictionKernels, a.precision, pairs.first, pairs.parallel, partly_fixed, len(rows))
         n = self.num_surface
         self.own = SimpleNamespace(
             any=runtime.array(ti.i32, 1), in_friction=runtime.array(ti.i32, n), load=runtime.array(a.fp, n)
         )
         runtime.fill(self.own.in_friction, 0)
-        self.own.label, self.own.row_of = runtime.upload(labels, ti.i32), runtime.upload(rows.ravel(), ti.i32)
+        self.own.label, self.own.row_of = runtime.upload(labels, ti.i32), runtime.upload(row_of, ti.i32)
         self.kept_u = self.kept_v = runtime.array(a.vector, 1, 1)
         self.adjoints = None
         self._sliding_supports = (
@@ -108,6 +114,10 @@ class PairFriction:
         if not hasattr(self.own, "load_dot"):
             self.own.load_dot = runtime.array(self.a.fp, self.num_surface)
         at = dict(u=u, w=u_dot, rest_dot=numbers.rest, parameters_dot=numbers.parameters)
+        if self.pairs.contacts:
+            parameters = runtime.fetch(numbers.parameters)[: len(self.a.values.parameters)].astype(np.float64)
+            self.pairs.contacts.load_change(self.a.values.parameters, parameters)
+            at |= dict(numbers_dot=self.pairs.contacts.numbers_dot)
         self.run(self.kernels.measure_jvp, at, slot=slot)
 
     def slide_jvp(self, history, slot: int, plan, rate_dot: float, u_dot, v_dot, numbers) -> None:
@@ -164,11 +174,21 @@ class PairFriction:
         u[0, self.a.mesh.surface_vertices] += runtime.fetch(self.adjoints["by_place"])
         runtime.fill(adjoint.u, u)
 
-    def collect(self) -> np.ndarray:
-        """Adjoints of friction speed and coefficients, float64."""
-        by_mu = whole(self.adjoints["by_mu"]).astype(np.float64)
-        by_speed = whole(self.adjoints["by_speed"]).astype(np.float64).sum()
-        return np.concatenate([[by_speed], by_mu.reshape(-1, self.num_rows).sum(0)])
+    @property
+    def speeds_at(self) -> np.ndarray:
+        """Where the friction speed of each contact stands among the parameters."""
+        if self.pairs.contacts:
+            return self.pairs.contacts.rows[:, 2]
+        return np.array([self.pairs.first + SelfContact.index.friction_speed])
+
+    def collect(self, out: np.ndarray) -> None:
+        """Adds the adjoints of friction speeds and coefficients to those of all parameters, float64."""
+        by_mu = whole(self.adjoints["by_mu"]).astype(np.float64).reshape(-1, self.num_rows).sum(0)
+        by_speed = whole(self.adjoints["by_speed"]).astype(np.float64)[: self.num_surface]
+        contacts, first = self.pairs.contacts, self.pairs.first + SelfContact.index.friction
+        out[contacts.mu if contacts else slice(first, first + self.num_rows)] += by_mu
+        owner = contacts.surface.owner if contacts else np.zeros(self.num_surface, int)
+        np.add.at(out, self.speeds_at[owner], by_speed)
 
     def collect_pass(self) -> tuple[np.ndarray, float]:
         """Adjoints of the masses and of the drag rate by the stage, float64."""

@@ -51,16 +51,17 @@ class PairKernels(ListedPair):
     @ti.func
     def force(self, kind: A, p, scene: A, at: A, plan: A):
         stiffness, width = self.numbers(p, scene)
+        radius = self.radius_of(p, scene)
         y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
         last = scene.plane[p]
         n, energy, g1, g2, g3 = three(last), ti.cast(0, self.fp), self.vec3(0), self.vec3(0), self.vec3(0)
         if last[0] == 0 and last[1] == 0 and last[2] == 0:  # a new list
             n = self.guess(kind, y1, y2, y3)
-        d = self.apart(kind, n, y1, y2, y3)
+        d = self.apart(kind, n, y1, y2, y3) - radius
         # the plane of the pass before spares most pairs the search; the margin is for rounding
         if not d > ti.cast(MARGIN, self.fp) * width or plan.exact > 0:
             scale = self.scale_of(kind, p, scene, plan)
-            energy, n, d, g1, g2, g3 = self.gradient(kind, y1, y2, y3, scale, stiffness, width)
+            energy, n, d, g1, g2, g3 = self.gradient(kind, y1, y2, y3, scale, stiffness, width, radius)
         scene.plane[p] = self.vec4(n[0], n[1], n[2], d)
         scene.energy[p] = energy
         if not d > width:
@@ -110,14 +111,25 @@ class PairKernels(ListedPair):
                 d_rest = three(scene.rest_plane[p]).dot(w[1] * r1 + w[2] * r2 + w[3] * r3)
             scale = self.scale_of(kind, p, scene, plan)
             stiffness, width = self.numbers(p, scene)
-            dk, dw = self.numbers_jvp(p, scene, plan.d_stiffness, plan.d_width, d_rest)
-            h1, h2, h3, by_stiffness, by_width = self.gradient_jvp(
-                kind, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, dk, dw
+            d_stiffness, d_width, d_radius = self.changes_of_numbers(p, scene, at, plan)
+            dk, dw = self.numbers_jvp(p, scene, d_stiffness, d_width, d_rest)
+            radius = self.radius_of(p, scene)
+            h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp(
+                kind, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, dk, dw, d_radius
             )
             by_k, by_W, by_D = self.numbers_vjp(p, scene, by_stiffness, by_width)
-            numbers = self.vec4(0 - by_k, 0 - by_W, 0 - by_D, ti.cast(0, self.fp))  # the force is minus the gradient
+            numbers = self.vec4(0 - by_k, 0 - by_W, 0 - by_D, 0 - by_radius)  # the force is minus the gradient
         self.store(p, scene, h1, h2, h3)
         scene.numbers[p] = numbers
+
+    @ti.func
+    def changes_of_numbers(self, p, scene: A, at: A, plan: A):
+        """Those of (stiffness, width, radius) of the contact of pair p."""
+        dk, dw, d_radius = plan.d_stiffness, plan.d_width, ti.cast(0, self.fp)
+        if ti.static(self.mixed):
+            change = at.numbers_dot[self.contact_of(p, scene)]
+            dk, dw, d_radius = scene.area[p] * change[0], change[1], change[2]
+        return dk, dw, d_radius
 
     @cached_property
     def products(self) -> Kernel:
@@ -126,6 +138,7 @@ class PairKernels(ListedPair):
         has_planes: the planes are those of `forces` at the same place, and spare pairs beyond the width the work.
         """
         at = dict(u="vectors2", w="vectors2", rest_dot="vectors", out="vectors")
+        at |= dict(numbers_dot="vectors") if self.mixed else {}
         numbers = dict(by_rest="int", has_planes="int", d_stiffness="float", d_width="float")
         return self.kernel("products", self.all_products, at, dict(numbers="vectors"), **numbers)
 
@@ -137,7 +150,7 @@ class PairKernels(ListedPair):
             for k in range(scene.row[s], scene.row[s + 1]):
                 p, corner = scene.corner_of[k] >> 2, scene.corner_of[k] & 3
                 numbers = scene.numbers[p]
-                if corner == 0:
+                if corner == self.corner_of_contact(p, scene):
                     total += numbers
                 if numbers[2] != 0:
                     n = three(scene.rest_plane[p])
@@ -149,7 +162,7 @@ class PairKernels(ListedPair):
 
     @cached_property
     def add_sums(self) -> Kernel:
-        """Adjoints of stiffness and width, each pair at its corner 0, and of the rest shape, after `products`.
+        """Adjoints of stiffness, width and radius, each pair at one corner, and of the rest shape, after `products`.
 
         The rest shape moves the corners, and makes the widths of pairs that are near in it.
         """

@@ -29,22 +29,23 @@ class PressedPair(ListedPair):
         """(weights w of the corners, unit normal n, N >= 0 [N])"""
         stiffness, width = self.numbers(p, scene)
         w, r, _ = self.nearest(kind, y1, y2, y3)
-        d = ti.sqrt(r.norm_sqr())
-        n, N = r / ti.max(d, ti.cast(self.tiny, self.fp)), ti.cast(0, self.fp)
+        length = ti.sqrt(r.norm_sqr())
+        d, N = length - self.radius_of(p, scene), ti.cast(0, self.fp)
+        n = r / ti.max(length, ti.cast(self.tiny, self.fp))
         if d < width:
             m, _, _ = self.fading(kind, p, y1, y2, y3, scene, plan)
             N = 0 - m * stiffness * width * barrier.slope(d / width, self.fp)
         return w, n, N
 
     @ti.func
-    def pressed_jvp(self, kind: A, p, y1, y2, y3, dy1, dy2, dy3, dk, dw, scene: A, plan: A):
-        """Their changes; dk, dw: of the pair's stiffness and width."""
+    def pressed_jvp(self, kind: A, p, y1, y2, y3, dy1, dy2, dy3, dk, dw, d_radius, scene: A, plan: A):
+        """Their changes; dk, dw, d_radius: of the pair's stiffness, width and radius."""
         stiffness, width = self.numbers(p, scene)
         w, r, g = self.nearest(kind, y1, y2, y3)
         d_weights, dr, fixed = self.nearest_jvp(kind, y1, y2, y3, dy1, dy2, dy3, w, r, g)
-        d = ti.max(ti.sqrt(r.norm_sqr()), ti.cast(self.tiny, self.fp))
-        n, dN = r / d, ti.cast(0, self.fp)
-        dd = n.dot(fixed)
+        length = ti.max(ti.sqrt(r.norm_sqr()), ti.cast(self.tiny, self.fp))
+        n, dN, d = r / length, ti.cast(0, self.fp), length - self.radius_of(p, scene)
+        dd = n.dot(fixed) - d_radius
         if d < width:
             s = d / width
             slope, curvature = barrier.slope(s, self.fp), barrier.curvature(s, self.fp)
@@ -55,15 +56,15 @@ class PressedPair(ListedPair):
                 dm = 2 * by_q * self.scale_of(kind, p, scene, plan) * x.dot(dx)
             change = dk * width * slope + stiffness * ((slope - s * curvature) * dw + curvature * dd)
             dN = 0 - dm * stiffness * width * slope - m * change
-        return d_weights, (dr - n.dot(dr) * n) / d, dN
+        return d_weights, (dr - n.dot(dr) * n) / length, dN
 
     @ti.func
     def pressed_vjp(self, kind: A, p, y1, y2, y3, w_adj, n_adj, N_adj, scene: A, plan: A):
-        """(adjoints of y1, y2, y3, of the pair's stiffness and width)"""
+        """(adjoints of y1, y2, y3, of the pair's stiffness, width and radius)"""
         stiffness, width = self.numbers(p, scene)
         w, r, g = self.nearest(kind, y1, y2, y3)
-        d = ti.max(ti.sqrt(r.norm_sqr()), ti.cast(self.tiny, self.fp))
-        n, zero = r / d, ti.cast(0, self.fp)
+        length, zero = ti.max(ti.sqrt(r.norm_sqr()), ti.cast(self.tiny, self.fp)), ti.cast(0, self.fp)
+        n, d = r / length, length - self.radius_of(p, scene)
         by_k, by_width, by_d, h = zero, zero, zero, (self.vec3(0), self.vec3(0), self.vec3(0))
         if d < width:
             s = d / width
@@ -77,7 +78,7 @@ class PressedPair(ListedPair):
                 h[0] += factor * (y3 - y2).cross(x)
                 h[1] += 0 - by_b
                 h[2] += by_b
-        r_adj = (n_adj - n.dot(n_adj) * n) / d + by_d * n
+        r_adj = (n_adj - n.dot(n_adj) * n) / length + by_d * n
         first, second = ti.static(BY_FIRST[kind], BY_SECOND[kind])
         e1, e2 = self.combine(first, y1, y2, y3), self.combine(second, y1, y2, y3)
         t1, t2 = e1.dot(r_adj), e2.dot(r_adj)
@@ -89,4 +90,4 @@ class PressedPair(ListedPair):
         for k in ti.static(range(3)):
             turned = ti.cast(first[k + 1], self.fp) * s1 + ti.cast(second[k + 1], self.fp) * s2
             h[k] += w[k + 1] * along + turned * r
-        return h[0], h[1], h[2], by_k, by_width
+        return h[0], h[1], h[2], by_k, by_width, 0 - by_d

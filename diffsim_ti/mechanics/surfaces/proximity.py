@@ -9,7 +9,7 @@ leaves 2, 1 or 0 of the parameters free, and that is all that differs between fa
 
 with dr_t the change of r at fixed t; then dr = dr_t + E dt and dw_i = (dw_i / dt) dt. Energy of a pair:
 
-    m(q) stiffness width^2 beta(d / width)                  beta: barrier.py
+    m(q) stiffness width^2 beta((d - radius) / width)       beta: barrier.py
 
 where m = q (2 - q) for q < 1, else 1, fades out edges that become parallel, whose nearest points jump:
 q = |a x b|^2 / (10^-3 A^2 B^2), with A, B the lengths at rest. Vertex and triangle: m = 1.
@@ -198,14 +198,14 @@ class Pair:
         return m, slope, curvature
 
     @ti.func
-    def gradient(self, kind: A, y1, y2, y3, scale, stiffness, width):
+    def gradient(self, kind: A, y1, y2, y3, scale, stiffness, width, radius):
         """(energy, n, d, g1, g2, g3): gradient of the energy by corners 1 to 3; corner 0 balances them.
 
-        n = r / d. scale: 1 / sqrt(threshold of |a x b|^2), not used for vertex and triangle.
+        d = |r| - radius, n = r / |r|. scale: 1 / sqrt(threshold of |a x b|^2), not used for vertex and triangle.
         """
         w, r, g = self.nearest(kind, y1, y2, y3)
-        d = ti.sqrt(r.norm_sqr())
-        n = r / ti.max(d, ti.cast(self.tiny, self.fp))
+        length = ti.sqrt(r.norm_sqr())
+        d, n = length - radius, r / ti.max(length, ti.cast(self.tiny, self.fp))
         energy, g1, g2, g3 = ti.cast(0, self.fp), self.vec3(0), self.vec3(0), self.vec3(0)
         if d < width:
             s = d / width
@@ -223,15 +223,18 @@ class Pair:
         return energy, n, d, g1, g2, g3
 
     @ti.func
-    def gradient_jvp(self, kind: A, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, d_stiffness, d_width):
-        """(h1, h2, h3, by_stiffness, by_width): change of the gradient of corners 1 to 3 (0 balances them) for changes of
-        corners, stiffness and width; and the products of dy with the gradient's derivatives by stiffness and width."""
+    def gradient_jvp(
+        self, kind: A, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, d_stiffness, d_width, d_radius
+    ):
+        """(h1, h2, h3, by_stiffness, by_width, by_radius): change of the gradient of corners 1 to 3 (0 balances them) for
+        changes of corners, stiffness, width and radius; and the products of dy with the gradient's derivatives by these."""
         w, r, g = self.nearest(kind, y1, y2, y3)
-        d = ti.sqrt(r.norm_sqr())
+        length = ti.sqrt(r.norm_sqr())
+        d = length - radius
         h1, h2, h3 = self.vec3(0), self.vec3(0), self.vec3(0)
-        by_stiffness, by_width = ti.cast(0, self.fp), ti.cast(0, self.fp)
+        by_stiffness, by_width, by_radius = ti.cast(0, self.fp), ti.cast(0, self.fp), ti.cast(0, self.fp)
         if d < width:
-            inverse = ti.cast(1, self.fp) / ti.max(d, ti.cast(self.tiny, self.fp))
+            inverse = ti.cast(1, self.fp) / ti.max(length, ti.cast(self.tiny, self.fp))
             n, s = inverse * r, d / width
             dw, dr, fixed = self.nearest_jvp(kind, y1, y2, y3, dy1, dy2, dy3, w, r, g)
             dd = n.dot(fixed)
@@ -241,8 +244,8 @@ class Pair:
             phi, slope, curvature = stiffness * width * width * beta, stiffness * width * beta1, stiffness * beta2
             phi_by_width, slope_by_width = stiffness * width * (2 * beta - s * beta1), stiffness * (beta1 - s * beta2)
             relative = d_stiffness / stiffness
-            d_phi = slope * dd + relative * phi + d_width * phi_by_width
-            d_slope = curvature * dd + relative * slope + d_width * slope_by_width
+            d_phi = slope * (dd - d_radius) + relative * phi + d_width * phi_by_width
+            d_slope = curvature * (dd - d_radius) + relative * slope + d_width * slope_by_width
             m, dm = ti.cast(1, self.fp), ti.cast(0, self.fp)
             if ti.static(kind == EDGE_EDGE):
                 a, b, da, db = y1, y3 - y2, dy1, dy3 - dy2
@@ -257,11 +260,13 @@ class Pair:
                 h1, h2, h3 = change * q_a + factor * dq_a, 0 - by_b, by_b
                 by_stiffness += factor * dq / stiffness
                 by_width += phi_by_width * by_q * dq
+                by_radius = by_radius - slope * by_q * dq
             by_stiffness += m * slope * dd / stiffness
             by_width += m * slope_by_width * dd
+            by_radius = by_radius - m * curvature * dd
             along_n, turned = (m * d_slope + dm * slope) * n, (m * slope) * dn
             shifted = (m * slope) * n
             h1 += w[1] * (along_n + turned) + dw[1] * shifted
             h2 += w[2] * (along_n + turned) + dw[2] * shifted
             h3 += w[3] * (along_n + turned) + dw[3] * shifted
-        return h1, h2, h3, by_stiffness, by_width
+        return h1, h2, h3, by_stiffness, by_width, by_radius

@@ -1,10 +1,14 @@
-"""Contact of surfaces with themselves and each other in explicit steps: its forces, and friction after the drift."""
+"""Contact of surfaces with themselves, each other and edges of obstacles in explicit steps: its forces, and friction after
+the drift."""
 
 from contextlib import contextmanager
+
+import numpy as np
 
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs, Tunnelling
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, Moment
 
 
 class SurfaceForces(Stage):
@@ -13,16 +17,28 @@ class SurfaceForces(Stage):
     in_kicks = True
 
     def __init__(self, pairs: SurfacePairs):
-        self.pairs, self.a = pairs, pairs.a
+        self.pairs, self.a, self.by_path = pairs, pairs.a, None
+
+    @staticmethod
+    def _moment(at: Passes) -> Moment:
+        """Obstacles at the end of a pass, and where it begins."""
+        schedule = at.ws.solver.schedule
+        return Moment(schedule, at.j, schedule.end(at.j), schedule.begin(at.j))
+
+    def _follow(self, at: Passes, m: int) -> None:
+        if self.pairs.obstacles:
+            self.pairs.follow(self.a.poses.value(self.a.rows["path"], self._moment(at)), m)
 
     @contextmanager
     def do(self, at: Passes):
+        self._follow(at, AT_BEGIN)
         if at.launch is None:  # the first pass: after each of them `check_pass` keeps the list
             self.pairs.ensure(at.history.u, at.slot)
         self.pairs.forces(at.history.u, at.slot, self.a.corner)
         yield
         if at.kick:
             return
+        self._follow(at, AT_STAGE)
         try:
             self.pairs.check_pass(at.history.u, at.end, float(at.ws.solver.schedule.length(at.j)))
         except Tunnelling as error:
@@ -31,25 +47,36 @@ class SurfaceForces(Stage):
     @contextmanager
     def tangent(self, at: Passes):
         pairs, run, place = self.pairs, at.run, (at.history.u, at.slot)
+        self._follow(at, AT_BEGIN)
+        poses = self.a.poses.jvp(self.a.rows["path"], run.tangent.path, self._moment(at)) if pairs.obstacles else None
+        of_obstacles = dict(poses_dot=poses) if pairs.obstacles else {}
         pairs.ensure(*place)
         if pairs.friction:  # which needs the forces, and their corners are those of the product
-            pairs.friction.begin_jvp(at.history, at.slot, run.u, run.numbers)
-        change = run.tangent.parameters[self.a.parameters_of_self_contact]
-        pairs.product(*place, run.u, self.a.corner, run.numbers.rest, change)
+            pairs.friction.begin_jvp(at.history, at.slot, run.u, run.numbers, **of_obstacles)
+        pairs.product(*place, run.u, self.a.corner, run.numbers.rest, run.tangent.parameters, **of_obstacles)
         yield
 
     @contextmanager
     def adjoint(self, at: Passes):
+        self._follow(at, AT_BEGIN)
         yield
         self.pairs.ensure(at.history.u, at.slot)
         self.pairs.vjp(at.history.u, at.slot, at.run.w, at.run.corner)
+        if self.by_path is not None:
+            by_rows = self.pairs.obstacles.take_rows()
+            self.a.poses.vjp(self.a.rows["path"], by_rows, self._moment(at), self.by_path)
 
     def clear(self) -> None:
         self.pairs.clear_sums()
+        moving = self.pairs.obstacles and self.a.rows["path"] is not None
+        self.by_path = np.zeros(self.a.rows["path"].shape) if moving else None
 
     def collect(self, out: Derived) -> None:
-        out.parameters[self.a.parameters_of_self_contact], rest = self.pairs.collect()
+        by_parameters, rest = self.pairs.collect()
+        out.parameters += by_parameters
         out.rest = rest + out.rest
+        if self.by_path is not None:
+            out.path += self.by_path
 
 
 class SurfaceFriction(Stage):

@@ -8,7 +8,8 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
 from diffsim_ti.mechanics.surfaces.buffers import branches, whole
-from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE
+from diffsim_ti.mechanics.surfaces.kinematic_surface import ContactNumbers, KinematicSurface
+from diffsim_ti.mechanics.surfaces.listed_pair import MANY, OPPOSITE
 from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
@@ -33,7 +34,8 @@ class Overlap(ValueError):
 
 
 class SurfacePairs:
-    """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py).
+    """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py), or with obstacles that act by
+    pairs, whose corners are vertices of the surface too (kinematic_surface.py).
 
     The list holds all pairs that were within the width and the slacks of their vertices when it was made, and holds good
     until a vertex has used up one of its two slacks: the one towards its own body by moving relative to that body, the one
@@ -53,17 +55,20 @@ class SurfacePairs:
 
     def __init__(self, arrays, parallel: bool):
         self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
-        self.mesh, self.first, self.parallel = mesh, arrays.parameters_of_self_contact.start, parallel
+        self.kinematic = mesh if isinstance(mesh, KinematicSurface) else None
+        self.contacts = ContactNumbers(mesh, arrays) if self.kinematic else None
+        self.mesh, self.parallel = mesh, parallel
+        self.first = MANY if self.kinematic else arrays.parameters_of_self_contact.start
         self.kernels = kernels_of(PairKernels, arrays.precision, self.first, parallel)
         self.motion = kernels_of(MotionKernels, arrays.precision, self.first, parallel)
-        edges = surface_edges(mesh)
+        edges = mesh.edges if self.kinematic else surface_edges(mesh)
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
         self.edges, self.term = edges, term
         self.body = np.full(mesh.num_vertices, -1)
-        self.body[mesh.surface_vertices] = np.unique(pieces(mesh)[mesh.surface_vertices], return_inverse=True)[1]
-        self.list = CandidatePairs(
-            mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body, arrays.precision, parallel
-        )
+        body = mesh.pieces() if self.kinematic else pieces(mesh)
+        self.body[mesh.surface_vertices] = np.unique(body[mesh.surface_vertices], return_inverse=True)[1]
+        surface = mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body
+        self.list = CandidatePairs(*surface, arrays.precision, parallel, self.kinematic)
         self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vec4
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
@@ -77,19 +82,37 @@ class SurfacePairs:
         self.touched = runtime.array(ti.i32, n)
         self.fresh, self.age, self.builds = False, 0, 0
         self._checked_rest = self._scratch = None
-        self.friction = self.friction_kind(self) if term.has_friction else None
+        has_friction = len(self.contacts.mu) > 0 if self.kinematic else term.has_friction
+        self.friction = self.friction_kind(self) if has_friction else None
+
+    def _number(self, place: int) -> float:
+        return float(self.a.values.parameters[self.a.parameters_of_self_contact.start + place])
 
     @property
     def width(self) -> float:
-        return float(self.a.values.parameters[self.first + SelfContact.index.width])
+        """The width [m] of pairs of bodies; without these the largest."""
+        return self._number(SelfContact.index.width) if self.term else float(self.contacts.widths[1:].max())
 
     @property
-    def stiffness(self) -> float:
-        return float(self.a.values.parameters[self.first + SelfContact.index.stiffness])
+    def least_width(self) -> float:
+        if not self.kinematic:
+            return self.width
+        return float(self.contacts.widths[0 if self.term else 1 :].min())
+
+    def _stiffness_and_width(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of pairs of the list, without their shares."""
+        if not self.kinematic:
+            one = np.ones(len(pairs))
+            return self._number(SelfContact.index.stiffness) * one, self.width * one
+        rows = self.contacts.rows[self.kinematic.numbers[pairs[:, [0, 2]]].max(1)]
+        k, width = self.a.values.parameters[rows[:, :2]].T
+        return k * whole(self.list.area)[: len(pairs)], width
 
     def load(self, u) -> None:
         """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""
         self.fresh = False
+        if self.kinematic:
+            self.contacts.load(self.a.values.parameters)
         checked = (self.a.values.rest, self.width)
         if self._checked_rest is None or self._checked_rest[0] is not checked[0] or self._checked_rest[1] != checked[1]:
             rest_state = runtime.array(self.kernels.vec4, 1, self.a.num_vertices)
@@ -100,6 +123,8 @@ class SurfacePairs:
         self.check_apart(u)
 
     def _check_rest(self, u) -> None:
+        if not self.term:
+            return
         largest = self.most_edges * self.list.typical
         if self.width > largest:
             raise ValueError(
@@ -121,10 +146,9 @@ class SurfacePairs:
             self._build(u, 0)
         found = self.list.first_piercing(self.a.rest, u, 0)
         if found:
-            edge, triangle = self.edges[found[0]], self.mesh.surface_triangles[found[1]]
+            edge, triangle = self._part("edge", self.edges[found[0]]), self.mesh.surface_triangles[found[1]]
             raise Overlap(
-                f"surfaces pass through each other: edge {_numbers(edge)} and triangle {_numbers(triangle)}; "
-                "move the bodies apart"
+                f"surfaces pass through each other: {edge} and triangle {_numbers(triangle)}; move the bodies apart"
             )
         gaps, pairs = self._distances(u)
         if gaps.size and not gaps.min() > 0:
@@ -137,11 +161,16 @@ class SurfacePairs:
         self._build(u, 0)
         self.check_apart(u)
 
+    obstacles = None  # whose corners are vertices of the surface: of pairs with vertices that no node gives
+
+    def follow(self, rows: np.ndarray, m: int) -> None:
+        """Obstacles are where rows of poses say."""
+
     def run(self, kernel, at: dict, *more, **numbers) -> None:
         """Launch a kernel of pairs, with the arrays `at`, and `more` of the scene."""
-        k, a = self.list, self.a
+        k, a, mine = self.list, self.a, (self.contacts,) if self.kinematic else ()
         numbers |= dict(num_surface=k.num_surface, first_out=a.first_contact_corner)
-        scene = *more, k, self, SimpleNamespace(rest=a.rest, parameters=a.parameters)
+        scene = *more, k, self, *mine, SimpleNamespace(rest=a.rest, parameters=a.parameters)
         self._launch(kernel, scene=scene, at=SimpleNamespace(**at))(
             **dict(num_vt=k.num_vt, num_pairs=k.count) | numbers
         )
@@ -170,6 +199,9 @@ class SurfacePairs:
         """Slacks [m] of the surface vertices towards their own body and others, shape (n, 4), for displacements x."""
         slack, least = np.zeros((len(x), 4)), self.least_slack * self.width
         slack[:, :2] = wanted
+        if self.kinematic:
+            own = self.kinematic.owner
+            slack[:, 2] = np.where(own > 0, np.maximum(self.contacts.reach[own] - self.width, 0), 0)
         if self.fresh and self.age:
             overall, last = self._travel(x - runtime.fetch(self.built)), self._travel(x - runtime.fetch(self.before))
             pace = np.maximum(overall / self.age, last)
@@ -194,7 +226,7 @@ class SurfacePairs:
 
     def _check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
-        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width, **self._sums)
+        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.least_width, **self._sums)
         self.run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_pairs=num_pairs, **bodies)
         flags = runtime.view(self.flags)
         stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
@@ -222,11 +254,17 @@ class SurfacePairs:
         self.fresh = False
         pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
         plane = whole(self.plane)[: self.list.count].astype(np.float64)
+        closing = np.full(len(pairs), -np.inf)
+        for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
+            for a, b in OPPOSITE[kind]:
+                change = ((moved[pairs[part, b]] - moved[pairs[part, a]]) * plane[part, :3]).sum(1)
+                closing[part] = np.maximum(closing[part], change)
         fastest = self._fastest(plane[:, 3], pairs)
-        stiffness, enough = self._resolved(moved[surface] / h, h, fastest)
+        worst = int((closing - plane[:, 3]).argmax()) if len(pairs) else None
+        stiffness, enough = self._resolved(moved[surface] / h, h, fastest, worst, pairs)
         remedy = f"take substeps of {enough:.3g} s"
         if stiffness is not None:
-            remedy = f"no step stops them: raise the contact's stiffness to {stiffness:.3g} N/m and {remedy}"
+            remedy = f"no step stops them: raise {self._stiffer(stiffness, worst, pairs)} and {remedy}"
         elif fastest * h > 1:
             remedy = f"contact at {fastest:.3g} rad/s is too stiff for it: {remedy}"
         if not crossed:
@@ -238,12 +276,6 @@ class SurfacePairs:
             )
             error.stable_dt, error.stiffness = enough, stiffness
             raise error
-        closing = np.full(len(pairs), -np.inf)
-        for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
-            for a, b in OPPOSITE[kind]:
-                change = ((moved[pairs[part, b]] - moved[pairs[part, a]]) * plane[part, :3]).sum(1)
-                closing[part] = np.maximum(closing[part], change)
-        worst = int((closing - plane[:, 3]).argmax())
         error = Tunnelling(
             f"{self._name(worst, pairs)} may have gone through each other: their gap was {plane[worst, 3]:.3g} m, and they "
             f"closed by {closing[worst]:.3g} m ({closing[worst] / h:.3g} m/s) in one substep of {h:.3g} s; {remedy}"
@@ -251,7 +283,7 @@ class SurfacePairs:
         error.stable_dt, error.stiffness = enough, stiffness
         raise error
 
-    def _resolved(self, v: np.ndarray, h: float, fastest: float) -> tuple[float | None, float]:
+    def _resolved(self, v: np.ndarray, h: float, fastest: float, worst, pairs) -> tuple[float | None, float]:
         """(stiffness [N/m] that stops surface vertices of velocities v [m/s], None if the present one does; a substep [s]).
 
         The barrier k w^2 beta(s) of a pair takes HELD times m V^2 / 2, m the heaviest vertex, V how fast they meet: of all
@@ -266,7 +298,9 @@ class SurfacePairs:
         start = float(np.linalg.norm(start - start.mean(0), axis=1).max(initial=0))
         own = frames if fastest * h > 1 and len(frames) > 1 else v
         speed = max(2 * start, 2 * float(np.linalg.norm(own - own.mean(0), axis=1).max(initial=0)), 1e-300)
-        k, w, energy = self.stiffness, self.width, 0.5 * HELD * mass * speed**2
+        k, w = self._stiffness_and_width(pairs)
+        k, w = (float(x[worst]) for x in (k, w)) if worst is not None else (1.0, self.width)
+        energy = 0.5 * HELD * mass * speed**2
         shares = np.geomspace(0.02, 1, 400)
         s, stiffness = float(np.interp(-energy / (k * w * w), -beta(shares), shares)), None
         if energy > k * w * w * beta(0.02):
@@ -274,19 +308,40 @@ class SurfacePairs:
         omega = np.sqrt((stiffness or k) * light * curvature_at(s))
         return stiffness, float(min(0.5 / max(omega, 1e-300), 0.1 * w / speed, 0.5 * h))
 
+    def _stiffer(self, stiffness: float, worst, pairs: np.ndarray) -> str:
+        """In words, the number that gives the worst pair a stiffness [N/m]."""
+        number = int(self.kinematic.numbers[pairs[worst][[0, 2]]].max()) if self.kinematic and worst is not None else 0
+        if not number:
+            return f"the contact's stiffness to {stiffness:.3g} N/m"
+        part = self.kinematic.corners.parts[number - 1]
+        if not part.force.per_area:
+            return f"the stiffness of {part.term!r} to {stiffness:.3g} N/m"
+        area = float(whole(self.list.area)[worst])
+        return f"the stiffness_per_area of {part.term!r} to {stiffness / area:.3g} N/m^3"
+
     def _fastest(self, gaps: np.ndarray, pairs: np.ndarray) -> float:
         """A frequency [rad/s] of pairs that press, of the lightest vertex against the stiffest pair."""
         at_rest = whole(self.rest_plane)[: self.list.count, 3].astype(np.float64)
-        share = np.minimum(1, at_rest / (2 * self.width))  # listed_pair.py
-        stiffness = self.stiffness / share * curvature_at(gaps / (share * self.width))
+        k, width = self._stiffness_and_width(pairs)
+        share = np.minimum(1, at_rest / (2 * width))  # listed_pair.py
+        stiffness = k / share * curvature_at(gaps / (share * width))
         lightness = runtime.fetch(self.a.inverse_mass).astype(np.float64)[pairs].max(1)
         return float(np.sqrt((stiffness * lightness).max(initial=0)))
 
     def _name(self, pair: int, pairs: np.ndarray) -> str:
         c = pairs[pair]
         if pair < self.list.num_vt:
-            return f"vertex {c[0]} and triangle {_numbers(c[1:])}"
+            return f"{self._part('vertex', c[:1])} and triangle {_numbers(c[1:])}"
+        if self.kinematic and self.kinematic.name(c[2]):
+            return f"edge {_numbers(c[:2])} and {self._part('edge', c[2:])}"
         return f"edges {_numbers(c[:2])} and {_numbers(c[2:])}"
+
+    def _part(self, kind: str, corners: np.ndarray) -> str:
+        """A vertex or an edge in words."""
+        obstacle = self.kinematic.name(corners[0]) if self.kinematic else None
+        if obstacle is None:
+            return f"{kind} {_numbers(corners) if len(corners) > 1 else corners[0]}"
+        return f"an edge of {obstacle!r}" if len(corners) > 1 else f"a point of {obstacle!r}"
 
     # ---- forces -----------------------------------------------------------------------------------------------------
 
@@ -294,14 +349,19 @@ class SurfacePairs:
         """Contact forces at u[slot], to the last corners of `out`."""
         self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
 
-    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0), has_planes=False) -> None:
-        """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width).
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False) -> None:
+        """Change of the contact forces for changes w[0] of the positions (and of the rest shape and all parameters).
 
         has_planes: `forces` were last computed at u[slot].
         """
         at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
-        numbers = dict(zip(("d_stiffness", "d_width"), parameters_dot))
-        numbers |= dict(by_rest=int(rest_dot is not None), has_planes=int(has_planes))
+        numbers = dict(d_stiffness=0.0, d_width=0.0, by_rest=int(rest_dot is not None), has_planes=int(has_planes))
+        if self.kinematic:
+            self.contacts.load_change(self.a.values.parameters, parameters_dot)
+            at |= dict(numbers_dot=self.contacts.numbers_dot)
+        elif parameters_dot is not None:
+            change = parameters_dot[self.a.parameters_of_self_contact][:2]
+            numbers |= dict(zip(("d_stiffness", "d_width"), map(float, change)))
         self.run(self.kernels.products, at, slot=slot, **numbers)
 
     def clear_sums(self) -> None:
@@ -317,12 +377,17 @@ class SurfacePairs:
         self.run(self.kernels.add_sums, dict(out=out), slot=slot)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of (stiffness, width, those of friction) and of the rest shape, (num_vertices, 3), by the forces alone;
-        float64."""
-        rest = np.zeros((self.mesh.num_vertices, 3))
+        """Adjoints of all parameters and of the rest shape, (num_vertices, 3), by the forces and friction; float64."""
+        rest, out = np.zeros((self.mesh.num_vertices, 3)), np.zeros_like(self.a.values.parameters)
         rest[self.mesh.surface_vertices] = runtime.fetch(self.rest_adj)
-        numbers = whole(self.sums).astype(np.float64).sum(0)[:2]
-        return np.concatenate([numbers, self.friction.collect()]) if self.friction else numbers, rest
+        sums = whole(self.sums).astype(np.float64)
+        if self.kinematic:
+            self.contacts.collect(self.a.values.parameters, sums[: len(self.mesh.surface_vertices)], out)
+        else:
+            out[self.a.parameters_of_self_contact][:2] = sums.sum(0)[:2]
+        if self.friction:
+            self.friction.collect(out)
+        return out, rest
 
     # ---- to look at -------------------------------------------------------------------------------------------------
 

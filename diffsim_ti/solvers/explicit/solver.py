@@ -99,6 +99,7 @@ class ExplicitSolver(Solver):
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
         alone = (
             self.scene.term(SelfContact)
+            or any(term.primitives is not None for term in self.scene.terms)
             or has_face_contact(self.scene)
             or any(x.apart for x in self.scene.interactions)
             or self.scene.reduced

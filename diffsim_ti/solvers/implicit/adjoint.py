@@ -194,7 +194,10 @@ class ImplicitAdjoint(RecordedPasses):
             by_lag = by_lag + by_place
         if self.path is not None:
             by_poses = runtime.fetch(self.poses).astype(np.float64).sum(1)
-            ws.collisions.vjp(by_poses + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
+            by_poses = by_poses + by_begin + (0.0 if seen is None else seen[3])
+            if ws.pairs and ws.pairs.obstacles:
+                by_poses = by_poses + ws.pairs.obstacles.take_rows()
+            ws.collisions.vjp(by_poses, j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
         self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()
@@ -270,7 +273,8 @@ class ImplicitAdjoint(RecordedPasses):
             out.parameters[features.drag] = self.rate
         rest = self.frames[0].sum(0)
         if self.ws.pairs:
-            out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()
+            by_parameters, by_pairs = self.ws.pairs.collect()
+            out.parameters += by_parameters
             rest = rest + by_pairs
         if self.ws.potential.faces and features.areas:
             by_areas = runtime.fetch(self.face_areas).astype(np.float64)

@@ -69,9 +69,13 @@ class ImplicitTangent(RecordedPasses):
         held = ws.with_frozen(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
         if ws.rigid:
             held = ws.rigid.held_jvp(held, self.du, tangent.rest)
+        poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
+        of_obstacles = dict(poses_dot=poses) if ws.pairs and ws.pairs.obstacles else {}
         if surface_friction:
-            from_friction = surface_friction.jvp(ws.potential.held_at, held, dx, self.du, self.numbers)
+            from_friction = surface_friction.jvp(
+                ws.potential.held_at, held, dx, self.du, self.numbers, **of_obstacles
+            )
             ws.potential.place(self.u_star)
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
@@ -79,7 +83,6 @@ class ImplicitTangent(RecordedPasses):
         if tangent.growths is not None:
             moved = ws.growth_of(tangent.growths, j, s)
             runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
-        poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
         if poses is not None:
             runtime.fill(self.poses, poses)
         if self._presses:
@@ -87,14 +90,8 @@ class ImplicitTangent(RecordedPasses):
         if ws.strains:
             ws.strains.jvp(s, (self.u, self.du), (self.before, self.tangent_before), self)
         if ws.pairs:
-            ws.pairs.product(
-                ws.potential.u,
-                0,
-                ws.potential.w,
-                a.corner,
-                self.numbers.rest,
-                tangent.parameters[a.parameters_of_self_contact],
-            )
+            moved = self.numbers.rest, tangent.parameters
+            ws.pairs.product(ws.potential.u, 0, ws.potential.w, a.corner, *moved, **of_obstacles)
         self._jvp(**ws.potential.sizes())
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + self.mass_dot * self.weight(share)

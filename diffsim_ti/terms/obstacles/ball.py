@@ -9,6 +9,7 @@ from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.primitives import BALL, CAPSULE
 
 
 def radial(g, r):
@@ -52,8 +53,12 @@ class Sphere(Obstacle):
 
     def __init__(self, center: ArrayLike = (0.0, 0.0, 0.0), radius: float = 1.0, inside: bool = False, **options):
         shape = place("center", center, "sphere_center"), extent("radius", radius, "sphere_radius")
-        super().__init__(shape, **options)
         self.inside = bool(inside)
+        super().__init__(shape, **options)
+
+    @property
+    def all_primitives(self):
+        return None if self.inside else BALL
 
     def distance(self, positions):
         d = np.linalg.norm(positions - self.values["sphere_center"], axis=1) - self.values["sphere_radius"]
@@ -100,7 +105,7 @@ class Capsule(Obstacle):
     whose other arguments it takes.
     """
 
-    counterpart = CapsuleForce
+    counterpart, all_primitives = CapsuleForce, CAPSULE
 
     def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options):
         ends = place("start", start, "capsule_start"), place("end", end, "capsule_end")

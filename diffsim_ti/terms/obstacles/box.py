@@ -13,6 +13,7 @@ from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.ball import check_axis, radial
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.primitives import BOX
 
 
 @traced
@@ -76,7 +77,7 @@ class Box(Obstacle):
     contact's stiffness jumps.
     """
 
-    counterpart = BoxForce
+    counterpart, all_primitives = BoxForce, BOX
 
     def __init__(
         self,

@@ -12,6 +12,7 @@ from diffsim_ti.terms.described import place, positive
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
+from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.terms.obstacles.stiffness import approach, over_time, pressed_by, stiffness_of_impact
 from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_path
@@ -61,6 +62,7 @@ class Obstacle(Term):
 
     acts_on_surface = True
     counterpart: type  # the device counterpart of the shape
+    all_primitives: "Primitives | None" = None  # of the shape
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -79,7 +81,13 @@ class Obstacle(Term):
         name: str | None = None,
         stiffness_per_area: float | None = None,
         about: ArrayLike | None = None,
+        by_pairs: bool = False,
     ):
+        self.by_pairs = bool(by_pairs)
+        if self.by_pairs and self.all_primitives is None:
+            raise ValueError(
+                f"{type(self).__name__}: by_pairs is for shapes of points and edges, and this one has none: leave it out"
+            )
         if isinstance(shape, dict):  # {name: value}, with nothing more to say of them
             shape = [Input(plain, value) for plain, value in shape.items()]
         stiff = self._stiffness(stiffness, stiffness_per_area)
@@ -137,6 +145,11 @@ class Obstacle(Term):
     def about(self) -> np.ndarray:
         """The point that it turns about [m], as it was made."""
         return self.values[self.about_name] if self.turns else np.zeros(3)
+
+    @property
+    def primitives(self) -> "Primitives | None":
+        """By which it acts on faces and edges of bodies; None where by its distance alone."""
+        return self.all_primitives if self.by_pairs else None
 
     @property
     def has_friction(self) -> bool:
@@ -225,7 +238,7 @@ class Obstacle(Term):
 
     @property
     def variant(self) -> tuple:
-        return self.has_friction, self.path is not None, self.per_area, self.turns
+        return self.has_friction, self.path is not None, self.per_area, self.turns, self.by_pairs
 
     def kernel(self, precision: str) -> ObstacleForce:
         return self.counterpart(precision, self.has_friction)

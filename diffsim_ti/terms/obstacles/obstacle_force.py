@@ -20,6 +20,7 @@ class ObstacleForce(VertexForce):
     """Device counterpart of an obstacle: `count` numbers of its shape, then stiffness, width [, friction, friction_speed].
 
     per_area: whether stiffness is per area [N/m^3]; what is said here of a vertex is then said of one square metre.
+    by_pairs: whether what is narrower than faces acts on them by pairs (mechanics/surfaces/kinematic_surface.py).
     A shape writes one function, `distance_and_normal`, in numbers of a graph; everything else follows from it. Positions
     are relative to the obstacle: callers take its displacement from X. The numbers of one that turns end in the point that
     it turns about, and its X is seven numbers: a place, and the unit quaternion of its rotation. A change of X + u is then
@@ -29,6 +30,7 @@ class ObstacleForce(VertexForce):
     friction: bool = False
     per_area: bool = field(default=False, kw_only=True)
     turns: bool = field(default=False, kw_only=True)
+    by_pairs: bool = field(default=False, kw_only=True)
 
     count = 0
     watched = True
@@ -163,6 +165,11 @@ class ObstacleForce(VertexForce):
         """Whether the barrier acts."""
         return self.gap(parameters, first, X, u) < self.width(parameters, first)
 
+    @ti.func
+    def may_touch(self, parameters: ti.template(), first, X, u):
+        """False only where the barrier does not act; what is the same without a look costs less where looking costs most."""
+        return self.touches(parameters, first, X, u)
+
     @traced
     def approach(self, parameters, first, X, u, move):
         """Change of the distance for a small move, n . move [m]."""
@@ -186,14 +193,14 @@ class ObstacleForce(VertexForce):
     @ti.func
     def force(self, parameters: ti.template(), first, X, u, v):
         f = 0 * u
-        if self.touches(parameters, first, X, u):
+        if self.may_touch(parameters, first, X, u):
             f = self._force(parameters, first, X, u)
         return f
 
     @ti.func
     def force_jvp(self, parameters: ti.template(), first, X, u, v, du, dv):
         df = 0 * u
-        if self.touches(parameters, first, X, u):
+        if self.may_touch(parameters, first, X, u):
             df = self._force_jvp(parameters, first, X, u, du)
         return df
 
@@ -204,7 +211,7 @@ class ObstacleForce(VertexForce):
     @ti.func
     def parameter_derivatives(self, parameters: ti.template(), first, X, u, v):
         by = self._zeros(u)
-        if self.touches(parameters, first, X, u):
+        if self.may_touch(parameters, first, X, u):
             self._parameter_derivatives(parameters, first, X, u, by)
         return by
 

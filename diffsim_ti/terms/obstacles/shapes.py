@@ -80,6 +80,29 @@ def _grid(n: int) -> Triangles:
     return np.stack([x, y], 1), np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 
+def skeleton(surface, least: float) -> Triangles:
+    """Triangles of a `KinematicSurface`, from both sides where they have no inside, and its segments and points as bars and
+    stones of its radius, or `least` [m]."""
+    x, t, r = surface.vertices, surface.triangles, max(surface.radius, least)
+    points, triangles = [x], [t, t[~surface.is_sided][:, ::-1]]
+    ends = np.concatenate([surface.segments, np.stack([surface.points, surface.points], 1)])
+    corners = np.array(
+        [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
+    )
+    sides = [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7]]
+    sides = np.array([*sides, [2, 7, 6], [3, 0, 4], [3, 4, 7]])
+    axis = x[ends[:, 1]] - x[ends[:, 0]]
+    axis = np.where(axis.any(1, keepdims=True), axis, [0.0, 0.0, 1.0])
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    first = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
+    first = first / np.linalg.norm(first, axis=1, keepdims=True)
+    frame = np.stack([first, np.cross(axis, first), axis], 1)
+    ended = x[ends[:, (corners[:, 2] > 0).astype(int)]]
+    points.append((ended + r * np.einsum("kd,mde->mke", corners, frame)).reshape(-1, 3))
+    triangles.append((len(x) + len(corners) * np.arange(len(ends))[:, None, None] + sides).reshape(-1, 3))
+    return np.concatenate(points), np.concatenate(triangles)
+
+
 def unit(v: ArrayLike) -> np.ndarray:
     """The vector made one long."""
     return np.asarray(v, np.float64) / np.linalg.norm(v)

@@ -1,0 +1,332 @@
+"""Corners and edges that obstacles bring to the pairs of a scene (terms/obstacles/primitives.py): where they are in a pass,
+how fast, and the chain from there to the obstacles' numbers and poses.
+
+A corner lies at x = c + t + R (p - c), p where the numbers of the obstacle's shape put it, c, t, R of its pose
+(state/obstacle_poses.py). In pairs it is a vertex of infinite mass that follows no node. The edges of an obstacle act on
+edges of bodies, its points on triangles; vertices of bodies meet the obstacle by its distance (mechanics/obstacles).
+
+A stiffness per area is multiplied by the area that the body's primitive stands for in the mesh: a triangle by its own, an
+edge by a third of its triangles'.
+"""
+
+from functools import cached_property
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.common import rotations
+from diffsim_ti.mesh.geometry import triangle_normals
+from diffsim_ti.mesh.sets import pieces
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE, TAU
+
+
+class ObstacleCorners:
+    """Of the obstacles of a scene that act by pairs. Rows of poses are those of state/obstacle_poses.py; parameters those of
+    the scene, as loaded."""
+
+    def __init__(self, arrays):
+        self.a, self.parts, end = arrays, [], 0
+        for k, ((force, first, _), term) in enumerate(zip(arrays.obstacles, arrays.contacts)):
+            if term.primitives is not None:
+                given = np.concatenate([np.ravel(x.value) for x in term.described if x.value is not None])
+                corners, _ = term.primitives.at(given[: force.count])
+                own = slice(end, end := end + len(corners))
+                self.parts.append(
+                    SimpleNamespace(k=k, force=force, first=first, term=term, own=own, as_given=corners)
+                )
+        self.count = end
+
+    def _numbers(self, part, parameters: np.ndarray) -> np.ndarray:
+        return parameters[part.first : part.first + part.force.count]
+
+    def made(self, parameters: np.ndarray) -> np.ndarray:
+        """Where corners are as obstacles were made, shape (count, 3) [m]."""
+        return np.concatenate([x.term.primitives.at(self._numbers(x, parameters))[0] for x in self.parts])
+
+    def radii(self, parameters: np.ndarray) -> np.ndarray:
+        return np.array([x.term.primitives.at(self._numbers(x, parameters))[1] for x in self.parts])
+
+    # ---- poses -------------------------------------------------------------------------------------------------------
+
+    def _row(self, part, m: int) -> int | None:
+        """The row of rotations, None of an obstacle that does not turn."""
+        place = self.a.poses.place_of.get(part.k)
+        return None if place is None else 3 * place + m
+
+    def _about(self, part, parameters: np.ndarray) -> np.ndarray:
+        at = part.first + part.force.index.about
+        return parameters[at : at + 3]
+
+    def _arms(self, part, parameters, rows, m: int, p=None, c=None) -> np.ndarray:
+        """R (p - c) of an obstacle that turns."""
+        p = part.term.primitives.at(self._numbers(part, parameters))[0] if p is None else p
+        c = self._about(part, parameters) if c is None else c
+        return rotations.turned(rotations.from_rodrigues(rows[self._row(part, m)]), p - c)
+
+    def at(self, parameters: np.ndarray, rows: np.ndarray, m: int = AT_STAGE) -> np.ndarray:
+        """Where corners are at the rows number m of poses."""
+        out = []
+        for x in self.parts:
+            p, _ = x.term.primitives.at(self._numbers(x, parameters))
+            if self._row(x, m) is not None:
+                p = self._about(x, parameters) + self._arms(x, parameters, rows, m, p)
+            out.append(p + rows[3 * x.k + m])
+        return np.concatenate(out)
+
+    def at_jvp(self, parameters, change, rows, rows_dot, m: int = AT_STAGE) -> np.ndarray:
+        """Its change for those of the parameters and of the rows (rotations: theta)."""
+        out = []
+        for x in self.parts:
+            dp, _ = x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))
+            row = self._row(x, m)
+            if row is not None:
+                dc, arms = self._about(x, change), self._arms(x, parameters, rows, m)
+                dp = dc + np.cross(rows_dot[row], arms) + self._arms(x, parameters, rows, m, dp, dc)
+            out.append(dp + rows_dot[3 * x.k + m])
+        return np.concatenate(out)
+
+    def at_vjp(self, parameters, rows, by_x, by_parameters, by_rows, m: int = AT_STAGE) -> None:
+        """Adds the adjoints of the parameters and of the rows for that of where corners are."""
+        for x in self.parts:
+            by, row = by_x[x.own], self._row(x, m)
+            by_rows[3 * x.k + m] += by.sum(0)
+            if row is not None:
+                by_rows[row] += np.cross(self._arms(x, parameters, rows, m), by).sum(0)
+                by = self._unturned(x, by, rows, m, by_parameters, by.sum(0))
+            self._add_shape(x, parameters, by, by_parameters)
+
+    def _unturned(self, part, by, rows, m, by_parameters, by_c) -> np.ndarray:
+        """R^T by, less which by_c is the adjoint of the point c."""
+        by = rotations.turned(rotations.conjugate(rotations.from_rodrigues(rows[self._row(part, m)])), by)
+        at = part.first + part.force.index.about
+        by_parameters[at : at + 3] += by_c - by.sum(0)
+        return by
+
+    def _add_shape(self, part, parameters, by, by_parameters, by_radius: float = 0.0) -> None:
+        own = slice(part.first, part.first + part.force.count)
+        by_parameters[own] += part.term.primitives.vjp(parameters[own], by, by_radius)
+
+    def add_radii(self, parameters, by_radii: np.ndarray, by_parameters: np.ndarray) -> None:
+        """Adds the adjoints of the parameters by those of the radii."""
+        for x, by in zip(self.parts, by_radii):
+            self._add_shape(x, parameters, np.zeros((x.own.stop - x.own.start, 3)), by_parameters, float(by))
+
+    def radii_jvp(self, parameters, change) -> np.ndarray:
+        return np.array(
+            [x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[1] for x in self.parts]
+        )
+
+    # ---- velocities, on the chord of a time tau from where the pass begins (mechanics/obstacles/turned.py) --------------
+
+    def _chord(self, part, rows) -> tuple[np.ndarray, np.ndarray]:
+        """(angular velocity, the turn of the chord)"""
+        row = self._row(part, 0)
+        return rows[row + RATE], rows[row + TAU, 0] * rows[row + RATE]
+
+    def velocity(self, parameters, rows) -> np.ndarray:
+        """Of corners [m/s]."""
+        out = np.zeros((self.count, 3))
+        for x in self.parts:
+            out[x.own] = rows[3 * x.k + RATE]
+            if self._row(x, 0) is not None:
+                omega, turn = self._chord(x, rows)
+                arms = self._arms(x, parameters, rows, AT_BEGIN)
+                out[x.own] += np.cross(omega, arms @ rotations.left_jacobian(turn).T)
+        return out
+
+    def velocity_jvp(self, parameters, change, rows, rows_dot) -> np.ndarray:
+        out = np.zeros((self.count, 3))
+        for x in self.parts:
+            out[x.own], row = rows_dot[3 * x.k + RATE], self._row(x, AT_BEGIN)
+            if row is not None:
+                (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
+                J, dp = rotations.left_jacobian(turn), x.term.primitives.jvp(
+                    self._numbers(x, parameters), self._numbers(x, change)
+                )[0]
+                darms = np.cross(rows_dot[row], arms)
+                darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self._about(x, change))
+                turned = rotations.turned(rotations.quaternion(turn), arms)
+                out[x.own] += np.cross(J @ rows_dot[row - AT_BEGIN + RATE], turned) + np.cross(omega, darms @ J.T)
+        return out
+
+    def velocity_vjp(self, parameters, rows, by_v, by_parameters, by_rows) -> None:
+        for x in self.parts:
+            by, row = by_v[x.own], self._row(x, AT_BEGIN)
+            by_rows[3 * x.k + RATE] += by.sum(0)
+            if row is not None:
+                (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
+                J, turned = rotations.left_jacobian(turn), rotations.turned(rotations.quaternion(turn), arms)
+                by_rows[row - AT_BEGIN + RATE] += J.T @ np.cross(turned, by).sum(0)
+                by_arms = np.cross(by, omega) @ J
+                by_rows[row] += np.cross(arms, by_arms).sum(0)
+                by_p = self._unturned(x, by_arms, rows, AT_BEGIN, by_parameters, 0.0)
+                self._add_shape(x, parameters, by_p, by_parameters)
+
+
+class KinematicSurface:
+    """The surface of a body and behind it the corners and edges of obstacles, as pairs read it; vertices of the body keep
+    their numbers.
+
+    body: a mesh, or its finer surface (mesh/collision_surface.py). owner: number of the contact of each vertex of
+    `surface_vertices`. acting: vertices that meet triangles; the first own_edges edges are the body's, of which the first
+    meeting_edges meet each other. areas: of each triangle and each edge.
+    """
+
+    def __init__(self, body, edges: np.ndarray, corners: ObstacleCorners, self_contact):
+        n, given = body.num_vertices, [x.as_given for x in corners.parts]
+        self.num_vertices, self.first, self.vertices = n + corners.count, n, np.concatenate([body.vertices, *given])
+        self.body, self.corners, self.surface_triangles = body, corners, body.surface_triangles
+        self.surface_vertices = np.concatenate([body.surface_vertices, np.arange(n, self.num_vertices)])
+        self.elements, self.tetrahedron_sets, self.vertex_sets = body.elements, body.tetrahedron_sets, body.vertex_sets
+        begin = [(n + x.own.start, x.term.primitives) for x in corners.parts]
+        self.edges = np.concatenate([edges, *(at + part.edges for at, part in begin)])
+        points = np.concatenate([at + part.points for at, part in begin])
+        self.own_edges, self.meeting_edges = len(edges), len(edges) if self_contact else 0
+        self.acting = np.concatenate([body.surface_vertices[: None if self_contact else 0], points])
+        size = np.linalg.norm(triangle_normals(body.vertices, body.surface_triangles), axis=1)
+        keys = np.sort(body.surface_triangles[:, [[0, 1], [1, 2], [2, 0]]], 2).reshape(-1, 2) @ [n, 1]
+        of_edges = np.bincount(np.searchsorted(edges @ [n, 1], keys), np.repeat(size / 3, 3), len(edges))
+        self.areas = size, np.concatenate([of_edges, np.zeros(len(self.edges) - len(edges))])
+        self.numbers = np.zeros(self.num_vertices, int)
+        for number, part in enumerate(corners.parts, start=1):
+            self.numbers[n + part.own.start : n + part.own.stop] = number
+        self.owner = self.numbers[self.surface_vertices]
+
+    def pieces(self) -> np.ndarray:
+        """Which body, or obstacle, each vertex belongs to."""
+        own = np.asarray(pieces(self.body))
+        return np.concatenate([own[: self.first], own.max() + self.numbers[self.first :]])
+
+    def name(self, vertex: int):
+        """The obstacle that a vertex belongs to, or None."""
+        number = int(self.numbers[vertex])
+        return self.corners.parts[number - 1].term if number else None
+
+    @cached_property
+    def matrix(self):
+        """C of vertices x = C X, without corners of obstacles, whose rows are empty."""
+        from scipy.sparse import csr_matrix, identity, vstack
+
+        own = getattr(self.body, "matrix", None)
+        own = identity(self.body.num_vertices, format="csr") if own is None else own
+        return vstack([own, csr_matrix((self.corners.count, own.shape[1]))], format="csr")
+
+
+class ObstacleMotion:
+    """Where the corners of a KinematicSurface are, on the device too, and the adjoints of that. `given` and `given_dot` are
+    displacements of all its vertices that no node gives, and changes of these."""
+
+    def __init__(self, surface: KinematicSurface, arrays):
+        self.surface, self.corners, self.a = surface, surface.corners, arrays
+        self.given, self.given_dot, self.unmoved = (runtime.array(arrays.vector, surface.num_vertices) for _ in range(3))
+        for array in (self.given, self.given_dot, self.unmoved):
+            runtime.fill(array, 0)
+        self.rows, self.m = np.zeros((arrays.poses.size, 3)), AT_STAGE
+        self.displacements = np.zeros((self.corners.count, 3))
+        self.by_parameters = self.by_rows = None
+
+    @property
+    def parameters(self) -> np.ndarray:
+        return self.a.values.parameters
+
+    def displacements_at(self, rows: np.ndarray, m: int = AT_STAGE) -> np.ndarray:
+        """Displacements of corners from where they were made, at rows of poses."""
+        return self.corners.at(self.parameters, rows, m) - self.corners.made(self.parameters)
+
+    def _fill(self, target, corners: np.ndarray) -> None:
+        out = np.zeros((self.surface.num_vertices, 3))
+        out[self.surface.first :] = corners
+        runtime.fill(target, out)
+
+    def follow(self, rows: np.ndarray, m: int) -> None:
+        self.rows, self.m = rows, m
+        self.displacements = self.displacements_at(rows, m)
+        self._fill(self.given, self.displacements)
+
+    def change(self, parameters_dot: np.ndarray, rows_dot: np.ndarray | None) -> np.ndarray:
+        """Changes of the displacements, for those of all parameters and of the rows of poses."""
+        rows_dot = np.zeros_like(self.rows) if rows_dot is None else rows_dot
+        out = self.corners.at_jvp(self.parameters, parameters_dot, self.rows, rows_dot, self.m)
+        self._fill(self.given_dot, out)
+        return out
+
+    def changes(self, parameters_dot: np.ndarray, rows_dot: np.ndarray | None) -> tuple[np.ndarray, ...]:
+        """Those of where corners are where forces are taken and where the pass begins, and of their velocities."""
+        given = self.parameters, parameters_dot, self.rows, np.zeros_like(self.rows) if rows_dot is None else rows_dot
+        return *(self.corners.at_jvp(*given, m) for m in (AT_STAGE, AT_BEGIN)), self.corners.velocity_jvp(*given)
+
+    def velocities(self) -> np.ndarray:
+        return self.corners.velocity(self.parameters, self.rows)
+
+    def clear(self) -> None:
+        """A reverse sweep begins."""
+        self.by_parameters, self.by_rows = np.zeros_like(self.parameters), np.zeros_like(self.rows)
+
+    def add_places(self, by_x: np.ndarray, m: int | None = None) -> None:
+        """Add the adjoints by that of where corners are."""
+        m = self.m if m is None else m
+        self.corners.at_vjp(self.parameters, self.rows, by_x, self.by_parameters, self.by_rows, m)
+
+    def add_velocities(self, by_v: np.ndarray) -> None:
+        self.corners.velocity_vjp(self.parameters, self.rows, by_v, self.by_parameters, self.by_rows)
+
+    def take_rows(self) -> np.ndarray:
+        """The adjoints of the rows of poses that were added in a pass."""
+        out, self.by_rows = self.by_rows, np.zeros_like(self.rows)
+        return out
+
+
+class ContactNumbers:
+    """Which numbers of the scene the contacts of a KinematicSurface have, on the device (listed_pair.py)."""
+
+    def __init__(self, surface: KinematicSurface, arrays):
+        self.surface, parts, term = surface, surface.corners.parts, arrays.self_contact
+        self.of_bodies, rows = arrays.parameters_of_self_contact, [[0, 0, 0]]
+        if term:
+            index, first = term.index, self.of_bodies.start
+            rows = [[first + index.stiffness, first + index.width, first + index.friction_speed * term.has_friction]]
+        for x in parts:
+            speed = x.force.index.friction_speed if x.force.friction else 0
+            rows.append([x.first + k for k in (x.force.index.stiffness, x.force.index.width, speed)])
+        self.rows = np.array(rows)
+        mu = np.arange(first + index.friction, self.of_bodies.stop) if term and term.has_friction else np.zeros(0, int)
+        self.rows_of_bodies = len(mu)
+        rough = [x.first + x.force.index.friction for x in parts if x.force.friction]
+        self.mu = np.concatenate([mu, rough]).astype(int)
+        felt = np.array([x.force.friction for x in parts])
+        self.row_of = np.where(felt, self.rows_of_bodies + np.cumsum(felt) - 1, -1)
+        per_area = [0, *(int(x.force.per_area) for x in parts)]
+        self.owner = runtime.upload(surface.owner, ti.i32)
+        self.at_number = runtime.upload(self.rows.ravel(), ti.i32)
+        self.at_row = runtime.upload(np.append(self.mu, 0), ti.i32)
+        self.per_area = runtime.upload(np.array(per_area), ti.i32)
+        self.radius = runtime.array(arrays.fp, len(rows))
+        self.numbers_dot = runtime.array(arrays.vector, len(rows))
+        self.widths = self.reach = None
+
+    def load(self, parameters: np.ndarray) -> None:
+        """Numbers that are loaded. widths: of the contacts; reach: how far each acts."""
+        radii = np.append(0.0, self.surface.corners.radii(parameters))
+        self.widths = parameters[self.rows[:, 1]]
+        self.reach = self.widths + radii
+        runtime.fill(self.radius, radii)
+
+    def load_change(self, parameters, change: np.ndarray | None) -> None:
+        """Changes of the numbers; None: zero."""
+        rows = np.zeros((len(self.rows), 3))
+        if change is not None:
+            rows[:, :2] = change[self.rows[:, :2]]
+            rows[1:, 2] = self.surface.corners.radii_jvp(parameters, change)
+            if not self.of_bodies.stop > self.of_bodies.start:
+                rows[0] = 0
+        runtime.fill(self.numbers_dot, rows)
+
+    def collect(self, parameters, sums: np.ndarray, out: np.ndarray) -> None:
+        """Adds the adjoints of the numbers to those of the scene for sums of (stiffness, width, -, radius) of each vertex."""
+        total = np.zeros((len(self.rows), 4))
+        np.add.at(total, self.surface.owner, sums)
+        for c in range(0 if self.of_bodies.stop > self.of_bodies.start else 1, len(total)):
+            out[self.rows[c, :2]] += total[c, :2]
+        self.surface.corners.add_radii(parameters, total[1:, 3], out)

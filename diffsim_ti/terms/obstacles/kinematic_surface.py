@@ -1,0 +1,138 @@
+"""A surface that does not deform: its points, triangles, edges, and which side of it is inside."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from diffsim_ti.common.checked import numbers, shown, wholes
+from diffsim_ti.mesh.geometry import cross
+from diffsim_ti.mesh.sets import components
+
+CORNERS = dict(triangles=3, segments=2, points=1)
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicSurface:
+    """What an obstacle consists of where it was made: all that is within `radius` of triangles, segments and points.
+
+    vertices [m], shape (k, 3); triangles, shape (t, 3), segments, shape (s, 2), and points, shape (p,), name them by index;
+    radius [m]. Vertices in one place are one to the topology (`one`), so that surfaces whose triangles share none are
+    closed, too. Parts that are closed and oriented have an inside, others are felt from both sides alike.
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    segments: np.ndarray
+    points: np.ndarray
+    radius: float = 0.0
+
+    @classmethod
+    def checked(cls, owner: str, vertices, triangles, segments, points) -> "KinematicSurface":
+        """Of what a user gives; where nothing names vertices, all of them are points. Raises ValueError."""
+        vertices = numbers(f"{owner}: vertices", vertices)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices) or not np.all(np.isfinite(vertices)):
+            raise ValueError(f"{owner}: vertices must be finite, of shape (k, 3), got {shown(vertices)}")
+        if triangles is None and segments is None and points is None:
+            points = np.arange(len(vertices))
+        parts = dict(triangles=triangles, segments=segments, points=points)
+        for name, corners in CORNERS.items():
+            part = wholes(f"{owner}: {name}", np.zeros((0, corners)) if parts[name] is None else parts[name])
+            part = part[:, None] if corners == 1 and part.ndim == 1 else part
+            part = part.reshape(-1, corners) if not part.size else part
+            if part.ndim != 2 or part.shape[1] != corners:
+                raise ValueError(f"{owner}: {name} must have shape (m, {corners}), got {part.shape}")
+            if part.size and not 0 <= part.min() <= part.max() < len(vertices):
+                outside = part.min() if part.min() < 0 else part.max()
+                raise ValueError(
+                    f"{owner}: {name} must name vertices by index, 0 to {len(vertices) - 1}, got {outside}"
+                )
+            parts[name] = part
+        if not any(len(part) for part in parts.values()):
+            raise ValueError(f"{owner}: give it at least one triangle, segment or point")
+        return cls(vertices, parts["triangles"], parts["segments"], parts["points"][:, 0])
+
+    @cached_property
+    def one(self) -> np.ndarray:
+        """Of each vertex the first that lies where it does, shape (k,)."""
+        order = np.lexsort(self.vertices.T)  # stable, so that the first of those in one place comes first
+        new = np.ones(len(order), bool)
+        new[1:] = (np.diff(self.vertices[order], axis=0) != 0).any(1)
+        out = np.empty(len(order), np.int64)
+        out[order] = order[new][np.cumsum(new) - 1]
+        return out
+
+    @cached_property
+    def _edges_of_triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """(edges of triangles, sorted, shape (e, 2); of each triangle's sides ab, bc, ca the number, shape (t, 3))"""
+        sides = np.sort(self.one[self.triangles[:, [0, 1, 1, 2, 2, 0]]].reshape(-1, 2), 1)
+        keys, which = np.unique(sides[:, 0] * len(self.vertices) + sides[:, 1], return_inverse=True)
+        return np.stack(np.divmod(keys, len(self.vertices)), 1), which.reshape(-1, 3)
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Edges of triangles and segments, each once, shape (e, 2)."""
+        all_edges = np.concatenate([self._edges_of_triangles[0], np.sort(self.one[self.segments], 1)])
+        all_edges = np.unique(all_edges, axis=0)
+        return all_edges[all_edges[:, 0] < all_edges[:, 1]]
+
+    @cached_property
+    def used(self) -> np.ndarray:
+        """Vertices that something names, each place once, sorted."""
+        named = np.concatenate([self.triangles.ravel(), self.segments.ravel(), self.points])
+        return np.unique(self.one[named])
+
+    @cached_property
+    def is_sided(self) -> np.ndarray:
+        """Whether each triangle belongs to a part that is closed and oriented, each edge being passed once each way."""
+        if not len(self.triangles):
+            return np.zeros(0, bool)
+        t, (edges, which) = self.one[self.triangles], self._edges_of_triangles
+        following = np.roll(t, -1, axis=1)
+        real = (t != following).all(1, keepdims=True)  # others have no area, and their neighbours meet
+        count = np.bincount(which.ravel(), np.repeat(real, 3), len(edges))
+        net = np.bincount(which.ravel(), (real * np.where(t < following, 1, -1)).ravel(), len(edges))
+        fits = ((count == 2) & (net == 0))[which].all(1) | ~real[:, 0]
+        body = components(t[:, [0, 1]].ravel(), t[:, [1, 2]].ravel(), len(self.vertices))[t[:, 0]]
+        good = np.ones(body.max() + 1, bool)
+        good[body[~fits]] = False
+        return good[body]
+
+    @cached_property
+    def pseudonormals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Outward directions, of sides ab, bc, ca of each triangle, (t, 3, 3), and of vertices, (k, 3), zero where there is
+        no inside: sums over the triangles there, at vertices weighted by their angles.
+
+        Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
+        """
+        x, sided = self.vertices[self.triangles], self.is_sided
+        normals = cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300) * sided[:, None]
+        edges, which = self._edges_of_triangles
+        of_edges, of_vertices = np.zeros((len(edges), 3)), np.zeros_like(self.vertices)
+        for a in range(3):
+            b, c = x[:, (a + 1) % 3] - x[:, a], x[:, (a + 2) % 3] - x[:, a]
+            angle = np.arctan2(np.linalg.norm(cross(b, c), axis=1), np.einsum("ij,ij->i", b, c))
+            for d in range(3):
+                of_edges[:, d] += np.bincount(which[:, a], normals[:, d], len(edges))
+                own = self.one[self.triangles[:, a]]
+                of_vertices[:, d] += np.bincount(own, angle * normals[:, d], len(self.vertices))
+        return of_edges[which], of_vertices[self.one]
+
+    @cached_property
+    def is_convex(self) -> bool:
+        """Whether it bounds a convex solid: one sphere whose edges all bend outwards."""
+        edges, which = self._edges_of_triangles
+        if len(self.segments) or len(self.points) or not len(self.triangles) or not self.is_sided.all():
+            return False
+        if len(np.unique(self.one[self.triangles])) - len(edges) + len(self.triangles) != 2:
+            return False
+        x = self.vertices[self.triangles]
+        normals, tiny = cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), 1e-9 * float(np.ptp(x.reshape(-1, 3), 0).max())
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        order = np.argsort(which.ravel(), kind="stable").reshape(-1, 2)  # the two sides of each edge
+        (f, g), (_, side) = (order // 3).T, (order % 3).T
+        beyond = x[g, (side + 2) % 3] - x[f, 0]
+        if np.einsum("ij,ij->i", beyond, normals[f]).max() > tiny:
+            return False
+        return bool(np.einsum("ij,ij->i", normals, x[:, 0] - x.reshape(-1, 3).mean(0)).min() > 0)

@@ -1,0 +1,98 @@
+"""The corners and edges by which an obstacle acts on edges and faces of bodies, and the place of these by its numbers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Primitives:
+    """What bodies feel of an obstacle between their own vertices, as pairs (mechanics/surfaces/kinematic_surface.py).
+
+    points: numbers of the corners that act on faces. edges: two corners of each edge that acts on edges, shape (k, 2).
+    Corners lie where the numbers p of the obstacle's shape say, as it was made:
+
+        (corners [m], radius [m]) = at(p),    and derivatives by p
+
+    radius: how far bodies stay from corners and edges, beside the gap of the barrier.
+    """
+
+    points: np.ndarray
+    edges: np.ndarray
+
+    def at(self, p: np.ndarray) -> tuple[np.ndarray, float]:
+        raise NotImplementedError
+
+    def jvp(self, p: np.ndarray, dp: np.ndarray) -> tuple[np.ndarray, float]:
+        """Their change."""
+        raise NotImplementedError
+
+    def vjp(self, p: np.ndarray, by_corners: np.ndarray, by_radius: float) -> np.ndarray:
+        """Adjoint of p."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class RoundPrimitives(Primitives):
+    """Of all that is within a radius, the last number, of corners, the others."""
+
+    def at(self, p):
+        return p[:-1].reshape(-1, 3), float(p[-1])
+
+    def jvp(self, p, dp):
+        return self.at(dp)
+
+    def vjp(self, p, by_corners, by_radius):
+        return np.append(by_corners.ravel(), by_radius)
+
+
+BALL = RoundPrimitives(np.zeros(1, int), np.zeros((0, 2), int))
+CAPSULE = RoundPrimitives(np.arange(2), np.array([[0, 1]]))
+SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+
+@dataclass(frozen=True)
+class BoxPrimitives(Primitives):
+    """Of a box: center, size, a quaternion q of any length; corners c + R(q) (signs size / 2)."""
+
+    def at(self, p):
+        return p[:3] + 0.5 * (SIGNS * p[3:6]) @ _rotation(p[6:])[0].T, 0.0
+
+    def jvp(self, p, dp):
+        R, by_q = _rotation(p[6:])
+        turned = np.einsum("dij,d->ij", by_q, dp[6:])
+        return dp[:3] + 0.5 * ((SIGNS * dp[3:6]) @ R.T + (SIGNS * p[3:6]) @ turned.T), 0.0
+
+    def vjp(self, p, by_corners, by_radius):
+        R, by_q = _rotation(p[6:])
+        by_size = 0.5 * (SIGNS * (by_corners @ R)).sum(0)
+        by_R = 0.5 * by_corners.T @ (SIGNS * p[3:6])
+        return np.concatenate([by_corners.sum(0), by_size, np.einsum("dij,ij->d", by_q, by_R)])
+
+
+BOX = BoxPrimitives(
+    np.arange(8), np.array([[a, b] for a in range(8) for b in range(a + 1, 8) if (SIGNS[a] != SIGNS[b]).sum() == 1])
+)
+
+
+def _rotation(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(rotation matrix of a quaternion of any length, its derivatives by the four numbers)."""
+    length = np.linalg.norm(q)
+    w, x, y, z = q / length
+    R = np.eye(3) + 2 * np.array(
+        [
+            [-y * y - z * z, x * y - w * z, x * z + w * y],
+            [x * y + w * z, -x * x - z * z, y * z - w * x],
+            [x * z - w * y, y * z + w * x, -x * x - y * y],
+        ]
+    )
+    by_unit = 2 * np.array(
+        [
+            [[0, -z, y], [z, 0, -x], [-y, x, 0]],
+            [[0, y, z], [y, -2 * x, -w], [z, w, -2 * x]],
+            [[-2 * y, x, w], [x, 0, z], [-w, z, -2 * y]],
+            [[-2 * z, -w, x], [w, -2 * z, y], [x, y, 0]],
+        ]
+    )
+    unit = q / length
+    return R, np.einsum("ed,eij->dij", (np.eye(4) - np.outer(unit, unit)) / length, by_unit)
