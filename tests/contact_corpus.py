@@ -481,9 +481,7 @@ def _on_surface(upper: str, surface: str, by=(0.0, 0.0), scale: float = 1.0):
         top = float(vertices[under if len(under) else slice(None), 1].max())
         above = moved(_upside_down(meshes(upper), top + 0.05), [by[0], 0, by[1]])
         fixed = Surface(vertices, triangles)
-        return posed(
-            [above], steps=120, contact=FIRM, terms=[fixed.obstacle(width=5e-3)], surfaces=[fixed], **ERLEBEN
-        )
+        return posed([above], steps=120, contact=FIRM, terms=[fixed.obstacle(width=5e-3)], surfaces=[fixed], **ERLEBEN)
 
     return make
 
@@ -554,7 +552,18 @@ SCENES["pin cushion of segments"] = _cushion(True)
 
 # ---- the table -------------------------------------------------------------------------------------------------------
 
-HEAD = ("scene", "tetrahedra", "steps", "intersections", "rounds", "most", "s/step", "us/tet", "paper's us/tet", "verdict")
+HEAD = (
+    "scene",
+    "tetrahedra",
+    "steps",
+    "intersections",
+    "rounds",
+    "most",
+    "s/step",
+    "us/tet",
+    "paper's us/tet",
+    "verdict",
+)
 
 
 def row(run: Run) -> list[str]:

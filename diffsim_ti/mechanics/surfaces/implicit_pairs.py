@@ -35,17 +35,22 @@ class ImplicitPairs(SurfacePairs):
         """Go to the displacements u[0]."""
         self.ensure(u, 0)
         self.forces(u, 0, self.a.corner)
+        if self.friction:
+            self.friction.leave()
 
     def energies(self) -> np.ndarray:
         """Energy of each pair [J]."""
         return runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
 
     def hessian_product(self, u, w, convex: bool) -> None:
-        """Change of the contact forces for changes w[0] of the positions, to the last corners of `arrays.corner`."""
+        """Change of the forces of contact and friction for changes w[0] of the positions, to the last corners of
+        `arrays.corner`."""
         if convex:
             self.run(self.hessian.products, dict(u=u, w=w, out=self.a.corner), slot=0)
         else:
             self.product(u, 0, w, self.a.corner, has_planes=True)
+        if self.friction:
+            self.friction.add_product(u, w, self.a.corner)
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (mechanics/energy/kernels.py)."""

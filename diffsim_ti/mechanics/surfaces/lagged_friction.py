@@ -1,9 +1,12 @@
 """Friction between surfaces in implicit passes: a force with a potential, from what presses where the pass begins."""
 
+from contextlib import contextmanager
+
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
+from diffsim_ti.mechanics.surfaces.friction_product import FrictionProduct
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.terms.obstacles.friction import ARRAYS, dissipated, slip
 
@@ -24,6 +27,7 @@ class LaggedFriction(PairFriction):
         self.L, self.x, self.per_gamma = np.zeros(0), np.zeros((self.a.num_vertices, 3)), 1.0
         self.by_speed, self.u_begin = np.zeros(len(self.speeds_at)), None
         self.contact = np.zeros(0, int)  # its number of each pair
+        self._product, self._is_put = FrictionProduct(pairs), False
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
         """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above."""
@@ -36,6 +40,19 @@ class LaggedFriction(PairFriction):
         self.n, self.L = pressing[:, :3], pressing[:, 3]
         surface = self.pairs.kinematic
         self.contact = surface.numbers[self.corners[:, [0, 2]]].max(1) if surface else np.zeros(len(felt), int)
+        self._product.begin(self.corners, self.w)
+        self._is_put = False
+
+    def leave(self) -> None:
+        """The displacement changes: so does the stiffness."""
+        self._is_put = False
+
+    @contextmanager
+    def without(self):
+        """As if nothing pressed."""
+        self.L, pressing, self._is_put = np.zeros_like(self.L), self.L, False
+        yield
+        self.L, self._is_put = pressing, False
 
     def _measure_here(self) -> None:
         self.pairs.forces(self.pairs.next, 0, self.a.corner)
@@ -86,10 +103,12 @@ class LaggedFriction(PairFriction):
         out += (slope - kappa)[:, None, None] * e[:, :, None] * e[:, None]
         return (self.per_gamma * self.L)[:, None, None] * out
 
-    def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
-        """d2E/du2 w [N], which is convex."""
-        across = np.einsum("pij,pk,pkj->pi", self._stiffness(u), self.w, w[self.corners], optimize=True)
-        return self._scatter(self.w[:, :, None] * across[:, None])
+    def add_product(self, u, w, out) -> None:
+        """Add the change of the forces at u[0] for changes w[0] of the positions to the last corners of `out`."""
+        if not self._is_put:
+            self._product.put(self._stiffness(runtime.fetch_row(u, 0)))
+            self._is_put = True
+        self._product.add(w, out)
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m]."""
