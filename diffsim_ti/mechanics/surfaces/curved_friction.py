@@ -40,6 +40,12 @@ class CurvedLaggedFriction:
     def without(self):
         return self.inner.without()
 
+    def bounded(self, which):
+        return self.inner.bounded(which)
+
+    def turns(self, u: np.ndarray, there: np.ndarray) -> np.ndarray:
+        return self.inner.turns(self._fine(u), self._fine(there))
+
     def _fine(self, u: np.ndarray) -> np.ndarray:
         return self.C @ u + self.given
 

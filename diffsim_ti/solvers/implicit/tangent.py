@@ -73,9 +73,7 @@ class ImplicitTangent(RecordedPasses):
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
         of_obstacles = dict(poses_dot=poses) if ws.pairs and ws.pairs.obstacles else {}
         if surface_friction:
-            from_friction = surface_friction.jvp(
-                ws.potential.held_at, held, dx, self.du, self.numbers, **of_obstacles
-            )
+            from_friction = surface_friction.jvp(ws.potential.held_at, held, dx, self.du, self.numbers, **of_obstacles)
             ws.potential.place(self.u_star)
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
