@@ -58,11 +58,15 @@ class ImplicitPairs(SurfacePairs):
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
-        largest such share only where they are about to meet. Marches along the step, with a new list at each halt."""
+        largest such share only where they are about to meet. Marches along the step, with a new list at each halt,
+        unless the present one holds on all of it."""
         travel = self._travel(step[self.mesh.surface_vertices])
         if not travel.any():
             return most
         runtime.fill(self.step, step[None])
+        if self._holds(u + most * step) and self._holds(u):
+            self.forces(self.next, 0, self.a.corner, exact=True)
+            return min(most, self._shares().min(initial=np.inf))
         share = 0.0
         for _ in range(self.longest_march):
             runtime.fill(self.next, (u + share * step)[None])
@@ -77,6 +81,11 @@ class ImplicitPairs(SurfacePairs):
             if listed < unlisted:
                 return share
         return share
+
+    def _holds(self, u: np.ndarray) -> bool:
+        """Whether the list holds at u, to where `next` goes."""
+        runtime.fill(self.next, u[None])
+        return self.fresh and not self._check(self.next, 0, 0, 0)[0]
 
     def _shares(self) -> np.ndarray:
         out = self.list.buffers.take("shares", self.kernels.fp, self.list.count)
