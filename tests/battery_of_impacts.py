@@ -1,11 +1,12 @@
 """Random impacts of small bodies on thin walls, needles, plates and balls, at rest and moving, judged by geometry alone.
 
-    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--rough] [--reduced] [--order 2] [--solver NAME]
+    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--rough] [--reduced] [--order 2] [--pairs]
+        [--solver NAME]
 
 Each case runs once; where it raises, what the error advises is done and the case runs again, three times at most.
 --turning: obstacles turn about a point near them as well. --rough: they rub. --reduced: the body, or what comes first of it
 and is stiffer, moves by few numbers, in implicit steps and static solves. --order 2: of ten-node tetrahedra, on the
-same grids.
+same grids. --pairs: points and edges of obstacles act by pairs.
 """
 
 import argparse
@@ -54,6 +55,7 @@ class Case:
     rough: bool = False
     reduced: str | None = None  # how a part of the body moves
     order: int = 1
+    pairs: bool = False
     stiffness: float | None = None  # per area [N/m^3]
     substeps: int = 1  # of explicit solvers: times what stability asks for
     substep: float = float("inf")  # what explicit ones were advised [s]
@@ -87,7 +89,14 @@ class Case:
 
 
 def draw(
-    number: int, seed: int, solvers, turning: bool = False, order: int = 1, reduced: bool = False, rough: bool = False
+    number: int,
+    seed: int,
+    solvers,
+    turning: bool = False,
+    order: int = 1,
+    reduced: bool = False,
+    rough: bool = False,
+    pairs: bool = False,
 ) -> Case:
     rng, names = np.random.default_rng([seed, number]), list(solvers)
     log = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))  # noqa: E731
@@ -108,6 +117,7 @@ def draw(
         rough=rough,
         reduced=("affine", "by functions", "by fields", "rigid")[(number + number // 6) % 4] if reduced else None,
         order=order,
+        pairs=pairs,
     )
 
 
@@ -143,6 +153,8 @@ def build(case: Case):
         path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
     stiffness = case.stiffness or natural_stiffness(case, mesh, width)
     given, back = turning(case, path) if case.turning else (dict(path=path), lambda x, t: x - path(t))
+    if case.pairs:
+        given["by_pairs"] = True
     if case.rough:
         given |= dict(friction=0.5, friction_speed=0.01 * case.speed)
     obstacle = obstacle(width=width, stiffness_per_area=stiffness, **given)
@@ -317,6 +329,7 @@ def main() -> int:
     parser.add_argument("--turning", action="store_true")
     parser.add_argument("--rough", action="store_true")
     parser.add_argument("--reduced", action="store_true")
+    parser.add_argument("--pairs", action="store_true")
     parser.add_argument("--order", type=int, choices=(1, 2), default=1)
     given = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)
@@ -324,7 +337,7 @@ def main() -> int:
     # by few numbers: dealt in turn to those that solve for them
     solvers = {name: kind for name, kind in SOLVERS.items() if not (given.reduced and kind.explicit)}
     cases = (
-        draw(n, given.seed, solvers, given.turning, given.order, given.reduced, given.rough)
+        draw(n, given.seed, solvers, given.turning, given.order, given.reduced, given.rough, given.pairs)
         for n in given.only or range(given.cases)
     )
     table = battery(c for c in cases if not given.solver or c.solver in given.solver)

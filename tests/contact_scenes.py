@@ -41,7 +41,7 @@ SHAPES = {
     "capsule": lambda **o: ds.Capsule([-0.3, -0.3, 0.2], [0.6, -0.3, 0.1], 0.3, **o),
     "box": lambda **o: ds.Box([0.2, -0.52, 0.2], [0.5, 1.0, 0.3], [0.1, 0.2, 0.05], **o),
     "cylinder": lambda **o: ds.Cylinder([0.2, -0.6, 0.2], [0.21, -0.02, 0.25], 0.2, **o),
-    "mesh": lambda **o: ds.MeshObstacle(*box_surface([0.9, 0.6, 0.8], [-0.1, -0.61, -0.2]), [0.01, 0, 0.02], 8, **o),
+    "mesh": lambda **o: ds.MeshObstacle(*box_surface([0.9, 0.6, 0.8], [-0.1, -0.61, -0.2]), [0.01, 0, 0.02], **o),
 }
 
 

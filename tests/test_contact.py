@@ -42,7 +42,7 @@ def evaluate(term, positions, precision="f64"):
     return runtime.fetch(gap), runtime.fetch(energy), runtime.fetch(force)
 
 
-@pytest.mark.parametrize("name", [n for n in SHAPES if n != "mesh"])
+@pytest.mark.parametrize("name", SHAPES)
 def test_distance_and_force(name):
     """The kernel's distance is the one that checks and reports use; the force is minus the energy's gradient."""
     term = SHAPES[name](stiffness=300.0, width=0.2)
@@ -93,20 +93,6 @@ def test_barrier_near_its_ends(precision, tolerance):
     assert np.all(runtime.fetch(out)[:, 0] == 0) and np.all(runtime.fetch(out)[1, 1:] < 0)
 
 
-def test_mesh_distance():
-    """Exact at faces; within a cell of edges the spline rounds."""
-    term = SHAPES["mesh"](stiffness=300.0, width=0.2)
-    box = ds.Box([0.36, -0.31, 0.22], [0.9, 0.6, 0.8], stiffness=300.0, width=0.2)
-    over = np.array([[0.3, 0.07, 0.2], [0.4, 0.12, 0.3], [0.36, -0.05, 0.22]])
-    np.testing.assert_allclose(evaluate(term, over)[0], box.distance(over), atol=2e-3)
-    np.testing.assert_allclose(term.distance(POINTS), box.distance(POINTS), atol=1e-12)
-    gap, exact = evaluate(term, POINTS)[0], box.distance(POINTS)
-    near = np.abs(exact) < 0.2
-    assert np.abs(gap[near] - exact[near]).max() < 0.5 * term.cell
-    far = np.array([[50.0, 0, 0], [0, -30, 0]])
-    assert np.all(evaluate(term, far)[2] == 0) and np.all(evaluate(term, far)[0] > 1)
-
-
 ERRORS = {
     "friction": (lambda: ds.Ground(friction=-0.1), "friction must be one number >= 0, got -0.1"),
     "friction speed": (lambda: ds.Ground(friction=0.1, friction_speed=0.0), r"friction_speed \[m/s\] must be > 0"),
@@ -116,8 +102,12 @@ ERRORS = {
     "axis": (lambda: ds.Capsule([0, 0, 0], [0, 0, 0], 1.0), "start and end must differ"),
     "box": (lambda: ds.Box(size=[1, -1, 1]), "box_size must be > 0"),
     "rotation": (lambda: ds.Box(rotation=[0, 1]), "rotation must be 3 finite numbers"),
-    "open mesh": (lambda: ds.MeshObstacle(BASE, [[0, 1, 2]]), "must be closed and consistently oriented; 3 edges"),
-    "inwards": (lambda: ds.MeshObstacle(BASE_MESH.vertices, BASE_MESH.surface_triangles[:, ::-1]), "face inwards"),
+    "mesh of nothing": (lambda: ds.MeshObstacle(BASE, []), "at least one triangle, segment or point"),
+    "mesh index": (
+        lambda: ds.MeshObstacle(BASE, segments=[[0, 3]]),
+        "segments must name vertices by index, 0 to 2, got 3",
+    ),
+    "mesh radius": (lambda: ds.MeshObstacle(BASE, radius=-1.0), "mesh_radius must be one number >= 0"),
     "width": (lambda: ds.Sphere(width=-1.0), r"Sphere: width \[m\] must be > 0"),
 }
 

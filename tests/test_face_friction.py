@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from contact_scenes import SHAPES, tetrahedron
 from quadratic_meshes import ball
 from test_every_adjoint import assert_transposed
 
@@ -76,21 +75,6 @@ def test_gradients_of_forces_and_places():
             if abs(found[-1]) < 1e-5 * size:
                 break
         assert min(map(abs, found)) < 1e-4 * size, (names, found, size)
-
-
-def test_friction_on_a_sampled_distance_is_across_its_normal(vertices_alone):
-    """A coarse grid, whose gradients are not of length one: friction in explicit steps is mu N, and across N."""
-    rough = dict(width=0.06, friction=0.3, friction_speed=1e-3, name="mesh")
-    term = SHAPES["mesh"](stiffness=300.0, path=lambda t: [20.0 * t, 0, 3.0 * t], **rough)
-    scene = ds.Scene(tetrahedron(0.02), ds.StableNeoHookean(2e4, 0.3), 100.0, [term], precision="f64")
-    parts = [ds.ContactForce("mesh", part, name=part, per_vertex=True) for part in ("normal", "friction")]
-    frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-4), 3, save_every=1, outputs=parts).forward()
-    normal, friction = frames["normal"][1:], frames["friction"][1:]
-    N, F = np.linalg.norm(normal, axis=2), np.linalg.norm(friction, axis=2)
-    touching = N > 1e-6
-    assert touching.sum() >= 9
-    np.testing.assert_allclose(F[touching], 0.3 * N[touching], rtol=1e-9)
-    assert np.abs((normal * friction).sum(2)[touching]).max() < 1e-12 * (N * F)[touching].max()
 
 
 # ---- a stage of explicit passes --------------------------------------------------------------------------------------

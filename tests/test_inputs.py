@@ -515,11 +515,11 @@ def test_names_of_every_obstacle():
         ds.Box([0, -5, 0], name="box", **SOFT),
         ds.Capsule([0, -5, 0], [1, -5, 0], 1.0, name="arm", **SOFT),
         ds.Cylinder([0, -5, 0], [1, -5, 0], 1.0, name="roll", **SOFT),
-        ds.MeshObstacle(corners, closed, resolution=4, name="stone", **SOFT),
+        ds.MeshObstacle(corners, closed, name="stone", **SOFT),
     ]
     of, barrier = scene(terms=terms), ("stiffness", "width")
     own = [["point", "normal"], ["center", "radius"], ["center", "size", "rotation"], *[["start", "end", "radius"]] * 2]
-    for term, numbers in zip(terms, [*own, ["position"]]):
+    for term, numbers in zip(terms, [*own, ["position", "radius"]]):
         assert list(of.input_names(term).values()) == [f"{term.name}.{number}" for number in (*numbers, *barrier)]
 
 

@@ -77,7 +77,10 @@ class SelfContactForce(Output):
         out.scene, out.arrays, n = scene, SceneArrays(scene), scene.mesh.num_vertices
         out.num_obstacles = len(scene.obstacles)
         out.vertices = np.arange(n) if self.on is None else np.unique(scene.mesh.vertex_indices(self.on))
-        out.pairs, out.surface = pairs_of(ImplicitPairs, out.arrays, False, with_obstacles=False), scene.mesh.surface_vertices
+        out.pairs, out.surface = (
+            pairs_of(ImplicitPairs, out.arrays, False, with_obstacles=False),
+            scene.mesh.surface_vertices,
+        )
         out.pair_friction = None if self.part == "normal" else out.pairs.friction
         return out
 
@@ -147,7 +150,9 @@ class SelfContactForce(Output):
             (u, pair_friction), du, df = self._place(frames, k), dx[k] - moved.rest, np.zeros(zero.shape[1:])
             if self.part != "friction":
                 runtime.fill(self.pairs.step, du[None])
-                self.pairs.product(self.pairs.next, 0, self.pairs.step, self.arrays.corner, numbers.rest, moved.parameters)
+                self.pairs.product(
+                    self.pairs.next, 0, self.pairs.step, self.arrays.corner, numbers.rest, moved.parameters
+                )
                 df += self._at_corners()
             if self._is_noted(frames, k) and change.contact_forces is not None:
                 df = df + change.contact_forces[k, -1, 1]

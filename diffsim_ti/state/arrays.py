@@ -55,7 +55,7 @@ class SceneArrays:
         self.own = {name: kind for x in self._all for name, kind in x.derived.items()}  # their numbers
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene, presses)
-        rows = scene.inputs.parameters
+        self._rows = rows = scene.inputs.parameters
         self.obstacles = self._counterparts(scene)
         self.curved, self.bend = are_treated_as_curved(mesh, self.contacts, bend), bend
         self._features = dict(
@@ -147,9 +147,11 @@ class SceneArrays:
             rows = scene.inputs.parameters.of(term)
             counterpart = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
             if isinstance(term, Obstacle):
-                kind = dict(per_area=term.per_area, turns=term.turns, by_pairs=term.primitives is not None)
+                kind = dict(per_area=term.per_area, turns=term.turns, by_pairs=term.by_pairs)
                 counterpart = replace(counterpart, **kind)
-            if counterpart.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
+            if (
+                counterpart.size + term.num_extra != rows.stop - rows.start
+            ):  # it would read, and add to, another term's rows
                 raise AssertionError(
                     f"the kernel of {term!r} has {counterpart.size} numbers, its term {rows.stop - rows.start}"
                 )
@@ -191,6 +193,9 @@ class SceneArrays:
         self.rows = values.parts()
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in (*PARTS, *self.own) if name != "mass"}
+        if any(term.num_extra for term in self.contacts):
+            numbers = [values.parameters[self._rows.of(term)] for term in self.contacts]
+            self.tables = np.concatenate([t.table_at(x) for t, x in zip(self.contacts, numbers)])
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
         if not (self.contacts or self.self_contact or any(x.reads_rest for x in self.features().interactions)):
             sources["rest"] = np.zeros((1, 3)), self.vector

@@ -31,10 +31,12 @@ class Term(ABC):
     """
 
     acts_on_surface = False
+    by_pairs = False  # whether what is narrower than faces acts on them by pairs, and not by points within them
     primitives = None  # by which an obstacle acts on faces and edges of bodies too (terms/obstacles/primitives.py)
     interaction = None  # the kind of interaction (mechanics/interaction.py) that a term of a user brings with it
     path = None  # displacement over time, of an obstacle that moves
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
+    num_extra = 0  # how many of its numbers, the last of them, kernels do not take one by one (VertexForce.corners)
     variant: tuple = ()  # what else than its class decides about the kernels of a term
     keyed = False  # whether its input is sampled at the ends of each run's steps (`rows`)
     stiffest = None  # np.max or np.min: which of what it is given over time asks for the shortest steps
@@ -90,6 +92,10 @@ class Term(ABC):
         """Links from places that need not be where they are to places near `origin` [m], by body lengths [m]; each writes
         what kernels take for the first that it reads."""
         return []
+
+    def table_at(self, numbers: np.ndarray) -> np.ndarray:
+        """The table, for its numbers as kernels take them."""
+        return self.table
 
     def sizes(self, mesh: TetrahedralMesh) -> dict[str, int]:
         """What words for lengths in the shapes of its inputs mean."""
@@ -173,6 +179,7 @@ class VertexForce(ABC):
     size = 0
     # of obstacles only (obstacle.py): is there friction, is stiffness per area, does it turn, is nearness noted?
     friction, per_area, turns, watched = False, False, False, False
+    corners = 0  # of an obstacle's shape, places behind its numbers: as many as are nearest to a point
 
     fp = number_type
 

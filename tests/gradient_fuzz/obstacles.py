@@ -101,7 +101,7 @@ def place(
         vertices, triangles = box_surface()
         depth = MESH_SIZE @ np.abs(MESH_TURN.inv().apply(n)) / 2
         position = foot - depth * n + 0.5 * CELL * aside
-        term = ds.MeshObstacle(vertices, triangles, position=position, resolution=8, **options)
+        term = ds.MeshObstacle(vertices, triangles, position=position, **options)
         distance = lambda y: box_distance(MESH_TURN.inv().apply(y - position), MESH_SIZE)  # noqa: E731
     return Placed(term, kind, distance, width, options.get("friction_speed", 0.0))
 

@@ -10,7 +10,9 @@ import weakref
 
 import numpy as np
 
+from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mechanics.obstacles.blocked import Blocked
+from diffsim_ti.mechanics.surfaces.listed_pair import SAFE
 
 
 class Approach:
@@ -31,16 +33,17 @@ class Approach:
         Raises Blocked where no room is left.
         """
         ws = self.ws
-        way, before, after = ws.collisions.detection, ws.collisions.before, ws.collisions.at_stage
+        before, after = ws.collisions.before, ws.collisions.at_stage
         step, drift = held - u, ws.arrays.poses.drift(before, after)
         if not (step.any() or drift.any()):
             return held
-        ws.check_pairs(u, step)
-        if way.share(u, step, before, drift) == 1:
-            return held
+        if not self._meets_pairs:
+            ws.check_pairs(u, step)
         try:
+            if self._share(u, step, before, drift)[0] == 1:
+                return held
             for start in starts:
-                if way.share(u, start - u, before, drift) == 1 and self._is_sound(u, start):
+                if self._share(u, start - u, before, drift)[0] == 1 and self._is_sound(u, start):
                     ws.collisions.put(before)
                     ws.potential.place(held)
                     if ws.newton.rise(held, ws.potential.energy(), start, problem) <= 0:
@@ -49,13 +52,27 @@ class Approach:
         finally:
             ws.collisions.put(after)
 
+    @property
+    def _meets_pairs(self) -> bool:
+        """Whether obstacles act by pairs, which are then looked at together with distances."""
+        return bool(self.ws.pairs and self.ws.pairs.obstacles)
+
+    def _share(self, u, step, places, drift, kept: float = 0.1) -> tuple:
+        """(share of a step on which nothing meets an obstacle, what would be met then); kept: as in detection."""
+        way = self.ws.collisions.detection
+        share, met = way.share(u, step, places, drift, kept=kept), way.met
+        if self._meets_pairs:
+            free, met_by_pairs = self.ws.collisions.pairs_share(u, step, places, drift, share)
+            if free < share:
+                return free * min(1, (1 - kept) / SAFE), met_by_pairs
+        return share, met
+
     def _in_parts(self, place, step, before, drift, problem):
         ws, done, stuck = self.ws, 0.0, 0
         moved = ws.arrays.poses.moved
         for _ in range(self.most_parts):
             left, poses = 1 - done, moved(before, drift, done)
-            share = ws.collisions.detection.share(place, left * step, poses, left * drift, kept=self.kept)
-            met = ws.collisions.detection.met
+            share, met = self._share(place, left * step, poses, left * drift, self.kept)
             place, done = place + share * left * step, done + share * left
             if share == 1:
                 return place
@@ -69,20 +86,25 @@ class Approach:
             ws.collisions.put(poses)
             place = ws.newton.solve(place, *problem, rounds=self.rounds)
         ws.collisions.put(poses)
+        if met.obstacle is None:
+            raise NotConverged("prescribed motion drives surfaces through each other: take smaller steps", [])
         own = list(met.vertices)
         carried = ws.collisions.carried(met.obstacle, place[own], poses, drift, own)
         speed = np.linalg.norm(carried - step[own], axis=1).max() / ws.substep
         raise Blocked.pinched(ws, place, met, 1 - done, float(speed))
 
-    def _carried(self, place, step, poses, drift, obstacle: int):
+    def _carried(self, place, step, poses, drift, obstacle: int | None):
         """All that moves freely goes along with an obstacle; None where that way is not free."""
+        if obstacle is None:
+            return None
         along = step + self.ws.collisions.carried(obstacle, place, poses, drift) * self.ws.linear
         along = self.ws.rigid.nearest(place + along) - place if self.ws.rigid else along
-        if not (along - step).any() or self.ws.collisions.detection.share(place, along, poses, drift) < 1:
+        if not (along - step).any() or self._share(place, along, poses, drift)[0] < 1:
             return None
         return place + along if self._is_sound(place, place + along) else None
 
     def _is_sound(self, u, there) -> bool:
         """Whether nothing turns inside out or meets itself on the way."""
         J0, J = self.ws.volume_ratios(u), self.ws.volume_ratios(there)
-        return not np.any((J0 > 0) & ~(J > 0.1 * J0)) and self.ws.pairs_share(u, there - u) == 1
+        upright = not np.any((J0 > 0) & ~(J > 0.1 * J0))
+        return upright and (self._meets_pairs or self.ws.pairs_share(u, there - u) == 1)

@@ -321,6 +321,7 @@ class ContactStage(ObstacleStages):
                 )
                 for m in ti.static(range(g.force.index.width + 1)):
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+                self.add_to_corners(g, g.size, i, by, adjoint)
                 by_v_obstacle = -now.h * by_own
                 move_adj += by_own
                 if ti.static(g.force.friction):

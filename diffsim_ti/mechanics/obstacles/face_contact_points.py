@@ -29,7 +29,7 @@ def has_face_contact(scene, bend: float = 0.0) -> bool:
     x = scene.mesh.vertices[scene.mesh.surface_triangles]
     longest = 1.2 * np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0)
     obstacles = [t for t in scene.terms if t.acts_on_surface and "barrier_width" in t.values]
-    by_distance = [t for t in obstacles if t.primitives is None]
+    by_distance = [t for t in obstacles if not t.by_pairs]
     return are_treated_as_curved(scene.mesh, obstacles, bend) or any(
         longest**2 > 6 * t.least_radius() * BENT * float(t.values["barrier_width"]) for t in by_distance
     )

@@ -20,6 +20,12 @@ class ImpulseRecord:
                 "explicit solvers note what obstacles with a distance do, and one of this scene is a force alone: take an "
                 "implicit solver for ContactForce and ContactTraction"
             )
+        if workspace.pairs and workspace.pairs.obstacles:
+            names = sorted({type(x.term).__name__ for x in workspace.pairs.obstacles.corners.parts})
+            raise ValueError(
+                f"explicit solvers do not note what edges and points of obstacles ({', '.join(names)}) do to faces: for "
+                "ContactForce and ContactTraction take an implicit solver, or pass these obstacles by_pairs=False"
+            )
         reaching = [g.number + k for g in features.groups if features.reaches(g) for k in range(g.count)]
         self.reaching = reaching if workspace.faces else []
         self.with_friction = list(workspace.faces.friction.number) if workspace.faces else []

@@ -7,7 +7,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mechanics.obstacles.blocked import Blocked
-from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
+from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection, Met
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.state.obstacle_poses import AT_STAGE, Moment
 from diffsim_ti.state.stage import Stage
@@ -57,6 +57,23 @@ class ObstacleCollisions:
         share = self.detection.share(u, step, self.rows[::3], most=most)
         return share, self.detection.met
 
+    def pairs_share(self, u, step, places, drift, most: float) -> tuple[float, Met | None]:
+        """How far along a step, at most `most`, pairs stay apart while obstacles go from places by a drift, and what would
+        meet then."""
+        pairs = self.ws.pairs
+        share = pairs.safe_share(u, step, most, self._corners_drift(places, drift))
+        met = pairs.met if share < most else None
+        return share, met and Met(*met, share)
+
+    def _corners_drift(self, places, drift) -> np.ndarray:
+        """How far corners of obstacles that act by pairs go; they are put to where they begin."""
+        obstacles, rows = self.ws.pairs.obstacles, np.zeros_like(self.rows)
+        rows[::3] = self.ws.arrays.poses.moved(places, drift, 1.0)
+        there = obstacles.displacements_at(rows)
+        rows[::3] = places
+        self.ws.pairs.follow(rows, AT_STAGE)
+        return there - obstacles.displacements
+
     def put(self, places: np.ndarray) -> None:
         """Take forces with obstacles elsewhere."""
         self.rows[::3] = places
@@ -76,9 +93,10 @@ class ObstacleCollisions:
 
     def check_end(self, j: int, u_star, u_next) -> None:
         """Raise Tunnelling where surfaces, or a surface and an obstacle, meet beyond the middle of a step."""
-        if self.ws.pairs:
-            self.ws.pairs.check_end(u_star, u_next)
-        drift = self.ws.arrays.poses.drift(self.rows[::3], self.at_end(j))
+        pairs, drift = self.ws.pairs, self.ws.arrays.poses.drift(self.rows[::3], self.at_end(j))
+        if pairs:
+            along = dict(drift=self._corners_drift(self.rows[::3], drift)) if pairs.obstacles else {}
+            pairs.check_end(u_star, u_next, **along)
         if self.detection.share(u_star, u_next - u_star, self.rows[::3], drift) == 1:
             return
         met = self.detection.met

@@ -97,6 +97,8 @@ class ObstacleFunctions:
         by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
         for m in ti.static(range(g.size)):
             df += by[m] * tangent.parameters[first + m]
+        if ti.static(g.force.corners):
+            df += g.force.force_by_corners(scene.parameters, first, X, u, tangent.parameters)
         df = self.on_area(g, i, df, scene)
         if ti.static(g.force.per_area):
             df += tangent.surface[i] * g.force.force(scene.parameters, first, X, u, v)
@@ -112,6 +114,9 @@ class ObstacleFunctions:
         by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
         for m in ti.static(range(g.size)):
             adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
+        if ti.static(g.force.corners):
+            of_corners = g.force.force_by_corners_vjp(scene.parameters, first, X, u, w)
+            self.add_to_corners(g, 0, i, of_corners, adjoint)
         by_place, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
         return by_place, by_v
 
@@ -121,6 +126,15 @@ class ObstacleFunctions:
         for m in ti.static(range(g.size)):
             row = g.first + k * g.size + m
             adjoint.sums[row, i] = adjoint.sums[row, i] + by[m]
+        self.add_to_corners(g, g.size, i, by, adjoint)
+
+    @ti.func
+    def add_to_corners(self, g: A, begin: A, i, by: A, adjoint: A):
+        """Add those of its corners, which stand in `by` from `begin` on, and behind them their rows."""
+        for c in ti.static(range(g.force.corners)):
+            for d in ti.static(range(3)):
+                row = by[begin + 3 * g.force.corners + c] + d
+                adjoint.sums[row, i] = adjoint.sums[row, i] + by[begin + 3 * c + d]
 
     # ---- points within a face, whose nodes are the rows of a matrix, its corners the first three ------------------------
 

@@ -26,7 +26,7 @@ class CandidatePairs:
     scale: of each edge pair, 1 / sqrt(10^-3 A^2 B^2) with the lengths A, B given. row, corner_of: the corners 4 p + k
     that meet at surface vertex s are corner_of[row[s] : row[s + 1]], in order. slack [m], of each surface vertex: what its
     primitives' reach is larger by, towards those of the same body and of others, and then in any case; zero unless set.
-    body: of each vertex. kinematic: what obstacles bring (kinematic_surface.py), None without; the last edges and vertices
+    body: of each vertex. kinematic: what obstacles bring (obstacle_corners.py), None without; the last edges and vertices
     of the surface are theirs, and its area is what each pair has of the body's surface.
     """
 

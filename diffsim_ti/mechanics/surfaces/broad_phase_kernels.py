@@ -156,8 +156,8 @@ class Search(Pair):
     def find(self) -> Kernel:
         """Partners of each primitive in the tree of `theirs`, in order, at most `room`, and their number.
 
-        Of two edges the smaller number gets the larger one; edges below `own` are of bodies, which meet each other only where
-        both are below `meet`. On a CPU they walk from their own leaf on, so that each two
+        Of two edges the smaller number gets the larger one; edges below `own` are of bodies, and
+        two of these meet below `meet`. On a CPU they walk from their own leaf on, so that each two
         meet once; elsewhere each looks at all and adds to its own row alone, as software Vulkan (Mesa 22.3) leaves a
         loop at its second atomic.
         """

@@ -52,8 +52,8 @@ class CurvedLaggedFriction:
     def energies(self, u: np.ndarray) -> np.ndarray:
         return self.inner.energies(self._fine(u))
 
-    def forces(self, u: np.ndarray) -> np.ndarray:
-        return self.C.T @ self.inner.forces(self._fine(u))
+    def forces(self, u: np.ndarray, only: int | None = None) -> np.ndarray:
+        return self.C.T @ self.inner.forces(self._fine(u), only)
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
         return abs(self.C).T @ self.inner.sizes(self._fine(u))
@@ -66,7 +66,7 @@ class CurvedLaggedFriction:
         of_points = self.inner.blocks(self._fine(u))
         return (self.C.power(2).T @ of_points.reshape(-1, 9)).reshape(-1, 3, 3)
 
-    def jvp(self, u, du, dx, du_begin, numbers, poses_dot=None) -> np.ndarray:
+    def jvp(self, u, du, dx, du_begin, numbers, poses_dot=None, only: int | None = None) -> np.ndarray:
         """poses_dot: changes of the rows of poses, None: zero."""
         C, obstacles = self.C, self.pairs.obstacles
         changes = [C @ du, C @ dx, C @ du_begin]
@@ -74,10 +74,10 @@ class CurvedLaggedFriction:
             given = obstacles.changes(self.pairs.parameters_of(numbers), poses_dot)
             for change, corners in zip(changes, (given[0], given[0] - given[2] / self.inner.per_gamma, given[1])):
                 change[self.pairs.finer.mesh.first :] = corners
-        return C.T @ self.inner.jvp(self._fine(u), *changes, self.pairs.fine_numbers(numbers))
+        return C.T @ self.inner.jvp(self._fine(u), *changes, self.pairs.fine_numbers(numbers), only)
 
-    def vjp(self, u: np.ndarray, forces_adj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        found, obstacles = self.inner.vjp(self._fine(u), self.C @ forces_adj), self.pairs.obstacles
+    def vjp(self, u: np.ndarray, forces_adj: np.ndarray, only: int | None = None) -> tuple[np.ndarray, ...]:
+        found, obstacles = self.inner.vjp(self._fine(u), self.C @ forces_adj, only), self.pairs.obstacles
         if obstacles:
             by_u, by_x, by_begin = (by[self.pairs.finer.mesh.first :] for by in found)
             obstacles.add_places(by_u + by_x, AT_STAGE)

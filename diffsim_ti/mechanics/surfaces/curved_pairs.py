@@ -1,5 +1,5 @@
 """Contact of surfaces whose vertices are not those of the mesh, x = C X + g: sums over nodes, of the finer surface of curved
-faces (mesh/collision_surface.py), and corners of obstacles, which their poses give (kinematic_surface.py). Displacements go
+faces (mesh/collision_surface.py), and corners of obstacles, which their poses give (obstacle_corners.py). Displacements go
 to them by C and g, forces back by C^T; all between is that of linear tetrahedra."""
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import Launches
 from diffsim_ti.mechanics.surfaces.curved_friction import friction_of
-from diffsim_ti.mechanics.surfaces.kinematic_surface import KinematicSurface, ObstacleCorners, ObstacleMotion
+from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleCorners, ObstacleMotion, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.runtime import Kernel, kernels_of, vector_type
@@ -33,7 +33,7 @@ def pairs_of(kind: type, arrays, parallel: bool, with_obstacles: bool = True):
     cuts = cuts_of(mesh, term, arrays.bend) if term else 0
     surface = CollisionSurface(mesh, cuts) if cuts else mesh
     if parts:
-        surface = KinematicSurface(surface, surface_edges(surface), corners, term)
+        surface = SurfaceWithObstacles(surface, surface_edges(surface), corners, term)
     return kind(arrays, parallel) if surface is mesh else CurvedPairs(kind, arrays, parallel, surface)
 
 
@@ -102,7 +102,7 @@ class FinerArrays:
 
     first_contact_corner = 0
 
-    def __init__(self, arrays, surface: "CollisionSurface | KinematicSurface"):
+    def __init__(self, arrays, surface: "CollisionSurface | SurfaceWithObstacles"):
         self.scene, self.mesh, self.precision = arrays, surface, arrays.precision
         self.self_contact, self.num_vertices = arrays.self_contact, surface.num_vertices
         self.parameters_of_self_contact = arrays.parameters_of_self_contact
@@ -129,7 +129,7 @@ class FinerArrays:
         """Take the rest shape that the scene has loaded."""
         if self._taken is not self.values:
             self._taken, rest = self.values, self.mesh.matrix @ (self.values.rest - self.scene.origin)
-            if isinstance(self.mesh, KinematicSurface):
+            if isinstance(self.mesh, SurfaceWithObstacles):
                 rest[self.mesh.first :] = self.mesh.corners.made(self.values.parameters)
             runtime.fill(self.rest, rest)
 
@@ -141,9 +141,9 @@ class CurvedPairs:
     obstacles: where corners of obstacles are (ObstacleMotion), None without.
     """
 
-    def __init__(self, kind: type, arrays, parallel: bool, surface: "CollisionSurface | KinematicSurface"):
+    def __init__(self, kind: type, arrays, parallel: bool, surface: "CollisionSurface | SurfaceWithObstacles"):
         self.a, self.finer, self.matrix = arrays, FinerArrays(arrays, surface), surface.matrix
-        self.obstacles = ObstacleMotion(surface, arrays) if isinstance(surface, KinematicSurface) else None
+        self.obstacles = ObstacleMotion(surface, arrays) if isinstance(surface, SurfaceWithObstacles) else None
         self.inner = kind(self.finer, parallel)
         self.kernels = kernels_of(Transfer, arrays.precision, parallel, self.obstacles is not None)
         fp, vector, n = arrays.fp, arrays.vector, arrays.num_vertices
@@ -270,8 +270,8 @@ class CurvedPairs:
         if self.obstacles:
             self.obstacles.clear()
 
-    def vjp(self, u, slot: int, w, out) -> None:
-        self.inner.vjp(self.fine(u, slot), 0, self.fine_change(w), self.finer.corner)
+    def vjp(self, u, slot: int, w, out, only: int | None = None) -> None:
+        self.inner.vjp(self.fine(u, slot), 0, self.fine_change(w), self.finer.corner, only)
         self._gather(out)
         self._add_corners()
 
@@ -309,6 +309,17 @@ class CurvedPairs:
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None) -> float:
         """drift: displacements of corners of obstacles meanwhile; None: they stand still."""
         return self.inner.safe_share(self._spread(u), self._step(step, drift), most)
+
+    @property
+    def met(self) -> tuple[tuple[int, ...], int | None] | None:
+        """What stopped the last step: vertices of the body, and the obstacle; None where two bodies did."""
+        surface, corners = self.finer.mesh, self.inner.blocked
+        if corners is None:
+            return None
+        numbers = surface.numbers[corners]
+        nodes = np.asarray(self.matrix[corners[numbers == 0]].argmax(1)).ravel()
+        obstacle = surface.corners.parts[numbers.max() - 1].k if numbers.any() else None
+        return tuple(int(i) for i in dict.fromkeys(nodes.tolist())), obstacle
 
     def is_collision_free(self, u: np.ndarray, step: np.ndarray, drift=None) -> bool:
         return self.inner.is_collision_free(self._spread(u), self._step(step, drift))

@@ -206,7 +206,9 @@ class FrictionKernels(ListedPair):
         t = v - n.dot(v) * n
         loads, lightness = self.at_corners(p, scene, scene.load), self.of_corners(p, scene, at.inverse_mass)
         c, s = plan.h * (self.size(kind, w) * loads).dot(lightness), ti.sqrt(t.norm_sqr())
-        kappa, f, y, B = slip_in_kernels(s, c, self.speed(p, scene, scene.parameters), ti.cast(self.tiny, self.fp), KERNELS)
+        kappa, f, y, B = slip_in_kernels(
+            s, c, self.speed(p, scene, scene.parameters), ti.cast(self.tiny, self.fp), KERNELS
+        )
         return v, t, s, c, kappa, f, y, B
 
     @ti.func

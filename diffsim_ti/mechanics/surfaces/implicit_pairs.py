@@ -18,6 +18,7 @@ class ImplicitPairs(SurfacePairs):
 
     friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
+    blocked: np.ndarray | None = None  # corners of the pair that stopped the last march
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)
@@ -64,21 +65,22 @@ class ImplicitPairs(SurfacePairs):
         if not travel.any():
             return most
         runtime.fill(self.step, step[None])
-        if self._holds(u + most * step) and self._holds(u):
-            self.forces(self.next, 0, self.a.corner, exact=True)
-            return min(most, self._shares().min(initial=np.inf))
-        share = 0.0
+        share, self.blocked, holds = 0.0, None, self._holds(u + most * step) and self._holds(u)
         for _ in range(self.longest_march):
-            runtime.fill(self.next, (u + share * step)[None])
-            self._build(self.next, 0, wanted=(most - share) * travel)
+            unlisted = np.inf
+            if not holds:
+                runtime.fill(self.next, (u + share * step)[None])
+                self._build(self.next, 0, wanted=(most - share) * travel)
+                reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
+                unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
             self.forces(self.next, 0, self.a.corner, exact=True)
-            reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
-            unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
-            listed = self._shares().min(initial=np.inf)
+            shares = self._shares()
+            listed = shares.min(initial=np.inf)
             share += min(listed, unlisted)
             if share >= most:
                 return most
             if listed < unlisted:
+                self.blocked = runtime.fetch(self.list.pairs)[4 * int(shares.argmin()) :][:4]
                 return share
         return share
 

@@ -92,10 +92,14 @@ class LaggedFriction(PairFriction):
     def _across(self, x: np.ndarray) -> np.ndarray:
         return x - self.n * _dot(self.n, x)
 
-    def _scatter(self, at_corners: np.ndarray) -> np.ndarray:
-        out = np.zeros((self.a.num_vertices, *at_corners.shape[2:]))
-        np.add.at(out, self.corners, at_corners)
+    def _scatter(self, at_corners: np.ndarray, only: int | None = None) -> np.ndarray:
+        out, own = np.zeros((self.a.num_vertices, *at_corners.shape[2:])), self._of(only)
+        np.add.at(out, self.corners[own], at_corners[own])
         return out
+
+    def _of(self, only: int | None) -> slice | np.ndarray:
+        """Pairs of a contact, or all."""
+        return slice(None) if only is None else self.contact == only
 
     def energies(self, u: np.ndarray) -> np.ndarray:
         """Of each pair [J]: what sliding so would dissipate."""
@@ -105,9 +109,9 @@ class LaggedFriction(PairFriction):
         _, _, t, _, _, kappa, _ = self._sliding(u)
         return (-self.L * kappa)[:, None] * t
 
-    def forces(self, u: np.ndarray) -> np.ndarray:
-        """[N]"""
-        return self._scatter(self.w[:, :, None] * self._pulls(u)[:, None])
+    def forces(self, u: np.ndarray, only: int | None = None) -> np.ndarray:
+        """[N]; only: of the pairs of one contact."""
+        return self._scatter(self.w[:, :, None] * self._pulls(u)[:, None], only)
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
         """Sum of the sizes of the forces that meet at each vertex [N]."""
@@ -138,7 +142,9 @@ class LaggedFriction(PairFriction):
         self.pairs.begin(self.u_begin)
         self._measure_here()
 
-    def jvp(self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers) -> np.ndarray:
+    def jvp(
+        self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers, only=None
+    ) -> np.ndarray:
         """Change of the forces for those of u, of x, of where the pass begins, and of `numbers`, a Tangent."""
         self._back_to_begin()
         runtime.fill(self.pairs.step, du_begin[None])
@@ -154,12 +160,13 @@ class LaggedFriction(PairFriction):
         df = slope * (ds - s / self.speed * d_speed)
         r, dr = (-self.L * kappa)[:, None] * t, (-dL * kappa)[:, None] * t
         dr -= self.L[:, None] * ((df - kappa * ds)[:, None] * e + kappa[:, None] * dt)
-        return self._scatter(self.w[:, :, None] * dr[:, None] + dw[:, :, None] * r[:, None])
+        return self._scatter(self.w[:, :, None] * dr[:, None] + dw[:, :, None] * r[:, None], only)
 
-    def vjp(self, u: np.ndarray, forces_adj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def vjp(self, u: np.ndarray, forces_adj: np.ndarray, only: int | None = None) -> tuple[np.ndarray, ...]:
         """Adjoints of u, of x, of where the pass begins; adds those of the numbers and of the rest shape."""
         v, relative, t, s, e, kappa, slope = self._sliding(u)
-        g = forces_adj[self.corners]
+        g = np.zeros((*self.corners.shape, 3))
+        g[self._of(only)] = forces_adj[self.corners[self._of(only)]]
         r, r_adj = (-self.L * kappa)[:, None] * t, np.einsum("pk,pkd->pd", self.w, g)
         by_f = -self.L * _dot(e, r_adj)[:, 0]
         t_adj = (-self.L * kappa)[:, None] * r_adj + (by_f * (slope - kappa))[:, None] * e

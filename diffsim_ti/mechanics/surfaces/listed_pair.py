@@ -21,7 +21,7 @@ OPPOSITE = (((0, 1), (0, 2), (0, 3)), ((0, 2), (0, 3), (1, 2), (1, 3)))
 LIST = dict(pairs="ints", scale="scalars", surface="ints", place="ints", row="ints", corner_of="ints")  # broad_phase.py
 SCENE = LIST | dict(rest="vectors", parameters="scalars", corner="vectors", plane="vectors")
 SCENE |= dict(rest_plane="vectors", rest_weights="vectors")  # motion_kernels.py
-MIXED = dict(owner="ints", at_number="ints", at_row="ints", radius="scalars", area="scalars")  # kinematic_surface.py
+MIXED = dict(owner="ints", at_number="ints", at_row="ints", radius="scalars", area="scalars")  # obstacle_corners.py
 NUMBERS = dict.fromkeys(("slot", "num_vt", "num_pairs", "num_surface", "first_out"), "int")
 
 
@@ -59,7 +59,7 @@ class ListedPair(Pair):
     """Taichi functions of pair p of a list; those of edges follow those of vertex and triangle.
 
     first: where the scene's parameters begin with stiffness and width. parallel: loops run on all threads.
-    first = MANY: pairs are of several contacts (kinematic_surface.py). `owner` says of each surface vertex the number of its
+    first = MANY: pairs are of several contacts (obstacle_corners.py). `owner` says of each surface vertex the number of its
     contact: 0 of bodies, and so of pairs of them, 1 and on of obstacles. The places of stiffness, width and friction speed
     of contact c among the parameters are at_number[3 c] and on, at_row says those of friction coefficients, radius[c] is
     its radius; the stiffness of each pair is multiplied by its `area`.

@@ -8,9 +8,9 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
 from diffsim_ti.mechanics.surfaces.buffers import branches, whole
-from diffsim_ti.mechanics.surfaces.kinematic_surface import ContactNumbers, KinematicSurface
 from diffsim_ti.mechanics.surfaces.listed_pair import MANY, OPPOSITE
 from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
+from diffsim_ti.mechanics.surfaces.obstacle_corners import ContactNumbers, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
 from diffsim_ti.mesh.sets import pieces
@@ -35,7 +35,7 @@ class Overlap(ValueError):
 
 class SurfacePairs:
     """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py), or with obstacles that act by
-    pairs, whose corners are vertices of the surface too (kinematic_surface.py).
+    pairs, whose corners are vertices of the surface too (obstacle_corners.py).
 
     The list holds all pairs that were within the width and the slacks of their vertices when it was made, and holds good
     until a vertex has used up one of its two slacks: the one towards its own body by moving relative to that body, the one
@@ -55,7 +55,7 @@ class SurfacePairs:
 
     def __init__(self, arrays, parallel: bool):
         self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
-        self.kinematic = mesh if isinstance(mesh, KinematicSurface) else None
+        self.kinematic = mesh if isinstance(mesh, SurfaceWithObstacles) else None
         self.contacts = ContactNumbers(mesh, arrays) if self.kinematic else None
         self.mesh, self.parallel = mesh, parallel
         self.first = MANY if self.kinematic else arrays.parameters_of_self_contact.start
@@ -349,16 +349,17 @@ class SurfacePairs:
         """Contact forces at u[slot], to the last corners of `out`."""
         self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
 
-    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False) -> None:
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False, only=None) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of the rest shape and all parameters).
 
-        has_planes: `forces` were last computed at u[slot].
+        has_planes: `forces` were last computed at u[slot]. only: of the pairs of one contact.
         """
         at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
         numbers = dict(d_stiffness=0.0, d_width=0.0, by_rest=int(rest_dot is not None), has_planes=int(has_planes))
         if self.kinematic:
             self.contacts.load_change(self.a.values.parameters, parameters_dot)
             at |= dict(numbers_dot=self.contacts.numbers_dot)
+            numbers |= dict(only=-1 if only is None else only)
         elif parameters_dot is not None:
             change = parameters_dot[self.a.parameters_of_self_contact][:2]
             numbers |= dict(zip(("d_stiffness", "d_width"), map(float, change)))
@@ -371,9 +372,9 @@ class SurfacePairs:
         if self.friction:
             self.friction.clear_sums()
 
-    def vjp(self, u, slot: int, w, out) -> None:
+    def vjp(self, u, slot: int, w, out, only: int | None = None) -> None:
         """The product with the adjoint w[0] of the forces; adds the adjoints of stiffness, width and rest shape."""
-        self.product(u, slot, w, out)
+        self.product(u, slot, w, out, only=only)
         self.run(self.kernels.add_sums, dict(out=out), slot=slot)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:

@@ -128,16 +128,18 @@ class ImplicitAdjoint(RecordedPasses):
         self.p = self.p + runtime.fetch_row(self._law.y, 0)
 
     def _pull_back_contacts(self, j: int, save_every: int) -> tuple[tuple | None, tuple | None]:
-        """Adjoints of what the forces of obstacles in pass j depend on (SharesAdjoint), and friction between surfaces
-        (LaggedFriction.vjp), where a loss names them."""
+        """Adjoints of what the forces of obstacles in pass j depend on (SharesAdjoint), and of what pairs do
+        (LaggedFriction.vjp, PairShares.vjp), where a loss names them."""
         seed, friction = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else (None, None)
         seen = None if seed is None else self._shares.pull_back(seed)
-        if friction is None:
-            return seen, None
-        p = self.potential
-        from_friction = p.surface_friction.vjp(p.held_at, friction)
-        p.place(self.u_star)
-        return seen, from_friction
+        p, by_pairs, found = self.potential, self.ws.pair_shares, []
+        if by_pairs and seed is not None:
+            found.append(by_pairs.vjp(seed))
+        if friction is not None:
+            found.append(np.array(p.surface_friction.vjp(p.held_at, friction, 0 if by_pairs else None)))
+        if found:
+            p.place(self.u_star)
+        return seen, tuple(sum(found)) if found else None
 
     def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held

@@ -109,7 +109,7 @@ class ImplicitTangent(RecordedPasses):
             self.chamber_record.note(j, save_every, change)
         d_star = held + d_star
         if self.contacts:
-            self._note_contacts(j, save_every, d_star, dx)
+            self._note_contacts(j, save_every, d_star, dx, poses)
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
@@ -119,13 +119,20 @@ class ImplicitTangent(RecordedPasses):
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before
 
-    def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray, dx: np.ndarray) -> None:
+    def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray, dx: np.ndarray, poses) -> None:
         """Change of the forces of obstacles, and of friction between surfaces, in pass j, u* changing by d_star."""
         p = self.ws.potential
         runtime.fill(p.w, d_star[None])
         record = dict(tangent=(SimpleNamespace(lag=self.lag, poses=self.poses, pressed=self.pressed), self.numbers))
-        friction = lambda: p.surface_friction.jvp(p.held_at, d_star, dx, self.du, self.numbers)  # noqa: E731
-        self.contacts.add(j, save_every, self.stage.static, lambda: self._shares.forces("jvp", **record), friction)
+        along, by_pairs = (d_star, dx, self.du, self.numbers), self.ws.pair_shares
+        of_bodies = dict(poses_dot=poses, only=0) if by_pairs else {}
+
+        def change():
+            out = self._shares.forces("jvp", **record)
+            return out + by_pairs.jvp(*along, self.tangent.parameters, poses) if by_pairs else out
+
+        friction = lambda: p.surface_friction.jvp(p.held_at, *along, **of_bodies)  # noqa: E731
+        self.contacts.add(j, save_every, self.stage.static, change, friction)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""

@@ -18,6 +18,7 @@ from diffsim_ti.mechanics.stress.frozen_strains import FrozenStrains
 from diffsim_ti.mechanics.stress.law_state import law_state_kernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
+from diffsim_ti.mechanics.surfaces.pair_shares import PairShares
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.implicit.closing import Closing
@@ -333,8 +334,19 @@ class ImplicitWorkspace(PrescribedInPasses):
         if self.impulses and save_every:
             at = self.potential.place(self.u_star)
             shares = self.kept("shares", lambda: Shares(self)) if len(self.arrays.obstacles) else None
-            friction = lambda: self.potential.surface_friction.forces(at)  # noqa: E731
-            self.impulses.add(j, save_every, self.is_static, lambda: shares.forces(), friction)
+            pair_shares = self.pair_shares
+            friction = lambda: self.potential.surface_friction.forces(at, 0 if pair_shares else None)  # noqa: E731
+            forces = lambda: shares.forces() + (pair_shares.forces() if pair_shares else 0.0)  # noqa: E731
+            self.impulses.add(j, save_every, self.is_static, forces, friction)
+
+    @property
+    def pair_shares(self) -> PairShares | None:
+        """What obstacles do by pairs; None where none acts so."""
+        return (
+            self.kept("pair shares", lambda: PairShares(self.potential))
+            if self.pairs and self.pairs.obstacles
+            else None
+        )
 
     # ---- what stands in the way --------------------------------------------------------------------------------------
 

@@ -1,7 +1,8 @@
 """Triangles, segments and points as an obstacle, by the exact distance to what is nearest of them."""
 
 import warnings
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,13 +11,20 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
+from diffsim_ti.inputs.description import length
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
-from diffsim_ti.terms.obstacles.kinematic_surface import KinematicSurface
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.surface_distance import SurfaceDistance
+from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
+
+STRETCH, BOW = (
+    1.2,
+    0.12,
+)  # of a body's longest edge, how far it may be stretched; of the width, what faces need not feel
 
 
 class MeshObstacle(Obstacle):
@@ -46,6 +54,7 @@ class MeshObstacle(Obstacle):
         segments: ArrayLike | None = None,
         points: ArrayLike | None = None,
         radius: float = 0.0,
+        shapeable: bool = False,
         **options,
     ):
         if resolution is not None:
@@ -55,18 +64,28 @@ class MeshObstacle(Obstacle):
                 stacklevel=2,
             )
         thick = Input("radius", radius, ((),), "m", NOT_NEGATIVE, plain="mesh_radius")
+        self._made = SurfaceMesh.checked("MeshObstacle", vertices, triangles, segments, points)
+        self._base = middle_far_part(self._made.vertices)
+        self._tree = SurfaceTree(self._made, self._base)
         super().__init__([place("position", position, "mesh_position"), thick], **options)
+        self.by_pairs, self.shapeable = True, bool(shapeable)
+        if self.shapeable:  # behind all other numbers, as kernels read few of them at a time
+            shape = Input("vertices", vertices, (self._made.vertices.shape,), "m", change=length, plain="mesh_vertices")
+            self.described = (*self.described, shape)
         if rounding_of(vertices) > OF_WIDTHS * self.values["barrier_width"]:
             coarse = f"float32 resolves vertices to {rounding_of(vertices):.2g} m, too little for the barrier's width"
             warnings.warn(f"MeshObstacle: {coarse}: give them in float64", stacklevel=2)
-        self._made = KinematicSurface.checked("MeshObstacle", vertices, triangles, segments, points)
-        self._base = middle_far_part(self._made.vertices)
-        self._tree = SurfaceTree(self._made, self._base)
 
     @cached_property
-    def table(self) -> np.ndarray:
-        """What kernels find distances in."""
+    def table(self):
         return self._tree.table()
+
+    def table_at(self, numbers):
+        """Of moved vertices, with the edges and sides that there are."""
+        if not self.shapeable:
+            return self.table
+        moved = numbers[-self._tree.x.size :].reshape(-1, 3)
+        return self.table if np.array_equal(moved, self._tree.x) else self._tree.moved(moved).table()
 
     def distance(self, positions):
         from_base = positions - (self._base + self.values["mesh_position"])
@@ -76,14 +95,23 @@ class MeshObstacle(Obstacle):
         """The tree is measured from `_base`, which the position has more."""
         out = super().shift(origin)
         out[:3] -= self._base
+        if self.shapeable:
+            out[-self._tree.x.size :] = np.tile(self._base, len(self._tree.x))
         return out
 
-    def kinematic_surface(self):
-        moved = self._made.vertices + self.values["mesh_position"]
-        return replace(self._made, vertices=moved, radius=float(self.values["mesh_radius"]))
-
     def surface(self, size):
-        return shapes.skeleton(self.kinematic_surface(), 0.002 * size)
+        points, triangles = shapes.skeleton(self._made, max(float(self.values["mesh_radius"]), 0.002 * size))
+        return points + self.values["mesh_position"], triangles
+
+    def settled(self, scene, density, initial_positions, initial_velocities):
+        """With those of its edges and corners that faces of the body are wide enough to feel between their own corners."""
+        out = copy(super().settled(scene, density, initial_positions, initial_velocities))
+        x = scene.mesh.vertices[scene.mesh.surface_triangles[:, :3]]
+        longest = STRETCH * float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0))
+        edges = self._made.sharp_edges(longest, BOW * float(self.values["barrier_width"]))
+        points = np.union1d(edges, self._made.one[self._made.points])
+        out.all_primitives = MeshPrimitives.of(points, edges, self._tree.x) if len(points) else None
+        return out
 
     def kernel(self, precision, table=0):
         if precision == "f32" and table + self.table.size > 2**24:
@@ -91,7 +119,39 @@ class MeshObstacle(Obstacle):
                 f"MeshObstacle: float32 cannot count the {table + self.table.size} numbers of a surface of "
                 f"{self._tree.count} triangles, segments and points: pass precision='f64', or fewer"
             )
-        return MeshForce(precision, self.has_friction, table, self._tree.is_sided, self._made.is_convex)
+        return MeshForce(precision, self.has_friction, table, self._tree.is_sided, self.shapeable)
+
+    @property
+    def num_extra(self):
+        return self._tree.x.size if self.shapeable else 0
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPrimitives(Primitives):
+    """Of a mesh: some of its vertices, whose numbers are `own`, at the position that the numbers begin with, and edges
+    between these; then its radius, and all vertices where inputs move them. vertices [m]: where none does."""
+
+    own: np.ndarray
+    vertices: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, edges: np.ndarray, vertices: np.ndarray) -> "MeshPrimitives":
+        own = np.union1d(edges, points)
+        return cls(np.searchsorted(own, points), np.searchsorted(own, edges), own, vertices[own])
+
+    def at(self, p):
+        vertices = p[4:].reshape(-1, 3)[self.own] if len(p) > 4 else self.vertices
+        return vertices + p[:3], float(p[3])
+
+    def jvp(self, p, dp):
+        moved = dp[4:].reshape(-1, 3)[self.own] if len(p) > 4 else np.zeros_like(self.vertices)
+        return moved + dp[:3], float(dp[3])
+
+    def vjp(self, p, by_corners, by_radius):
+        by_vertices = np.zeros((len(p[4:]) // 3, 3))
+        if len(p) > 4:
+            by_vertices[self.own] = by_corners
+        return np.concatenate([by_corners.sum(0), [by_radius], by_vertices.ravel()])
 
 
 @dataclass(frozen=True)
@@ -100,9 +160,13 @@ class MeshForce(ObstacleForce):
 
     table: int = 0
     sided: bool = False
-    convex: bool = False
+    shapeable: bool = False
 
     count = 4
+
+    @property
+    def corners(self):
+        return 3 if self.shapeable else 0
 
     @cached_property
     def nearest(self) -> SurfaceDistance:
@@ -112,12 +176,25 @@ class MeshForce(ObstacleForce):
     def distance_and_normal(self, g, p, X, u):
         local = [(x - c) + y for x, c, y in zip(X, p, u)]
         point = let(ti.types.vector(3, self.fp)(*(k.value for k in local)))
-        found = let(self.nearest.look(point, g.parameters))
+        begin = g.first + self.size if self.shapeable else self.nearest.vertices(g.parameters)
+        found, rows, w, bent = (let(x) for x in self.nearest.look(point, let(begin), g.parameters))
         n = [at(found, 1 + k) for k in range(3)]
         H = [[at(found, 4 + k) for k in row] for row in ((0, 1, 2), (1, 3, 4), (2, 4, 5))]
-        d = g.function(at(found, 0), *((x, lambda k=k: n[k]) for k, x in enumerate(local)))
-        rows = [g.function(n[a], *((x, lambda a=a, b=b: H[a][b]) for b, x in enumerate(local))) for a in range(3)]
-        return d - p[3], rows
+        by_d = [(x, lambda k=k: n[k]) for k, x in enumerate(local)]
+        by_n = [[(x, lambda a=a, b=b: H[a][b]) for b, x in enumerate(local)] for a in range(3)]
+        for c in range(self.corners):
+            for e in range(3):
+                row, share = let(at(rows, c) + e), at(w, c)
+                leaf = g.leaf(at(g.parameters, row))
+                leaf.row = row
+                g.corners.append(leaf)
+                by_d.append((leaf, lambda e=e, share=share: let(-share * n[e])))
+                for a in range(3):
+                    by_n[a].append(
+                        (leaf, lambda a=a, e=e, c=c, share=share: let(-share * H[a][e] - at(bent, a, c) * n[e]))
+                    )
+        d = g.function(at(found, 0), *by_d)
+        return d - p[3], [g.function(n[a], *by_n[a]) for a in range(3)]
 
     @ti.func
     def may_touch(self, parameters: ti.template(), first, X, u):

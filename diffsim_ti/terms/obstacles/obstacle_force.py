@@ -20,7 +20,7 @@ class ObstacleForce(VertexForce):
     """Device counterpart of an obstacle: `count` numbers of its shape, then stiffness, width [, friction, friction_speed].
 
     per_area: whether stiffness is per area [N/m^3]; what is said here of a vertex is then said of one square metre.
-    by_pairs: whether what is narrower than faces acts on them by pairs (mechanics/surfaces/kinematic_surface.py).
+    by_pairs: whether what is narrower than faces acts on them by pairs (mechanics/surfaces/obstacle_corners.py).
     A shape writes one function, `distance_and_normal`, in numbers of a graph; everything else follows from it. Positions
     are relative to the obstacle: callers take its displacement from X. The numbers of one that turns end in the point that
     it turns about, and its X is seven numbers: a place, and the unit quaternion of its rotation. A change of X + u is then
@@ -59,14 +59,22 @@ class ObstacleForce(VertexForce):
 
     @traced
     def record(self, parameters, first, X, u):
-        """(graph, all numbers, components of u, d, n) at a point."""
+        """(graph, all numbers, components of u, d, n) at a point. Behind the numbers stand those of `corners`, each leaf
+        with the `row` of the parameters where it is."""
         g = Graph(self.fp, parameters)
+        g.first, g.corners = first, []
         p = [g.leaf(x) for x in self._numbers(parameters, first)]
         rest, moved = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (X, u))
         if self.turns and length_of(X) == 7:  # not of a face's corners, which come as the obstacle was made
-            return g, p, *self._record_turned(g, p, let(X), rest, moved)
-        d, n = self.distance_and_normal(g, p[: self.count], rest, moved)
-        return g, p, moved, d, n
+            moved, d, n = self._record_turned(g, p, let(X), rest, moved)
+        else:
+            d, n = self.distance_and_normal(g, p[: self.count], rest, moved)
+        return g, [*p, *g.corners], moved, d, n
+
+    @traced
+    def rows_of(self, p):
+        """Of each corner the row of its first number."""
+        return [q.row for q in p[self.size :: 3]]
 
     @traced
     def _record_turned(self, g, p, X, rest, moved):
@@ -146,9 +154,11 @@ class ObstacleForce(VertexForce):
     def contact_plane_vjp(self, parameters, first, X, u, adjoint, sums, i):
         """Add to sums[first.., i] what an adjoint of (n, d) says of the obstacle's numbers."""
         g, p, _, d, n = self.record(parameters, first, X, u)
-        adjoints = g.reverse([(x, let(at(adjoint, k))) for k, x in enumerate([*n, d])], p[: self.count])
-        for k, by in enumerate(adjoints):
-            assign(at(sums, first + k, i), at(sums, first + k, i) + by)
+        leaves = [*p[: self.count], *p[self.size :]]
+        adjoints = g.reverse([(x, let(at(adjoint, k))) for k, x in enumerate([*n, d])], leaves)
+        for k, (leaf, by) in enumerate(zip(leaves, adjoints)):
+            row = getattr(leaf, "row", first + k)
+            assign(at(sums, row, i), at(sums, row, i) + by)
 
     @traced
     def clearance(self, parameters, first, X, u):
@@ -240,9 +250,22 @@ class ObstacleForce(VertexForce):
     @traced
     def _parameter_derivatives(self, parameters, first, X, u, by):
         g, p, _, f = self._record_force(parameters, first, X, u)
-        rows = [g.reverse([(f[d], g.one())], p) for d in range(3)]
+        rows = [g.reverse([(f[d], g.one())], p[: self.size]) for d in range(3)]
         for m, target in enumerate(by):
             assign(target, self.vector_of([row[m] for row in rows]))
+
+    @traced
+    def force_by_corners(self, parameters, first, X, u, parameters_dot):
+        """Change of the force for those of its corners."""
+        g, p, _, f = self._record_force(parameters, first, X, u)
+        return self.vector_of(g.forward([(q, at(parameters_dot, q.row)) for q in p[self.size :]], f))
+
+    @traced
+    def force_by_corners_vjp(self, parameters, first, X, u, w):
+        """(adjoints of its corners, rows of these) for the adjoint w of the force."""
+        g, p, _, f = self._record_force(parameters, first, X, u)
+        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], p[self.size :])
+        return (*adjoints, *self.rows_of(p))
 
     # ---- friction as a stage of explicit passes ----------------------------------------------------------------------
 
@@ -281,7 +304,8 @@ class ObstacleForce(VertexForce):
             parameters, first, X, u, v, v_obstacle, h_over_m
         )
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], [*moved, *before, *obstacle, ratio, *p])
-        return (*self.parted(adjoints, len(moved)), adjoints[len(moved) + 6], tuple(adjoints[len(moved) + 7 :]))
+        by = (*adjoints[len(moved) + 7 :], *self.rows_of(p))
+        return (*self.parted(adjoints, len(moved)), adjoints[len(moved) + 6], by)
 
     # ---- friction as a force of implicit passes, at the velocity v; felt: (X, u), the place where N and n are those of the
     # barrier, or (None, N n), the normal force itself [N] -----------------------------------------------------------------
@@ -339,7 +363,7 @@ class ObstacleForce(VertexForce):
         adjoint w of the force."""
         g, p, moved, speed, obstacle, f = self._with_friction(parameters, first, felt, v, v_obstacle)
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *obstacle, *p])
-        return (*self.parted(adjoints, len(moved)), tuple(adjoints[len(moved) + 6 :]))
+        return (*self.parted(adjoints, len(moved)), (*adjoints[len(moved) + 6 :], *self.rows_of(p)))
 
     @traced
     def parted(self, adjoints, count):

@@ -80,10 +80,10 @@ def _grid(n: int) -> Triangles:
     return np.stack([x, y], 1), np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 
-def skeleton(surface, least: float) -> Triangles:
-    """Triangles of a `KinematicSurface`, from both sides where they have no inside, and its segments and points as bars and
-    stones of its radius, or `least` [m]."""
-    x, t, r = surface.vertices, surface.triangles, max(surface.radius, least)
+def skeleton(surface, r: float) -> Triangles:
+    """Triangles of a `SurfaceMesh`, from both sides where they have no inside, and its segments and points as bars and
+    stones of a radius [m]."""
+    x, t = surface.vertices, surface.triangles
     points, triangles = [x], [t, t[~surface.is_sided][:, ::-1]]
     ends = np.concatenate([surface.segments, np.stack([surface.points, surface.points], 1)])
     corners = np.array(

@@ -95,7 +95,7 @@ def push_vjp(force, parameters, first, X, u, move, damping, n_adj, push_adj):
     seeds = [(k, let(at(n_adj, d))) for d, k in enumerate(n)] + [(pushed, push_adj)]
     adjoints, count = g.reverse(seeds, [*moved, *leaves, *p]), len(moved)
     of_place = let(ti.types.vector(6, force.fp)(*adjoints[:6])) if count == 6 else _vector(force.fp, adjoints[:3])
-    return of_place, _vector(force.fp, adjoints[count : count + 3]), tuple(adjoints[count + 3 :])
+    return of_place, _vector(force.fp, adjoints[count : count + 3]), (*adjoints[count + 3 :], *force.rows_of(p))
 
 
 # ---- friction, for a plane and a push that are known -------------------------------------------------------------------

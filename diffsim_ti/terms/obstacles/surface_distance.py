@@ -4,6 +4,7 @@ With p = sum_i w_i y_i the nearest point of the corners y, r = x - p, and E the 
 a triangle, one on a side, none at a corner), G = (E^T E)^-1:
 
     d = s |r| - radius,    n = s r / |r|,    dn / dx = s / |r| (1 - n n^T - E G E^T)
+    dd / dy_i = -w_i n,    dn / dy_i = -w_i dn / dx - g_i n^T,    with g_i the columns of E G dE^T / dy_i
 
 s is -1 behind what has an inside, else 1. Inside of a triangle n is its normal, and dn / dx = 0 exactly.
 """
@@ -66,9 +67,13 @@ class SurfaceDistance:
 
     @ti.func
     def corner(self, m, k, parameters: A):
-        """Where corner k of primitive m lies in the parameters."""
-        i = ti.cast(parameters[self.table + self.number(2, parameters) + self.stride * m + k], ti.i32)
-        return self.table + self.number(3, parameters) + 3 * i
+        """Three times the number of the vertex that is corner k of primitive m."""
+        return 3 * ti.cast(parameters[self.table + self.number(2, parameters) + self.stride * m + k], ti.i32)
+
+    @ti.func
+    def vertices(self, parameters: A):
+        """Where vertices that no input moves begin in the parameters."""
+        return self.table + self.number(3, parameters)
 
     @ti.func
     def nearer_child(self, node, x, parameters: A):
@@ -81,8 +86,8 @@ class SurfaceDistance:
         return 2 * node + ti.cast(nearer > 0, ti.i32)
 
     @ti.func
-    def find(self, x, parameters: A):
-        """(primitive, feature, shares of its corners) of what is nearest."""
+    def find(self, x, begin, parameters: A):
+        """(primitive, feature, shares of its corners) of what is nearest; begin: where vertices begin in the parameters."""
         leaves, count = self.number(0, parameters), self.number(1, parameters)
         best, m, feature, w = ti.cast(1e30, self.fp), 0, 0, self.vec3(0)
         node, down = 1, True
@@ -95,9 +100,9 @@ class SurfaceDistance:
                         down = True
                     else:
                         for j in range(GROUP * (node - leaves), ti.min(GROUP * (node - leaves + 1), count)):
-                            a = self.vector(self.corner(j, 0, parameters), parameters)
-                            b = self.vector(self.corner(j, 1, parameters), parameters)
-                            c = self.vector(self.corner(j, 2, parameters), parameters)
+                            a = self.vector(begin + self.corner(j, 0, parameters), parameters)
+                            b = self.vector(begin + self.corner(j, 1, parameters), parameters)
+                            c = self.vector(begin + self.corner(j, 2, parameters), parameters)
                             own, shares, square = self.nearest(x, a, b, c)
                             if square < best:
                                 best, m, feature, w = square, j, own, shares
@@ -141,45 +146,61 @@ class SurfaceDistance:
         return feature, w, square
 
     @ti.func
-    def look(self, x, parameters: A):
-        """(d without the radius, n, dn / dx: xx, xy, xz, yy, yz, zz)"""
+    def look(self, x, begin, parameters: A):
+        """((d without the radius, n, dn / dx: xx, xy, xz, yy, yz, zz), rows of the parameters where the corners begin, w, g
+        as columns)"""
         one, zero = ti.cast(1, self.fp), ti.cast(0, self.fp)
-        m, feature, w = self.find(x, parameters)
-        a = self.vector(self.corner(m, 0, parameters), parameters)
-        b = self.vector(self.corner(m, 1, parameters), parameters)
-        c = self.vector(self.corner(m, 2, parameters), parameters)
-        out, n, d = ti.Vector.zero(self.fp, 10), (b - a).cross(c - a), zero
+        m, feature, w = self.find(x, begin, parameters)
+        rows, y, g = ti.Vector([0, 0, 0]), ti.Matrix.zero(self.fp, 3, 3), ti.Matrix.zero(self.fp, 3, 3)
+        for k in ti.static(range(3)):
+            rows[k] = begin + self.corner(m, k, parameters)
+            for i in ti.static(range(3)):
+                y[i, k] = parameters[rows[k] + i]
+        r = x - y @ w
+        a, b = self.column(y, 1) - self.column(y, 0), self.column(y, 2) - self.column(y, 0)
+        out, n, d, bend, along = ti.Vector.zero(self.fp, 10), a.cross(b), zero, zero, self.vec3(0)
         if feature == 0:
-            n = n / ti.sqrt(n.norm_sqr())
-            # from the nearest corner, where rounding is least
-            d = (x - (w[0] * a + w[1] * b + w[2] * c)).dot(n)
+            square = n.norm_sqr()
+            b1, b2 = b.cross(n) / square, n.cross(a) / square  # that have the products 1 and 0 with a and b
+            n = n / ti.sqrt(square)
+            d = r.dot(n)
             if d < 0 and not self.has_inside(m, parameters):
-                n = zero - n
+                n = zero * n - n
                 d = zero - d
+            for i in ti.static(range(3)):
+                g[i, 0], g[i, 1], g[i, 2] = zero - b1[i] - b2[i], b1[i], b2[i]
         else:
-            along, bend = self.vec3(0), zero
             if feature < 4:
-                along = b - a
-                if feature == 2:
-                    along = c - b
-                if feature == 3:
-                    along = a - c
-                along = along / ti.sqrt(along.norm_sqr())
-            r = x - (w[0] * a + w[1] * b + w[2] * c)
+                first = feature - 1
+                following = (first + 1) % 3
+                for i in ti.static(range(3)):
+                    for k in ti.static(range(3)):
+                        share = ti.cast(following == k, self.fp) - ti.cast(first == k, self.fp)
+                        along[i] += share * y[i, k]
+                square = along.norm_sqr()
+                for i in ti.static(range(3)):
+                    for k in ti.static(range(3)):
+                        share = ti.cast(following == k, self.fp) - ti.cast(first == k, self.fp)
+                        g[i, k] = share * along[i] / square
+                along = along / ti.sqrt(square)
             d = ti.sqrt(r.norm_sqr())
             sign = self.sign(m, feature, r, parameters)
             bend = sign / ti.max(d, ti.cast(self.tiny, self.fp))
             n = bend * r
-            d = sign * d
-            if ti.abs(d) <= ti.cast(self.tiny, self.fp):
+            if d <= ti.cast(self.tiny, self.fp):
                 n = self.vec3(one, zero, zero)
-            for k in ti.static(range(6)):
-                i, j = ti.static(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))[k])
-                out[4 + k] = bend * (ti.cast(i == j, self.fp) - n[i] * n[j] - along[i] * along[j])
+            d = sign * d
         out[0] = d
-        for k in ti.static(range(3)):
-            out[1 + k] = n[k]
-        return out
+        for k in ti.static(range(6)):
+            i, j = ti.static(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))[k])
+            if ti.static(k < 3):
+                out[1 + k] = n[k]
+            out[4 + k] = bend * (ti.cast(i == j, self.fp) - n[i] * n[j] - along[i] * along[j])
+        return out, rows, w, g
+
+    @ti.func
+    def column(self, y, k: A):
+        return self.vec3(y[0, k], y[1, k], y[2, k])
 
     @ti.func
     def has_inside(self, m, parameters: A):
@@ -196,7 +217,8 @@ class SurfaceDistance:
             if self.has_inside(m, parameters):
                 first = self.table + self.number(2, parameters) + self.stride * m + 4 + 3 * (feature - 1)
                 if feature > 3:
-                    first = self.corner(m, feature - 4, parameters) + self.number(4, parameters)
+                    first = self.vertices(parameters) + self.number(4, parameters)
+                    first += self.corner(m, feature - 4, parameters)
                 if r.dot(self.vector(first, parameters)) < 0:
                     out = ti.cast(-1, self.fp)
         return out

@@ -9,12 +9,13 @@ Hapala, Davidovic, Wald, Havran, Slusallek 2011, Efficient stack-less BVH traver
 Ericson, Real-Time Collision Detection, 2005, 5.1 and 6; Morton 1966.
 """
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from diffsim_ti.mesh.geometry import cross, curve_order
-from diffsim_ti.terms.obstacles.kinematic_surface import KinematicSurface
+from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 
 GROUP = 4
 HEADER = 5  # of the table: number of leaves, of primitives, where primitives begin, where vertices do, numbers of these
@@ -26,7 +27,7 @@ class SurfaceTree:
     """Of a surface's primitives, in float64 on the host and as a `table` of numbers for kernels; origin [m]: what places in
     the table are measured from."""
 
-    def __init__(self, surface: KinematicSurface, origin: np.ndarray):
+    def __init__(self, surface: SurfaceMesh, origin: np.ndarray):
         self.surface, self.x = surface, surface.vertices - origin
         s, p = surface.segments, surface.points
         corners = np.concatenate([surface.triangles, s[:, [0, 1, 1]], p[:, None][:, [0, 0, 0]]])
@@ -48,6 +49,12 @@ class SurfaceTree:
                 if first == 1:
                     break
                 first, row = first // 2, reduce(row[::2], row[1::2])
+
+    def moved(self, x: np.ndarray) -> "SurfaceTree":
+        """That of vertices elsewhere, with the same edges and sides."""
+        surface = replace(self.surface, vertices=x)
+        vars(surface).update({name: getattr(self.surface, name) for name in ("one", "is_sided", "_edges_of_triangles")})
+        return SurfaceTree(surface, np.zeros(3))
 
     @cached_property
     def pseudonormals(self) -> np.ndarray:

@@ -25,7 +25,7 @@ def changes(leaves, change):
 @traced
 def all_changes(numbers, parameters_dot, first, *pairs):
     """(leaf, its change) of an obstacle's numbers and of the leaves of vectors, given as (leaves, change)."""
-    out = [(q, at(parameters_dot, first + k)) for k, q in enumerate(numbers)]
+    out = [(q, at(parameters_dot, getattr(q, "row", first + k))) for k, q in enumerate(numbers)]
     return sum((changes(leaves, change) for leaves, change in pairs), out)
 
 

@@ -31,15 +31,16 @@ class ObstacleCorners:
         for k, ((force, first, _), term) in enumerate(zip(arrays.obstacles, arrays.contacts)):
             if term.primitives is not None:
                 given = np.concatenate([np.ravel(x.value) for x in term.described if x.value is not None])
-                corners, _ = term.primitives.at(given[: force.count])
+                given = given - term.shift(np.zeros(3))
+                shape = np.r_[: force.count, force.size : force.size + term.num_extra]  # its numbers, from its first
+                corners, _ = term.primitives.at(given[shape])
                 own = slice(end, end := end + len(corners))
-                self.parts.append(
-                    SimpleNamespace(k=k, force=force, first=first, term=term, own=own, as_given=corners)
-                )
+                part = dict(k=k, force=force, first=first, term=term, own=own, as_given=corners, shape=first + shape)
+                self.parts.append(SimpleNamespace(**part))
         self.count = end
 
     def _numbers(self, part, parameters: np.ndarray) -> np.ndarray:
-        return parameters[part.first : part.first + part.force.count]
+        return parameters[part.shape]
 
     def made(self, parameters: np.ndarray) -> np.ndarray:
         """Where corners are as obstacles were made, shape (count, 3) [m]."""
@@ -105,8 +106,7 @@ class ObstacleCorners:
         return by
 
     def _add_shape(self, part, parameters, by, by_parameters, by_radius: float = 0.0) -> None:
-        own = slice(part.first, part.first + part.force.count)
-        by_parameters[own] += part.term.primitives.vjp(parameters[own], by, by_radius)
+        by_parameters[part.shape] += part.term.primitives.vjp(parameters[part.shape], by, by_radius)
 
     def add_radii(self, parameters, by_radii: np.ndarray, by_parameters: np.ndarray) -> None:
         """Adds the adjoints of the parameters by those of the radii."""
@@ -142,9 +142,10 @@ class ObstacleCorners:
             out[x.own], row = rows_dot[3 * x.k + RATE], self._row(x, AT_BEGIN)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
-                J, dp = rotations.left_jacobian(turn), x.term.primitives.jvp(
-                    self._numbers(x, parameters), self._numbers(x, change)
-                )[0]
+                J, dp = (
+                    rotations.left_jacobian(turn),
+                    x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[0],
+                )
                 darms = np.cross(rows_dot[row], arms)
                 darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self._about(x, change))
                 turned = rotations.turned(rotations.quaternion(turn), arms)
@@ -165,7 +166,7 @@ class ObstacleCorners:
                 self._add_shape(x, parameters, by_p, by_parameters)
 
 
-class KinematicSurface:
+class SurfaceWithObstacles:
     """The surface of a body and behind it the corners and edges of obstacles, as pairs read it; vertices of the body keep
     their numbers.
 
@@ -215,12 +216,14 @@ class KinematicSurface:
 
 
 class ObstacleMotion:
-    """Where the corners of a KinematicSurface are, on the device too, and the adjoints of that. `given` and `given_dot` are
-    displacements of all its vertices that no node gives, and changes of these."""
+    """Where the corners of a SurfaceWithObstacles are, on the device too, and the adjoints of that. `given` and `given_dot`
+    are displacements of all its vertices that no node gives, and changes of these."""
 
-    def __init__(self, surface: KinematicSurface, arrays):
+    def __init__(self, surface: SurfaceWithObstacles, arrays):
         self.surface, self.corners, self.a = surface, surface.corners, arrays
-        self.given, self.given_dot, self.unmoved = (runtime.array(arrays.vector, surface.num_vertices) for _ in range(3))
+        self.given, self.given_dot, self.unmoved = (
+            runtime.array(arrays.vector, surface.num_vertices) for _ in range(3)
+        )
         for array in (self.given, self.given_dot, self.unmoved):
             runtime.fill(array, 0)
         self.rows, self.m = np.zeros((arrays.poses.size, 3)), AT_STAGE
@@ -279,9 +282,9 @@ class ObstacleMotion:
 
 
 class ContactNumbers:
-    """Which numbers of the scene the contacts of a KinematicSurface have, on the device (listed_pair.py)."""
+    """Which numbers of the scene the contacts of a SurfaceWithObstacles have, on the device (listed_pair.py)."""
 
-    def __init__(self, surface: KinematicSurface, arrays):
+    def __init__(self, surface: SurfaceWithObstacles, arrays):
         self.surface, parts, term = surface, surface.corners.parts, arrays.self_contact
         self.of_bodies, rows = arrays.parameters_of_self_contact, [[0, 0, 0]]
         if term:
@@ -324,7 +327,7 @@ class ContactNumbers:
         runtime.fill(self.numbers_dot, rows)
 
     def collect(self, parameters, sums: np.ndarray, out: np.ndarray) -> None:
-        """Adds the adjoints of the numbers to those of the scene for sums of (stiffness, width, -, radius) of each vertex."""
+        """Adds to the adjoints of all parameters those by sums of (stiffness, width, -, radius) at each vertex."""
         total = np.zeros((len(self.rows), 4))
         np.add.at(total, self.surface.owner, sums)
         for c in range(0 if self.of_bodies.stop > self.of_bodies.start else 1, len(total)):

@@ -1,4 +1,4 @@
-"""A surface that does not deform: its points, triangles, edges, and which side of it is inside."""
+"""Triangles, segments and points that an obstacle consists of: their edges, and which side of them is inside."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,11 +13,10 @@ CORNERS = dict(triangles=3, segments=2, points=1)
 
 
 @dataclass(frozen=True, eq=False)
-class KinematicSurface:
-    """What an obstacle consists of where it was made: all that is within `radius` of triangles, segments and points.
+class SurfaceMesh:
+    """vertices [m], shape (k, 3); triangles, shape (t, 3), segments, (s, 2), and points, (p,), which name them by index.
 
-    vertices [m], shape (k, 3); triangles, shape (t, 3), segments, shape (s, 2), and points, shape (p,), name them by index;
-    radius [m]. Vertices in one place are one to the topology (`one`), so that surfaces whose triangles share none are
+    Vertices in one place are one to the topology (`one`), so that surfaces whose triangles share none are
     closed, too. Parts that are closed and oriented have an inside, others are felt from both sides alike.
     """
 
@@ -25,10 +24,9 @@ class KinematicSurface:
     triangles: np.ndarray
     segments: np.ndarray
     points: np.ndarray
-    radius: float = 0.0
 
     @classmethod
-    def checked(cls, owner: str, vertices, triangles, segments, points) -> "KinematicSurface":
+    def checked(cls, owner: str, vertices, triangles, segments, points) -> "SurfaceMesh":
         """Of what a user gives; where nothing names vertices, all of them are points. Raises ValueError."""
         vertices = numbers(f"{owner}: vertices", vertices)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices) or not np.all(np.isfinite(vertices)):
@@ -69,18 +67,29 @@ class KinematicSurface:
         keys, which = np.unique(sides[:, 0] * len(self.vertices) + sides[:, 1], return_inverse=True)
         return np.stack(np.divmod(keys, len(self.vertices)), 1), which.reshape(-1, 3)
 
-    @cached_property
-    def edges(self) -> np.ndarray:
-        """Edges of triangles and segments, each once, shape (e, 2)."""
-        all_edges = np.concatenate([self._edges_of_triangles[0], np.sort(self.one[self.segments], 1)])
-        all_edges = np.unique(all_edges, axis=0)
-        return all_edges[all_edges[:, 0] < all_edges[:, 1]]
+    def sharp_edges(self, length: float, bow: float) -> np.ndarray:
+        """Edges that a flat face of this length [m] would feel: segments, edges of one triangle or of more than two, and
+        those where a face that rests on the surface lies more than a bow [m] off it, shape (e, 2).
 
-    @cached_property
-    def used(self) -> np.ndarray:
-        """Vertices that something names, each place once, sorted."""
-        named = np.concatenate([self.triangles.ravel(), self.segments.ravel(), self.points])
-        return np.unique(self.one[named])
+        Where two triangles of height h bend by phi, away from where the body may be, that is phi length^2 / 6 h, as over
+        a ball of radius h / phi, or phi length / 6 if it is shorter than they are.
+        """
+        edges, which = self._edges_of_triangles
+        count = np.bincount(which.ravel(), minlength=len(edges))
+        order = np.argsort(which.ravel(), kind="stable")
+        first = (np.cumsum(count) - count)[count == 2]
+        x, keeps = self.vertices[self.triangles], count != 2
+        (f, g), (i, j) = np.divmod(order[np.stack([first, first + 1])], 3)  # the triangles of an edge, their sides
+        along = x[f, (i + 1) % 3] - x[f, i]
+        along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        a, b = x[f, (i + 2) % 3] - x[f, i], x[g, (j + 2) % 3] - x[f, i]
+        a, b = (y - np.einsum("ij,ij->i", y, along)[:, None] * along for y in (a, b))
+        height = np.minimum(*(np.linalg.norm(y, axis=1) for y in (a, b)))
+        bend = np.arctan2(np.linalg.norm(cross(a, b), axis=1), -np.einsum("ij,ij->i", a, b))
+        is_concave = self.is_sided[f] & (np.einsum("ij,ij->i", cross(x[f, 1] - x[f, 0], x[f, 2] - x[f, 0]), b) > 0)
+        keeps[count == 2] = ~is_concave & (bend * length * np.maximum(length / height.clip(1e-300), 1) > 6 * bow)
+        out = np.unique(np.concatenate([edges[keeps], np.sort(self.one[self.segments], 1)]), axis=0)
+        return out[out[:, 0] < out[:, 1]]
 
     @cached_property
     def is_sided(self) -> np.ndarray:
@@ -118,21 +127,3 @@ class KinematicSurface:
                 own = self.one[self.triangles[:, a]]
                 of_vertices[:, d] += np.bincount(own, angle * normals[:, d], len(self.vertices))
         return of_edges[which], of_vertices[self.one]
-
-    @cached_property
-    def is_convex(self) -> bool:
-        """Whether it bounds a convex solid: one sphere whose edges all bend outwards."""
-        edges, which = self._edges_of_triangles
-        if len(self.segments) or len(self.points) or not len(self.triangles) or not self.is_sided.all():
-            return False
-        if len(np.unique(self.one[self.triangles])) - len(edges) + len(self.triangles) != 2:
-            return False
-        x = self.vertices[self.triangles]
-        normals, tiny = cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), 1e-9 * float(np.ptp(x.reshape(-1, 3), 0).max())
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        order = np.argsort(which.ravel(), kind="stable").reshape(-1, 2)  # the two sides of each edge
-        (f, g), (_, side) = (order // 3).T, (order % 3).T
-        beyond = x[g, (side + 2) % 3] - x[f, 0]
-        if np.einsum("ij,ij->i", beyond, normals[f]).max() > tiny:
-            return False
-        return bool(np.einsum("ij,ij->i", normals, x[:, 0] - x.reshape(-1, 3).mean(0)).min() > 0)
