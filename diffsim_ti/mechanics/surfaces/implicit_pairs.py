@@ -74,7 +74,7 @@ class ImplicitPairs(SurfacePairs):
                 reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
                 unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
             self.forces(self.next, 0, self.a.corner, exact=True)
-            shares = self._shares()
+            shares = self._shares(most - share)
             listed = shares.min(initial=np.inf)
             share += min(listed, unlisted)
             if share >= most:
@@ -89,9 +89,10 @@ class ImplicitPairs(SurfacePairs):
         runtime.fill(self.next, u[None])
         return self.fresh and not self._check(self.next, 0, 0, 0)[0]
 
-    def _shares(self) -> np.ndarray:
+    def _shares(self, most: float) -> np.ndarray:
+        """Of the step from `next` on, of each pair, where `forces` were exact."""
         out = self.list.buffers.take("shares", self.kernels.fp, self.list.count)
-        self.run(self.hessian.shares, dict(w=self.step, out=out), slot=0, most=SAFE)
+        self.run(self.hessian.shares, dict(u=self.next, w=self.step, out=out), slot=0, most=most)
         return runtime.fetch(out)[: self.list.count].astype(np.float64)
 
     def is_collision_free(self, u: np.ndarray, step: np.ndarray) -> bool:
