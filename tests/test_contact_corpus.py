@@ -2,9 +2,12 @@
 
 from fractions import Fraction
 
+import contact_corpus
 import numpy as np
 import pytest
 from exact_predicates import ExactJudge, segments_meet_triangles, side
+
+import diffsim_ti as ds
 
 
 def _slowly(p, q, a, b, c) -> bool:
@@ -86,3 +89,38 @@ def test_the_judge_sees_a_needle_in_a_body_and_a_sheet_that_touches_itself():
     judge = ExactJudge(strip, [[0, 1, 3], [0, 3, 2], [2, 3, 5], [2, 5, 4]])
     assert judge.count(strip) == 0 and judge.count(folded) > 0
     assert ExactJudge(strip, judge.triangles, asked=np.zeros(6, bool)).count(folded) == 0
+
+
+@pytest.mark.parametrize("name, steps", [("spike on soft spike", 60), ("slots", 60), ("slope 0.5, friction 0.49", 60)])
+def test_scene_without_intersections(name, steps):
+    """The slope takes all of its steps: the cube slides as far as Coulomb's law says."""
+    posed = contact_corpus.SCENES[name](contact_corpus.Meshes())
+    found = contact_corpus.run(name, posed, steps)
+    assert found.error is None and found.done == steps and found.intersections == 0 == found.turned
+    if steps == posed.steps:
+        assert found.verdict == "as expected"
+
+
+def test_arch_stands():
+    posed = contact_corpus.SCENES["arch, friction 0.5"](contact_corpus.Meshes())
+    found = contact_corpus.run("arch", posed, 80)
+    assert found.error is None and found.intersections == 0
+    assert posed.expected(found) is None and found.speed(5) < 0.01
+
+
+def test_what_passes_by_does_not_cut_a_step_short():
+    """A small tetrahedron goes past a large one, at a distance of a twentieth of its way, and then straight towards it."""
+    corners = np.vstack([np.zeros(3), np.eye(3)])
+    large = ds.TetrahedralMesh(corners, [[0, 1, 2, 3]], fix_orientation=True)
+    small = ds.TetrahedralMesh(0.1 * corners + [-0.15, 1.2, 0.2], [[0, 1, 2, 3]], fix_orientation=True)
+    mesh = ds.TetrahedralMesh.joined([large, small])
+    contact = ds.SelfContact(1e4, 1e-3)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=contact, precision="f64")
+    pairs, moves = ds.Simulator(ds.ImplicitEulerSolver(scene)).workspace.pairs, np.arange(8)[:, None] > 3
+    u = np.zeros((8, 3))
+    assert pairs.safe_share(u, moves * np.array([0, -2.0, 0])) == 1
+    share = pairs.safe_share(u, moves * np.array([1.0, -2.0, 0]))
+    judge = ExactJudge(mesh.vertices, mesh.surface_triangles, tetrahedra=mesh.tetrahedra, points=np.arange(8))
+    way = moves * np.array([1.0, -2.0, 0])
+    touch = next(s for s in np.linspace(0, 1, 1001) if judge.count(mesh.vertices + s * way))
+    assert 0.8 * touch < share < touch

@@ -102,11 +102,12 @@ class HessianKernels(ListedPair):
 
     @ti.func
     def share(self, kind: A, p, scene: A, at: A, plan: A):
-        """The share of the step w, if below `most`, after which the pair has closed all but 1 - SAFE of its gap: planes
-        that part it on the way say how far it may go on at least, so that it arrives where its gap is almost that small.
+        """The share of the step w, if below `most`, after which the pair has closed all but 1 - SAFE of its gap, or half of
+        the width if that is less, and half as much again: planes that part it on the way say how far it may go on.
         Li, Kaufman, Jiang 2021, Codimensional Incremental Potential Contact, doi:10.1145/3450626.3459767, algorithm 1."""
         plane, one = scene.plane[p], ti.cast(1, self.fp)
-        least, radius = ti.cast(1 - SAFE, self.fp) * plane[3], self.radius_of(p, scene)
+        radius, half = self.radius_of(p, scene), ti.cast(0.5, self.fp) * self.width(p, scene)
+        least = ti.min(ti.cast(1 - SAFE, self.fp) * plane[3], half)
         share = (plane[3] - least) / self.closing(kind, three(plane), p, scene, at)
         goes_on = share < plan.most
         if goes_on:
