@@ -22,7 +22,8 @@ AREAS = {
     "quadratic_answers curved_contact",
     "obstacles and friction": "contact mesh_obstacle contact_area contact_faces contact_stage contact_rollers "
     "contact_crossing contact_friction face_friction contact_gradients obstacle_pairs own_obstacle poses far_from_origin",
-    "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction",
+    "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction "
+    "contact_corpus",
     "PyTorch, optimisations": "ensemble torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",
     "charts, maps, advice": "sweep study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film marks "

@@ -8,6 +8,7 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
+from diffsim_ti.solvers.implicit.linear import conjugate_gradients
 
 SLOPE, G = 0.5, 9.81
 EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
@@ -59,6 +60,22 @@ def test_slope(solver, dt):
     assert went(solver, dt, scene, steps)[1] > 0.9 * (0.5 * down * end**2)
     scene, down = on_slope(0.3, settled())
     np.testing.assert_allclose(went(solver, dt, scene, steps)[1], 0.5 * down * end**2, rtol=0.02)
+
+
+def test_linear_solves_on_the_device_know_friction():
+    """Conjugate gradients of multigrid solve what products on the host say, where all that presses also sticks."""
+    solver = ds.ImplicitEulerSolver(on_slope(0.51, settled())[0], dt=1e-2, preconditioner="multigrid")
+    simulator = ds.Simulator(solver)
+    simulator.step()
+    newton = simulator.workspace.newton
+    newton.preconditioner.update(newton.potential.held_at)
+    b = np.random.default_rng(0).standard_normal((solver.scene.mesh.num_vertices, 3)) * newton.free
+    x, residual, *_ = conjugate_gradients(newton.operator(), b, newton.preconditioner, 1e-8, 1000, 1e-16)
+    assert residual <= 1e-8
+    left = b - newton.operator()(x)
+    assert np.linalg.norm(left) <= 1e-7 * np.linalg.norm(b)
+    with newton.potential.without_friction():  # which is no small part of it
+        assert np.linalg.norm(b - newton.operator()(x)) > 0.1 * np.linalg.norm(b)
 
 
 # ---- energy and momentum ---------------------------------------------------------------------------------------------

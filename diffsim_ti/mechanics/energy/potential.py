@@ -1,6 +1,6 @@
 """The potential energy of a displacement on the device, with its derivatives, as arrays of float64."""
 
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from types import SimpleNamespace
 
@@ -127,21 +127,17 @@ class Potential:
     def without_friction(self):
         """What has a potential in the state alone, for friction has one in a pass."""
         a = self.arrays
-        surface_friction = getattr(self.surface_friction, "inner", self.surface_friction)  # of curved faces: on corners
         rough = [first + force.index.friction for force, first, _ in a.obstacles if force.friction]
-        if not (rough or surface_friction):
+        if not (rough or self.surface_friction):
             yield
             return
-        kept, pressing = runtime.fetch(a.parameters), surface_friction.L if surface_friction else None
+        kept = runtime.fetch(a.parameters)
         smooth = kept.copy()
         smooth[rough] = 0
-        if surface_friction:
-            surface_friction.L = np.zeros_like(pressing)
         runtime.fill(a.parameters, smooth)
-        yield
+        with self.surface_friction.without() if self.surface_friction else nullcontext():
+            yield
         runtime.fill(a.parameters, kept)
-        if surface_friction:
-            surface_friction.L = pressing
 
     def energy(self) -> tuple[float, float, np.ndarray]:
         """(energy [J], the sum of its absolute parts, J at each point)."""
@@ -174,7 +170,7 @@ class Potential:
         self.multiply(convex)
         y = runtime.fetch(self.y)[0].astype(np.float64)
         y = (y + self.faces.product() if self.faces else y) * -scale
-        return sum((part.product(self.held_at, w, convex) for part in self._on_host()), y)
+        return y + self.hosts.product(self.held_at, w, convex) if self.hosts else y
 
     def multiply(self, convex: bool = False) -> None:
         """y = -d2E/du2 w on the device, without faces and host forces."""
@@ -275,7 +271,7 @@ class Potential:
             y[a.mesh.surface_vertices] -= runtime.fetch(a.corner)[a.first_contact_corner :][
                 : len(a.mesh.surface_vertices)
             ]
-        return sum((part.product(self.held_at, w) for part in self._on_host()), y)
+        return y + self.hosts.product(self.held_at, w) if self.hosts else y
 
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact and of host forces in `blocks`; None without."""

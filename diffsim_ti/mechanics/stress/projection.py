@@ -33,7 +33,10 @@ class Projection:
 
         C = self.C.reshape(-1, 3, 3, 3, 3)
         blocks = np.einsum("eai,ecidj,ebj->eacbd", self.N, C, self.N, optimize=True)
-        at, size = (3 * self.nodes[:, :, None] + np.arange(3)).reshape(len(C), -1), 3 * self.num_vertices
+        at, size = (
+            (3 * self.nodes[:, :, None] + np.arange(3)).reshape(len(C), 3 * self.nodes.shape[1]),
+            3 * self.num_vertices,
+        )
         rows, columns = (x.ravel() for x in np.broadcast_arrays(at[:, :, None], at[:, None]))
         return coo_matrix((blocks.ravel(), (rows, columns)), shape=(size, size)).tocsr()
 

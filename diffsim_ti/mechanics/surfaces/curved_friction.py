@@ -37,6 +37,15 @@ class CurvedLaggedFriction:
             there[first:] = self.given[first:] - obstacles.velocities() / per_gamma
         self.inner.begin(self.pairs.spread(u), there, per_gamma)
 
+    def without(self):
+        return self.inner.without()
+
+    def bounded(self, which):
+        return self.inner.bounded(which)
+
+    def turns(self, u: np.ndarray, there: np.ndarray) -> np.ndarray:
+        return self.inner.turns(self._fine(u), self._fine(there))
+
     def _fine(self, u: np.ndarray) -> np.ndarray:
         return self.C @ u + self.given
 
@@ -48,9 +57,6 @@ class CurvedLaggedFriction:
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
         return abs(self.C).T @ self.inner.sizes(self._fine(u))
-
-    def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
-        return self.C.T @ self.inner.product(self._fine(u), self.C @ w, convex)
 
     def clear_sums(self) -> None:
         """The finer surface has them."""

@@ -9,12 +9,13 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, ListedPair, behind, between, first_of, three
+from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, SAFE, ListedPair, behind, between, first_of, three
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.terms.obstacles import barrier
 
 A = ti.template()
+MOST_PLANES = 50  # that part a pair on its way
 
 
 @dataclass(frozen=True)
@@ -91,15 +92,37 @@ class HessianKernels(ListedPair):
     # ---- how far a step may go ---------------------------------------------------------------------------------------
 
     @ti.func
-    def share(self, kind: A, p, scene: A, at: A, plan: A):
-        """The share of the step w after which the pair has closed along its plane's normal by the share `most` of its gap;
-        above 1 it may take the step whole."""
-        plane, closing = scene.plane[p], ti.cast(0, self.fp)
-        n = three(plane)
+    def closing(self, kind: A, n, p, scene: A, at: A):
+        """How far the corners of pair p come towards each other along n in the whole step w, at most."""
+        closing = ti.cast(1e-30, self.fp)
         for a, b in ti.static(OPPOSITE[kind]):
             i, k = scene.pairs[4 * p + a], scene.pairs[4 * p + b]
             closing = ti.max(closing, n.dot(between(at.w, i, k, 0)))
-        return plan.most * plane[3] / ti.max(closing, ti.cast(1e-30, self.fp))
+        return closing
+
+    @ti.func
+    def share(self, kind: A, p, scene: A, at: A, plan: A):
+        """The share of the step w, if below `most`, after which the pair has closed all but 1 - SAFE of its gap, or half of
+        the width if that is less, and half as much again: planes that part it on the way say how far it may go on.
+        Li, Kaufman, Jiang 2021, Codimensional Incremental Potential Contact, doi:10.1145/3450626.3459767, algorithm 1."""
+        plane, one = scene.plane[p], ti.cast(1, self.fp)
+        radius, half = self.radius_of(p, scene), ti.cast(0.5, self.fp) * self.width(p, scene)
+        least = ti.min(ti.cast(1 - SAFE, self.fp) * plane[3], half)
+        share = (plane[3] - least) / self.closing(kind, three(plane), p, scene, at)
+        goes_on = share < plan.most
+        if goes_on:
+            y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
+            w1, w2, w3 = self.changes(p, scene, at.w, 0)
+            for _ in range(MOST_PLANES):
+                if goes_on:
+                    w, r, g = self.nearest(kind, y1 + share * w1, y2 + share * w2, y3 + share * w3)
+                    length = ti.max(ti.sqrt(r.norm_sqr()), ti.cast(self.tiny, self.fp))
+                    room = length - radius - least
+                    goes_on = room > ti.cast(0.5, self.fp) * least
+                    if goes_on:
+                        share += room / self.closing(kind, (one / length) * r, p, scene, at)
+                        goes_on = share < plan.most
+        return share
 
     @ti.func
     def all_shares(self, scene: A, at: A, plan: A):
@@ -110,4 +133,4 @@ class HessianKernels(ListedPair):
 
     @cached_property
     def shares(self) -> Kernel:
-        return self.kernel("shares", self.all_shares, dict(w="vectors2", out="scalars"), most="float")
+        return self.kernel("shares", self.all_shares, dict(u="vectors2", w="vectors2", out="scalars"), most="float")

@@ -36,17 +36,22 @@ class ImplicitPairs(SurfacePairs):
         """Go to the displacements u[0]."""
         self.ensure(u, 0)
         self.forces(u, 0, self.a.corner)
+        if self.friction:
+            self.friction.leave()
 
     def energies(self) -> np.ndarray:
         """Energy of each pair [J]."""
         return runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
 
     def hessian_product(self, u, w, convex: bool) -> None:
-        """Change of the contact forces for changes w[0] of the positions, to the last corners of `arrays.corner`."""
+        """Change of the forces of contact and friction for changes w[0] of the positions, to the last corners of
+        `arrays.corner`."""
         if convex:
             self.run(self.hessian.products, dict(u=u, w=w, out=self.a.corner), slot=0)
         else:
             self.product(u, 0, w, self.a.corner, has_planes=True)
+        if self.friction:
+            self.friction.add_product(u, w, self.a.corner)
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (mechanics/energy/kernels.py)."""
@@ -54,19 +59,22 @@ class ImplicitPairs(SurfacePairs):
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
-        largest such share only where they are about to meet. Marches along the step, with a new list at each halt."""
+        largest such share only where they are about to meet. Marches along the step, with a new list at each halt,
+        unless the present one holds on all of it."""
         travel = self.travel(step[self.mesh.surface_vertices])
         if not travel.any():
             return most
         runtime.fill(self.step, step[None])
-        share, self.blocked = 0.0, None
+        share, self.blocked, holds = 0.0, None, self._holds(u + most * step) and self._holds(u)
         for _ in range(self.longest_march):
-            runtime.fill(self.next, (u + share * step)[None])
-            self.build(self.next, 0, wanted=(most - share) * travel)
+            unlisted = np.inf
+            if not holds:
+                runtime.fill(self.next, (u + share * step)[None])
+                self.build(self.next, 0, wanted=(most - share) * travel)
+                reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
+                unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
             self.forces(self.next, 0, self.a.corner, exact=True)
-            reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
-            unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
-            shares = self._shares()
+            shares = self._shares(most - share)
             listed = shares.min(initial=np.inf)
             share += min(listed, unlisted)
             if share >= most:
@@ -76,9 +84,15 @@ class ImplicitPairs(SurfacePairs):
                 return share
         return share
 
-    def _shares(self) -> np.ndarray:
+    def _holds(self, u: np.ndarray) -> bool:
+        """Whether the list holds at u, to where `next` goes."""
+        runtime.fill(self.next, u[None])
+        return self.fresh and not self._check(self.next, 0, 0, 0)[0]
+
+    def _shares(self, most: float) -> np.ndarray:
+        """Of the step from `next` on, of each pair, where `forces` were exact."""
         out = self.list.buffers.take("shares", self.kernels.fp, self.list.count)
-        self.run(self.hessian.shares, dict(w=self.step, out=out), slot=0, most=SAFE)
+        self.run(self.hessian.shares, dict(u=self.next, w=self.step, out=out), slot=0, most=most)
         return runtime.fetch(out)[: self.list.count].astype(np.float64)
 
     def is_collision_free(self, u: np.ndarray, step: np.ndarray) -> bool:

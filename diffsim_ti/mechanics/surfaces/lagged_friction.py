@@ -1,9 +1,12 @@
 """Friction between surfaces in implicit passes: a force with a potential, from what presses where the pass begins."""
 
+from contextlib import contextmanager
+
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
+from diffsim_ti.mechanics.surfaces.friction_product import FrictionProduct
 from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.terms.obstacles.friction import ARRAYS, dissipated, slip
 
@@ -24,6 +27,8 @@ class LaggedFriction(PairFriction):
         self.L, self.x, self.per_gamma = np.zeros(0), np.zeros((self.a.num_vertices, 3)), 1.0
         self.by_speed, self.u_begin = np.zeros(len(self.speeds_at)), None
         self.contact = np.zeros(0, int)  # its number of each pair
+        self._product, self._is_put = FrictionProduct(pairs), False
+        self._bounded = False  # of each pair whether its stiffness is that of `bounded`
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
         """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above."""
@@ -36,6 +41,35 @@ class LaggedFriction(PairFriction):
         self.n, self.L = pressing[:, :3], pressing[:, 3]
         surface = self.pairs.kinematic
         self.contact = surface.numbers[self.corners[:, [0, 2]]].max(1) if surface else np.zeros(len(felt), int)
+        self._product.begin(self.corners, self.w)
+        self._is_put = False
+
+    def leave(self) -> None:
+        """The displacement changes: so does the stiffness."""
+        self._is_put = False
+
+    def turns(self, u: np.ndarray, there: np.ndarray) -> np.ndarray:
+        """Whether each pair slides at u, and there the other way or so much slower that its stiffness at u, which is none
+        along the motion, says little of the way."""
+        t, after = self._sliding(u)[2], self._sliding(there)[2]
+        square = (t * t).sum(1)
+        return (square > (0.5 * self.speed) ** 2) & ((t * after).sum(1) < 0.3 * square)
+
+    @contextmanager
+    def bounded(self, which):
+        """The stiffness of some pairs is that of a paraboloid above their energy, which touches it at u: f / |t| across n.
+        Directions then go too far less often. Lange, Hunter, Yang 2000, Optimization Transfer Using Surrogate Objective
+        Functions, doi:10.1080/10618600.2000.10474858."""
+        self._bounded, self._is_put = which, False
+        yield
+        self._bounded, self._is_put = False, False
+
+    @contextmanager
+    def without(self):
+        """As if nothing pressed."""
+        self.L, pressing, self._is_put = np.zeros_like(self.L), self.L, False
+        yield
+        self.L, self._is_put = pressing, False
 
     def _measure_here(self) -> None:
         self.pairs.forces(self.pairs.next, 0, self.a.corner)
@@ -87,13 +121,15 @@ class LaggedFriction(PairFriction):
         """The matrix L d(f t / |t|) / dt / gamma of each pair [N/m]."""
         _, _, _, _, e, kappa, slope = self._sliding(u)
         out = kappa[:, None, None] * (np.eye(3) - self.n[:, :, None] * self.n[:, None])
-        out += (slope - kappa)[:, None, None] * e[:, :, None] * e[:, None]
+        out += np.where(self._bounded, 0.0, slope - kappa)[:, None, None] * e[:, :, None] * e[:, None]
         return (self.per_gamma * self.L)[:, None, None] * out
 
-    def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
-        """d2E/du2 w [N], which is convex."""
-        across = np.einsum("pij,pk,pkj->pi", self._stiffness(u), self.w, w[self.corners], optimize=True)
-        return self._scatter(self.w[:, :, None] * across[:, None])
+    def add_product(self, u, w, out) -> None:
+        """Add the change of the forces at u[0] for changes w[0] of the positions to the last corners of `out`."""
+        if not self._is_put:
+            self._product.put(self._stiffness(runtime.fetch_row(u, 0)))
+            self._is_put = True
+        self._product.add(w, out)
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m]."""

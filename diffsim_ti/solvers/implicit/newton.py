@@ -12,6 +12,7 @@ starts need that).
 Kane, Marsden, Ortiz, West 2000, doi:10.1002/1097-0207(20001210)49:10<1295::AID-NME993>3.0.CO;2-W.
 """
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -113,7 +114,7 @@ class Newton:
         """
         self.report = report = NewtonReport()
         self.reports.append(report)
-        self.mass, self.inertial, self.loads = mass, inertial, loads
+        self.mass, self.inertial, self.loads, self._turning = mass, inertial, loads, False
         u = self.potential.place(start)
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
@@ -245,7 +246,16 @@ class Newton:
         return exact if solved else max(exact, min(self.rough, 0.9 * gained**2))
 
     def _step(self, u, R, forcing):
-        """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by."""
+        """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by. Friction that
+        the direction before turned round is bounded (mechanics/surfaces/lagged_friction.py)."""
+        friction = self.potential.surface_friction
+        with friction.bounded(self._turning) if friction else nullcontext():
+            direction, R = self._direction_of(u, R, forcing)
+        if friction:
+            self._turning = friction.turns(u, u + direction)
+        return cleaned(linear_of(self.free), direction), R
+
+    def _direction_of(self, u, R, forcing):
         A = self.operator()
         balanced = self.volumes.predicted(u, R, self.stiffness) * self.free if self.volumes else R
         direction = self._direction(A, balanced, forcing)
@@ -261,7 +271,7 @@ class Newton:
 
             direction, change, self._rise = self.volumes.bordered(u, direction, solve)
             self.report.products, R = self.report.products + A.products - done, R + change
-        return cleaned(linear_of(self.free), direction), R
+        return direction, R
 
     def _recount(self, u, moved, direction) -> None:
         """Multipliers go as far as the step from u along a direction that was found."""

@@ -1,0 +1,633 @@
+"""The scenes that contact codes are judged by, and a table of what becomes of them.
+
+    python tests/contact_corpus.py [--meshes FOLDER] [--scene NAME ...] [--steps N] [--list]
+
+FOLDER holds the meshes of the IPC paper's repository (spike.msh, wedge.msh, cube.msh, tet.msh, mat20x20.msh, mat40x40.msh,
+arch/01.msh ..., and surfaces *.obj); without it coarser ones of our own stand for them. Each scene runs once. The table says
+how many steps were done, what an exact judge found (exact_predicates.py: edges that pierce triangles and points within
+tetrahedra, at the end of each step and at three places on the straight way to it), Newton's rounds, processor seconds of a
+step, microseconds of a step and tetrahedron beside the paper's, and whether bodies went where they were to go.
+
+Li, Ferguson, Schneider, Langlois, Zorin, Panozzo, Jiang, Kaufman 2020, Incremental Potential Contact,
+doi:10.1145/3386569.3392425. Erleben 2018, Methodology for Assessing Mesh-Based Contact Point Methods, doi:10.1145/3096239.
+"""
+
+import argparse
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from exact_predicates import ExactJudge
+
+import diffsim_ti as ds
+
+G = 9.81
+NONE = np.zeros((0, 3), int)
+
+
+# ---- meshes ----------------------------------------------------------------------------------------------------------
+
+
+class Meshes:
+    """Meshes by their names in the paper's repository, of a folder or, without one, of our own."""
+
+    def __init__(self, folder: str | None = None):
+        self.folder = None if folder is None else Path(folder)
+
+    def __call__(self, name: str) -> ds.TetrahedralMesh:
+        if self.folder is not None:
+            return ds.TetrahedralMesh.from_file(self.folder / f"{name}.msh", fix_orientation=True, drop_orphans=True)
+        return getattr(self, f"_{name}")()
+
+    def arch(self) -> list[ds.TetrahedralMesh]:
+        """Blocks, one after the other from foot to foot."""
+        if self.folder is not None:
+            blocks = [self(f"arch/{path.stem}") for path in sorted((self.folder / "arch").glob("*.msh"))]
+            return [shrunk(block, 0.005) for block in blocks]  # they touch each other
+        return _half_ring(blocks=7, inner=1.0, outer=1.4, gap=0.004)
+
+    def surface(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """(vertices, triangles) of NAME.obj."""
+        if self.folder is None:
+            mesh = self(name)
+            return mesh.vertices, mesh.surface_triangles
+        vertices, triangles = [], []
+        for line in (self.folder / f"{name}.obj").read_text().splitlines():
+            words = line.split()
+            if words[:1] == ["v"]:
+                vertices.append([float(x) for x in words[1:4]])
+            if words[:1] == ["f"]:
+                corners = [int(word.split("/")[0]) - 1 for word in words[1:]]
+                triangles += [[corners[0], corners[k], corners[k + 1]] for k in range(1, len(corners) - 1)]
+        return np.array(vertices), np.array(triangles, int).reshape(-1, 3)
+
+    def _cube(self):
+        return ds.TetrahedralMesh.create_box(2, size=1.0)
+
+    def _tet(self):
+        return ds.TetrahedralMesh(np.vstack([np.zeros(3), np.eye(3)]), [[0, 1, 2, 3]], fix_orientation=True)
+
+    def _spike(self):
+        base = np.array([[0.5, 0, -0.5], [0.5, 0, 0.5], [-0.5, 0, 0.5], [-0.5, 0, -0.5], [0, 3, 0]])
+        return ds.TetrahedralMesh(base, [[0, 1, 2, 4], [0, 2, 3, 4]], fix_orientation=True)
+
+    def _wedge(self):
+        ends = np.array([[-0.5, 0, -1], [0.5, 0, -1], [0, 3, -1], [-0.5, 0, 1], [0.5, 0, 1], [0, 3, 1.0]])
+        return ds.TetrahedralMesh(ends, [[0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]], fix_orientation=True)
+
+    def _mat20x20(self):
+        return ds.TetrahedralMesh.create_box((9, 2, 9), size=(1, 0.013, 1)).translated([-0.5, -0.0065, -0.5])
+
+    def _mat40x40(self):
+        return ds.TetrahedralMesh.create_box((11, 2, 11), size=(1, 0.008, 1)).translated([-0.5, -0.004, -0.5])
+
+
+def _ball(cells: int, radius: float) -> ds.TetrahedralMesh:
+    """A cube's grid drawn onto shells about its middle."""
+    cube = ds.TetrahedralMesh.create_box(2 * cells + 1, size=2.0)
+    x = cube.vertices - cube.vertices.mean(0)
+    length = np.linalg.norm(x, axis=1, keepdims=True)
+    x = radius * x * np.abs(x).max(1, keepdims=True) / np.where(length > 0, length, 1)
+    return ds.TetrahedralMesh(x, cube.tetrahedra)
+
+
+def _half_ring(blocks: int, inner: float, outer: float, gap: float) -> list[ds.TetrahedralMesh]:
+    cube = ds.TetrahedralMesh.create_box(2, size=1.0)
+    out = []
+    for k in range(blocks):
+        radius, share = inner + (outer - inner) * cube.vertices[:, 0], (k + cube.vertices[:, 1]) / blocks
+        angle = np.pi * share
+        tangent = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], 1)
+        x = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.4 * (cube.vertices[:, 2] - 0.5)], 1)
+        x -= gap * (cube.vertices[:, 1] - 0.5)[:, None] * tangent
+        out.append(ds.TetrahedralMesh(x, cube.tetrahedra, fix_orientation=True))
+    return out
+
+
+def moved(mesh: ds.TetrahedralMesh, by=(0, 0, 0), turned=None) -> ds.TetrahedralMesh:
+    """A body, turned about its axes' origin by `turned` = (axis, angle), then moved."""
+    mesh = mesh if turned is None else mesh.rotated(*turned)
+    return mesh.translated(np.asarray(by, float))
+
+
+def shrunk(mesh: ds.TetrahedralMesh, by: float) -> ds.TetrahedralMesh:
+    """A body smaller about its middle by a length on each side, at its corners in all directions alike."""
+    x = mesh.vertices
+    middle, half = 0.5 * (x.max(0) + x.min(0)), 0.5 * np.ptp(x, 0)
+    return ds.TetrahedralMesh(middle + (x - middle) * (1 - by / half.min()), mesh.tetrahedra)
+
+
+def set_on(mesh: ds.TetrahedralMesh, height: float) -> ds.TetrahedralMesh:
+    """A body moved up or down so that its lowest vertex is at y = height."""
+    return mesh.translated([0, height - mesh.vertices[:, 1].min(), 0])
+
+
+# ---- a scene with its judge ------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Surface:
+    """What an obstacle consists of, for the judge; path: its displacement at a time."""
+
+    vertices: np.ndarray
+    triangles: np.ndarray = field(default_factory=lambda: NONE)
+    segments: np.ndarray = field(default_factory=lambda: NONE[:, :2])
+    points: np.ndarray = field(default_factory=lambda: NONE[:, 0])
+    path: Callable[[float], np.ndarray] = staticmethod(lambda t: np.zeros(3))
+
+    def obstacle(self, **options) -> ds.MeshObstacle:
+        parts = {name: getattr(self, name) for name in ("triangles", "segments", "points")}
+        return ds.MeshObstacle(self.vertices, **{k: v for k, v in parts.items() if len(v)}, **options)
+
+
+@dataclass
+class Posed:
+    """A scene with its solver, how many steps it takes, and what is expected of it.
+
+    expected(run): None, or what is wrong. paper: (seconds a step, tetrahedra, Newton's rounds a step), None unknown.
+    """
+
+    solver: object
+    steps: int
+    surfaces: list[Surface] = field(default_factory=list)
+    expected: Callable[["Run"], str | None] = staticmethod(lambda run: None)
+    paper: tuple | None = None
+
+    def judge(self) -> tuple[ExactJudge, Callable[[np.ndarray, float], np.ndarray]]:
+        """(judge, places(positions of the mesh, time) -> what it judges)."""
+        mesh = self.solver.scene.mesh
+        x, first = [mesh.vertices], mesh.num_vertices
+        triangles, segments, points = [mesh.surface_triangles], [NONE[:, :2]], [mesh.surface_vertices]
+        for s in self.surfaces:
+            x.append(s.vertices)
+            triangles.append(s.triangles + first)
+            segments.append(s.segments + first)
+            named = np.unique(np.concatenate([s.triangles.ravel(), s.segments.ravel(), s.points]))
+            points.append(named + first)
+            first += len(s.vertices)
+        asked = np.arange(first) < mesh.num_vertices
+        parts = (np.concatenate(part) for part in (triangles, segments))
+        judge = ExactJudge(
+            np.concatenate(x), *parts, tetrahedra=mesh.tetrahedra, points=np.concatenate(points), asked=asked
+        )
+
+        def places(body: np.ndarray, t: float) -> np.ndarray:
+            return np.concatenate([body, *(s.vertices + s.path(t) for s in self.surfaces)])
+
+        return judge, places
+
+
+@dataclass
+class Run:
+    """What became of a scene: positions after each step, shape (steps + 1, n, 3), and what each step took."""
+
+    name: str
+    posed: Posed
+    positions: list = field(default_factory=list)
+    seconds: list = field(default_factory=list)
+    rounds: list = field(default_factory=list)
+    intersections: int = 0
+    turned: int = 0
+    error: str | None = None
+
+    @property
+    def mesh(self) -> ds.TetrahedralMesh:
+        return self.posed.solver.scene.mesh
+
+    @property
+    def done(self) -> int:
+        return len(self.seconds)
+
+    def body(self, k: int) -> np.ndarray:
+        """Positions of body k after each step."""
+        return np.array(self.positions)[:, self.mesh.vertex_sets[f"body_{k}"]]
+
+    def speed(self, steps: int = 1) -> float:
+        """The largest of any vertex over the last steps [m/s]."""
+        way = self.positions[-1] - self.positions[-1 - steps]
+        return float(np.linalg.norm(way, axis=1).max()) / (steps * self.posed.solver.dt)
+
+    @property
+    def verdict(self) -> str:
+        if self.error:
+            return self.error
+        if self.done < self.posed.steps:
+            return "stopped"
+        return self.posed.expected(self) or "as expected"
+
+
+def run(name: str, posed: Posed, steps: int | None = None, judged: bool = True, samples: int = 4, say=None) -> Run:
+    out, steps = Run(name, posed), posed.steps if steps is None else min(steps, posed.steps)
+    try:
+        simulator = ds.Simulator(posed.solver)
+    except (ValueError, RuntimeError, TypeError) as error:
+        out.error = f"{type(error).__name__}: {error}"
+        return out
+    judge, places = posed.judge()
+    t, x = 0.0, simulator.positions
+    out.positions.append(x)
+    out.intersections += judge.count(places(x, t))
+    for _ in range(steps):
+        before, begin = simulator.report.iterations, time.process_time()
+        try:
+            simulator.step()
+        except (FloatingPointError, ValueError) as error:
+            out.error = f"step {out.done + 1}: {type(error).__name__}: {error}"
+            break
+        out.seconds.append(time.process_time() - begin)
+        out.rounds.append(simulator.report.iterations - before)
+        x, t, x_before, t_before = simulator.positions, simulator.time, x, t
+        out.positions.append(x)
+        if judged:
+            out.intersections += judge.count_along(places(x_before, t_before), places(x, t), samples)
+            out.turned += len(judge.turned(places(x, t)))
+        if say:
+            say(out)
+    return out
+
+
+# ---- scenes ----------------------------------------------------------------------------------------------------------
+
+SCENES: dict[str, Callable[[Meshes], Posed]] = {}
+
+
+def scene(name: str):
+    def note(make):
+        SCENES[name] = make
+        return make
+
+    return note
+
+
+def posed(bodies, E, nu, dt, steps, terms=(), density=1000.0, fixed=None, motion=None, contact=None, **more) -> Posed:
+    """Bodies in one scene under gravity; E and density: numbers, or one of each body."""
+    mesh = ds.TetrahedralMesh.joined(bodies)
+
+    def each(value):
+        return value if np.isscalar(value) else np.repeat(value, [body.num_tetrahedra for body in bodies])
+
+    more_of_scene = {k: more.pop(k) for k in ("initial_velocities", "initial_positions") if k in more}
+    tolerance = more.pop("tolerance", 1e-4)
+    built = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(each(E), nu),
+        each(density),
+        [*([ds.Gravity()] if more.pop("gravity", True) else []), *([contact] if contact else []), *terms],
+        fixed=fixed,
+        motion=motion,
+        precision="f64",
+        **more_of_scene,
+    )
+    return Posed(ds.ImplicitEulerSolver(built, dt=dt, tolerance=tolerance, max_iterations=200), steps, **more)
+
+
+def comes_to_rest(run: Run) -> str | None:
+    """Slower in the end than a hundredth of what a fall of its own size gives, and without jitter."""
+    size = float(np.ptp(run.mesh.vertices, 0).max())
+    speed = run.speed(5)
+    return None if speed < 0.003 * np.sqrt(2 * G * size) else f"still moves at {speed:.2g} m/s"
+
+
+def _upside_down(mesh: ds.TetrahedralMesh, height: float) -> ds.TetrahedralMesh:
+    return set_on(moved(mesh, turned=([0, 0, 1], np.pi)), height)
+
+
+ERLEBEN = dict(E=1e5, nu=0.4, dt=5e-3)
+FIRM = ds.SelfContact(stiffness=1e6, width=5e-3)
+
+
+def _pair(upper: str, lower: str, gap: float = 0.05, by=(0.0, 0.0)):
+    """A soft body upside down on another, whose lowest vertices are held."""
+
+    def make(meshes: Meshes) -> Posed:
+        below = meshes(lower)
+        above = moved(_upside_down(meshes(upper), below.vertices[:, 1].max() + gap), [by[0], 0, by[1]])
+        fixed = np.flatnonzero(below.vertices[:, 1] <= below.vertices[:, 1].min() + 1e-9)
+        return posed([below, above], steps=120, contact=FIRM, fixed=fixed, **ERLEBEN)
+
+    return make
+
+
+for _upper in ("spike", "wedge", "cube"):
+    for _lower in ("spike", "wedge"):
+        SCENES[f"{_upper} on soft {_lower}"] = _pair(_upper, _lower)
+
+
+@scene("slots")
+def slots(meshes: Meshes) -> Posed:
+    """A tetrahedron among three boxes, 1 mm from two and 5 um from the third."""
+    cube, tet = meshes("cube"), meshes("tet")
+    bodies = [moved(cube, by) for by in ([-1.001, 0, 0], [1.000005, 0, 0], [0, -1.001, 0])] + [tet]
+    return posed(
+        bodies,
+        contact=ds.SelfContact(1e7, 1e-4),
+        fixed=np.arange(3 * cube.num_vertices),
+        steps=300,
+        expected=comes_to_rest,
+        **ERLEBEN,
+    )
+
+
+def _stack(side: float, mass_ratio_density: float, E: float, steps: int = 120):
+    def make(meshes: Meshes) -> Posed:
+        cube = meshes("cube")
+        small = cube.translated([-0.5, 0.01, -0.5])
+        large = ds.TetrahedralMesh(cube.vertices * side, cube.tetrahedra).translated([-side / 2, 1.02, -side / 2])
+        return posed(
+            [small, large],
+            E=[1e6, E],
+            nu=0.4,
+            density=[1000.0, mass_ratio_density],
+            dt=0.025,
+            steps=steps,
+            contact=ds.SelfContact(1e7 * max(1.0, side**3 * mass_ratio_density / 1e6), 0.01, friction=0.5),
+            terms=[ds.Ground(0.0, friction=0.5)],
+            expected=comes_to_rest,
+        )
+
+    return make
+
+
+SCENES["stack of two"] = _stack(1.0, 1000.0, 1e6)
+SCENES["mass ratio 10 000"] = _stack(10.0, 1e4, 1e8)
+
+
+def _arch(friction: float, stands: bool):
+    def make(meshes: Meshes) -> Posed:
+        blocks = meshes.arch()
+        n, each = len(blocks), blocks[0].num_vertices
+        width = 5e-4 * abs(float(blocks[-1].vertices[:, 0].mean()))
+        weight = G * 1000 * sum(block.volumes.sum() for block in blocks)
+        feet = np.concatenate([np.arange(each), np.arange((n - 1) * each, n * each)])
+
+        def expected(run: Run) -> str | None:
+            fall = float((run.body(n // 2)[0, :, 1] - run.body(n // 2)[-1, :, 1]).mean())
+            fell = fall > 0.02 * run.mesh.vertices[:, 1].max()
+            return None if fell != stands else f"its key stone went down by {fall:.3g} m"
+
+        contact = ds.SelfContact(0.1 * weight / width, width, friction=friction)
+        E = 2e10 if meshes.folder else 1e7
+        return posed(blocks, E, 0.4, 0.01, 200, contact=contact, fixed=feet, expected=expected)
+
+    return make
+
+
+SCENES["arch, friction 0.5"] = _arch(0.5, True)
+SCENES["arch, friction 0.2"] = _arch(0.2, False)
+
+
+def _cards(friction: float):
+    def make(meshes: Meshes) -> Posed:
+        card = meshes("mat20x20")
+        lean, half, gap = np.radians(75), 0.0065, 2e-3
+        reach = np.cos(lean)
+
+        def pair(x: float, floor: float) -> list[ds.TetrahedralMesh]:
+            """Two that lean against each other about x."""
+            out = []
+            for sign in (1, -1):  # the left one rises to the right
+                leaning = set_on(moved(card, turned=([0, 0, 1], sign * lean)), floor + gap)
+                edge = sign * leaning.vertices[:, 0]
+                out.append(leaning.translated([x - sign * (edge.max() + 0.5 * gap), 0, 0]))
+            return out
+
+        across = reach + half  # of the ground that one of a pair covers
+        bodies = pair(-across - 0.02, 0.0) + pair(across + 0.02, 0.0)
+        top = max(body.vertices[:, 1].max() for body in bodies)
+        bodies.append(card.translated([0, top + gap + half, 0]))
+        bodies += pair(0.0, top + 2 * half + gap)
+        return posed(
+            bodies,
+            E=1e8,
+            nu=0.4,
+            dt=0.025,
+            steps=80,
+            contact=ds.SelfContact(1e5, 1.5e-3, friction=friction),
+            terms=[ds.Ground(0.0, width=1.5e-3, friction=friction)],
+        )
+
+    return make
+
+
+SCENES["house of cards, friction 0.2"] = _cards(0.2)
+SCENES["house of cards, friction 0.1"] = _cards(0.1)
+
+
+def _slope(friction: float):
+    """A cube that lies on a board, by a gravity that is turned."""
+
+    def make(meshes: Meshes) -> Posed:
+        angle, speed, steps, dt, width = np.arctan(0.5), 1e-3, 60, 0.01, 2e-3
+        board = ds.TetrahedralMesh.create_box((5, 2, 3), size=(4, 0.2, 2)).translated([-1, -0.2, -0.5])
+        cube = meshes("cube").translated([-0.4, 0.8 * width, 0.03])
+        down = G * np.array([np.sin(angle), -np.cos(angle), 0])
+
+        def expected(run: Run) -> str | None:
+            x = run.body(1)[:, :, 0].mean(1)
+            v = (x[-1] - x[-11]) / (10 * dt)
+            a, end = down[0] + friction * down[1], steps * dt
+            if friction >= 0.5:
+                return None if abs(v) <= 1.01 * speed else f"creeps at {v:.3g} m/s"
+            law = 0.5 * a * end * (end + dt)  # of backward Euler
+            way = x[-1] - x[0]
+            return None if abs(way / law - 1) < 0.02 else f"slides {way:.4g} m, Coulomb's law says {law:.4g} m"
+
+        def pose(friction: float, start=None) -> Posed:
+            return posed(
+                [board, cube],
+                E=1e9,
+                nu=0.4,
+                dt=dt,
+                steps=steps,
+                gravity=False,
+                contact=ds.SelfContact(2e6, width, friction=friction, friction_speed=speed),
+                terms=[ds.Gravity(down)],
+                fixed=np.arange(board.num_vertices),
+                initial_positions=start,
+                expected=expected,
+            )
+
+        held = ds.Simulator(pose(0.51).solver)  # until it lies still
+        held.run(100)
+        return pose(friction, held.positions)
+
+    return make
+
+
+SCENES["slope 0.5, friction 0.49"] = _slope(0.49)
+SCENES["slope 0.5, friction 0.5"] = _slope(0.5)
+
+
+@scene("mat twist")
+def twist(meshes: Meshes) -> Posed:
+    """Both ends turn against each other, 0.4 turns a second together, for two turns of each end against the other."""
+    mat = meshes("mat40x40")
+    x = mat.vertices[:, 0]
+    ends = [np.flatnonzero(x <= x.min() + 1e-9), np.flatnonzero(x >= x.max() - 1e-9)]
+    held = np.sort(np.concatenate(ends))
+    sign = np.where(x[held] > 0, 1.0, -1.0)
+    X = mat.vertices[held]
+
+    def motion(t: float) -> np.ndarray:
+        angle = np.pi * 0.4 * t * sign
+        y, z = X[:, 1], X[:, 2]
+        return np.stack(
+            [0 * y, np.cos(angle) * y - np.sin(angle) * z - y, np.sin(angle) * y + np.cos(angle) * z - z], 1
+        )
+
+    contact = ds.SelfContact(1e4, 1e-3)
+    return posed([mat], 2e4, 0.4, 0.04, 125, gravity=False, contact=contact, fixed=held, motion=motion)
+
+
+# ---- scenes with obstacle surfaces -----------------------------------------------------------------------------------
+
+
+def _on_surface(upper: str, surface: str, by=(0.0, 0.0), scale: float = 1.0):
+    """A soft body upside down on a surface that does not move."""
+
+    def make(meshes: Meshes) -> Posed:
+        vertices, triangles = meshes.surface(surface)
+        vertices = scale * vertices
+        under = np.flatnonzero(np.abs(vertices[:, [0, 2]] - by).max(1) < 0.6)
+        top = float(vertices[under if len(under) else slice(None), 1].max())
+        above = moved(_upside_down(meshes(upper), top + 0.05), [by[0], 0, by[1]])
+        fixed = Surface(vertices, triangles)
+        return posed([above], steps=120, contact=FIRM, terms=[fixed.obstacle(width=5e-3)], surfaces=[fixed], **ERLEBEN)
+
+    return make
+
+
+for _upper, _lower in (("spike", "spike"), ("wedge", "spike"), ("spike", "wedge"), ("wedge", "wedge")):
+    SCENES[f"{_upper} on {_lower}.obj"] = _on_surface(_upper, _lower)
+SCENES["cube on spike.obj"] = _on_surface("cube", "spike", by=(0.5, 0.5))
+for _lower in ("crack", "hole", "cliff", "internal_edges"):
+    for _upper in ("spike", "wedge"):
+        SCENES[f"{_upper} on {_lower}.obj"] = _on_surface(_upper, _lower)
+
+
+@scene("mat on knives")
+def knives(meshes: Meshes) -> Posed:
+    """Nine single triangles on edge."""
+    places = np.linspace(-0.4, 0.4, 9)
+    corners = np.array([[[x, -0.3, -0.6], [x, -0.3, 0.6], [x, 0.0, 0.6 * (-1) ** k]] for k, x in enumerate(places)])
+    blades = Surface(corners.reshape(-1, 3), np.arange(27).reshape(9, 3))
+    return posed(
+        [meshes("mat40x40").translated([0.013, 0.2, 0.007])],
+        E=2e4,
+        nu=0.4,
+        dt=0.04,
+        steps=150,
+        contact=ds.SelfContact(1e4, 1e-3),
+        terms=[blades.obstacle(width=1e-3)],
+        surfaces=[blades],
+        paper=(1.4, 9126, 5.5),
+    )
+
+
+def _cushion(as_segments: bool):
+    def make(meshes: Meshes) -> Posed:
+        n, ball = (21, 10) if meshes.folder else (5, 3)
+        body = _ball(ball, radius=0.4)
+        grid = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, n)] * 2, indexing="ij"), -1).reshape(-1, 2)
+        beds = []
+        for sign in (-1, 1):
+            tips = np.stack([grid[:, 0], np.full(len(grid), 0.45 * sign), grid[:, 1]], 1)
+            feet = tips + [0, 0.3 * sign, 0]
+            k = np.arange(len(tips))
+            close = lambda t, s=sign: np.array([0, -s * min(0.2 * t, 0.15), 0])  # noqa: E731
+            if as_segments:
+                beds.append(Surface(np.concatenate([tips, feet]), segments=np.stack([k, k + len(k)], 1), path=close))
+            else:
+                beds.append(Surface(tips, points=k, path=close))
+        return posed(
+            [body],
+            E=1e4,
+            nu=0.4,
+            dt=0.02,
+            steps=50,
+            gravity=False,
+            contact=ds.SelfContact(1e4, 1e-3),
+            terms=[bed.obstacle(width=1e-3, path=bed.path) for bed in beds],
+            surfaces=beds,
+            paper=(2.8, 28000, None),
+        )
+
+    return make
+
+
+SCENES["pin cushion of points"] = _cushion(False)
+SCENES["pin cushion of segments"] = _cushion(True)
+
+
+# ---- the table -------------------------------------------------------------------------------------------------------
+
+HEAD = (
+    "scene",
+    "tetrahedra",
+    "steps",
+    "intersections",
+    "rounds",
+    "most",
+    "s/step",
+    "us/tet",
+    "paper's us/tet",
+    "verdict",
+)
+
+
+def row(run: Run) -> list[str]:
+    n, seconds = run.mesh.num_tetrahedra, np.array(run.seconds[1:] or [np.nan])  # the first one compiles
+    paper = run.posed.paper
+    return [
+        run.name,
+        str(n),
+        f"{run.done}/{run.posed.steps}",
+        str(run.intersections) + (f" ({run.turned} turned)" if run.turned else ""),
+        f"{np.mean(run.rounds or [np.nan]):.1f}",
+        str(max(run.rounds, default=0)),
+        f"{seconds.mean():.3g}",
+        f"{1e6 * seconds.mean() / n:.3g}",
+        f"{1e6 * paper[0] / paper[1]:.3g}" if paper else "",
+        run.verdict,
+    ]
+
+
+def main(arguments=None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--meshes", help="folder of the paper's meshes")
+    parser.add_argument("--scene", nargs="+", default=None, help="names, or what they begin with")
+    parser.add_argument("--steps", type=int, default=None, help="at most so many of each scene")
+    parser.add_argument("--list", action="store_true", help="print names and end")
+    parser.add_argument("--every", type=int, default=0, help="say after so many steps how far a scene is")
+    given = parser.parse_args(arguments)
+    names = [n for n in SCENES if given.scene is None or any(n.startswith(s) for s in given.scene)]
+    if given.list:
+        print("\n".join(names))
+        return 0
+    meshes, good = Meshes(given.meshes), True
+    print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD), flush=True)
+
+    def say(run: Run) -> None:
+        if given.every and run.done % given.every == 0:
+            print(f"  {run.name}: {run.done}, {run.rounds[-1]} rounds, {run.seconds[-1]:.2g} s", file=sys.stderr)
+
+    for name in names:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                found = run(name, SCENES[name](meshes), given.steps, say=say)
+            except (ValueError, TypeError, RuntimeError) as error:
+                print(f"| {name} | | | | | | | | | not posed: {error} |", flush=True)
+                good = False
+                continue
+        good &= found.verdict == "as expected" and found.intersections == 0
+        print("| " + " | ".join(row(found)) + " |", flush=True)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
