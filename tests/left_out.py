@@ -93,7 +93,6 @@ LEFT_OUT = {
         test_reduced_explicit::test_self_contact_pushes_a_body[affine]
     """,
     "capsules; transposes and impacts before a mesh": """
-        test_contact_faces::test_forces_and_energies_are_those_of_implicit_steps[mesh-True]
     """,
     "obstacles as forces, backward Euler": """
         test_contact_area::test_equal_areas_are_equal_stiffnesses[SemiImplicitSolver]
