@@ -103,7 +103,7 @@ def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
                 case["mesh"],
                 ds.StableNeoHookean(case["E"], 0.35),
                 1000.0,
-                [ds.SelfContact(**contact)],
+                [ds.SelfContact(**contact, stage=not case["reduced"])],
                 initial_velocities=case["v"],
                 reduced=case["reduced"],
                 precision=case["precision"],

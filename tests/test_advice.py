@@ -248,6 +248,10 @@ FOLLOWED = {
         lambda: ds.ContactForce("floor", on="xmin", per_vertex=True),
         lambda: (ds.ContactForce("floor", on="xmin"), ds.ContactForce("floor", per_vertex=True)),
     ),
+    ("terms/obstacles/mesh_obstacle.py", "float32 cannot count"): (
+        lambda: ds.MeshObstacle(CUBE.vertices, CUBE.surface_triangles).kernel("f32", 2**24),
+        lambda: ds.MeshObstacle(CUBE.vertices, CUBE.surface_triangles).kernel("f64", 2**24),
+    ),
     ("solvers/semi_implicit.py", "give it fixed=vertices"): (
         lambda: ds.SemiImplicitSolver(scene(), dt=1e-4).set_fixed_vertices("ymin"),
         lambda: ds.SemiImplicitSolver(scene(fixed="ymin"), dt=1e-4),
@@ -311,6 +315,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("batch/taped.py", "its field is already"): "test_batch_tape.py",
     ("common/checked.py", "is a tensor with a graph"): "test_calls.py",
     ("mechanics/surfaces/surface_pairs.py", "take a width below"): "test_self_contact.py",
+    ("solvers/explicit/solver.py", "leave stage out"): "test_self_contact.py",
     ("mechanics/surfaces/surface_pairs.py", "take substeps of {} s"): "test_self_contact.py, battery_of_throws.py",
     ("mechanics/surfaces/contact_stage.py", "take substeps of {} s"): "battery_of_throws.py",
     ("mechanics/surfaces/surface_pairs.py", "no step stops them"): "test_self_contact.py, battery_of_throws.py",

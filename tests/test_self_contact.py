@@ -22,7 +22,7 @@ def tetrahedron(size=0.1):
 
 
 @lru_cache
-def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, **options):
+def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, stage=False, **options):
     """Two tetrahedra that meet edge across edge, a little askew."""
     corners = np.array([[-0.05, 0, 0], [0.05, 0, 0], [0, -0.08, -0.05], [0, -0.08, 0.05]])
     lower = ds.TetrahedralMesh(corners, [[0, 1, 2, 3]], fix_orientation=True)
@@ -34,7 +34,7 @@ def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, **op
         mesh,
         MATERIAL,
         density=1000.0,
-        terms=[ds.SelfContact(STIFFNESS, WIDTH)],
+        terms=[ds.SelfContact(STIFFNESS, WIDTH, stage=stage)],
         initial_velocities=velocity,
         precision=precision,
     )
@@ -42,7 +42,7 @@ def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, **op
 
 
 @lru_cache
-def two_blocks(precision="f64", **options):
+def two_blocks(precision="f64", stage=False, **options):
     """A turned block that falls on another; many pairs of all kinds."""
     block = ds.TetrahedralMesh.create_box(3, 0.1)
     upper = block.rotated([1, 2, 0.5], 0.7, center=(0.05, 0.05, 0.05)).translated([0.02, 0.125, 0.01])
@@ -53,7 +53,7 @@ def two_blocks(precision="f64", **options):
         mesh,
         MATERIAL,
         density=1000.0,
-        terms=[ds.SelfContact(STIFFNESS, WIDTH)],
+        terms=[ds.SelfContact(STIFFNESS, WIDTH, stage=stage)],
         initial_velocities=velocity,
         precision=precision,
     )
@@ -86,9 +86,10 @@ def test_energy_and_momenta_through_a_collision():
     simulator.check_surfaces()
 
 
-@pytest.mark.parametrize("kind", ["edges", "blocks"])
+@pytest.mark.parametrize("kind", ["edges", "edges as a stage", "blocks"])
 def test_gradients_through_a_collision(kind):
-    rollout = collision() if kind == "blocks" else ds.Rollout(crossed_edges(), 60, gradients="all")
+    edges = crossed_edges(stage="stage" in kind)
+    rollout = collision() if kind == "blocks" else ds.Rollout(edges, 60, gradients="all")
     frames = rollout.forward()
     free = (frames.displacements[-1] - frames.displacements[0]) - rollout.values["initial_velocities"] * frames.times[
         -1
@@ -115,9 +116,10 @@ def test_gradients_through_a_collision(kind):
         assert min(abs(c - slope) for c in central) <= 2e-5 * abs(slope) + 1e-9, name
 
 
+@pytest.mark.parametrize("stage", [False, True], ids=["force", "stage"])
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
-def test_tangent_and_adjoint_agree(solver):
-    rollout = ds.Rollout(crossed_edges(solver=solver), 60, save_every=20, gradients="all")
+def test_tangent_and_adjoint_agree(solver, stage):
+    rollout = ds.Rollout(crossed_edges(solver=solver, stage=stage), 60, save_every=20, gradients="all")
     assert verify.dot_product_test(rollout) <= 1e-11
 
 
@@ -310,13 +312,13 @@ def test_a_width_beyond_many_elements_is_refused():
 
 
 def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
-    solver = crossed_edges(speed=400.0, substeps=1, contact="force")
+    solver = crossed_edges(speed=400.0, substeps=1)
     simulator = ds.Simulator(solver)
     with pytest.raises(ds.Tunnelling, match=r"substep of 0\.0001 s.*take substeps of"):
         simulator.run(20)
     simulator.check_surfaces()
     scene = crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)])
-    weak = ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT, substeps=1, contact="force"))
+    weak = ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT, substeps=1))
     with pytest.raises(
         ds.Tunnelling, match=r"^step \d+, t = .*(edges|vertex).*may have gone through each other: their gap was .* m/s"
     ) as error:
@@ -328,11 +330,11 @@ def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
 def test_contact_too_stiff_for_its_step_says_so_and_its_advice_works():
     scene = crossed_edges().scene
     scene = scene.replace(terms=[ds.SelfContact(1e9, WIDTH)])
-    stiff = ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT, substeps=1, contact="force"))
+    stiff = ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT, substeps=1))
     with pytest.raises(ds.Tunnelling, match=r"at .* rad/s is too stiff for it: take substeps of") as error:
         stiff.run(200)
     step = error.value.stable_dt
-    shorter = ds.SemiImplicitSolver(stiff.solver.scene, dt=step, contact="force")
+    shorter = ds.SemiImplicitSolver(stiff.solver.scene, dt=step)
     simulator = ds.Simulator(shorter)
     simulator.run(round(3e-3 / step))
     simulator.check_surfaces()
@@ -345,7 +347,7 @@ def test_a_throw_goes_well_when_the_advice_is_taken(stiffness, dt):
 
     def throw():
         now = scene.replace(terms=[ds.SelfContact(of["stiffness"], WIDTH)])
-        simulator = ds.Simulator(ds.SemiImplicitSolver(now, dt=of["substep"], substeps=1, contact="force"))
+        simulator = ds.Simulator(ds.SemiImplicitSolver(now, dt=of["substep"], substeps=1))
         simulator.run(int(0.016 / of["substep"]))
         simulator.check_surfaces()
         return simulator
@@ -362,11 +364,14 @@ def test_a_throw_goes_well_when_the_advice_is_taken(stiffness, dt):
 
 @pytest.mark.parametrize("stiffness, dt", [(1e-2, 4e-4), (1e7, 4e-4)])
 def test_the_stage_keeps_surfaces_apart_whatever_the_stiffness(stiffness, dt):
-    """Where a force would be too weak or too stiff for its step by far: no intersection, momenta to round-off, no energy
-    from nowhere but for the second order of turning surfaces."""
-    mesh = two_blocks().scene.mesh
-    scene = two_blocks().scene.replace(terms=[ds.SelfContact(stiffness, WIDTH)])
-    simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=dt))
+    """Where a force is too weak or too stiff for its step by far, and says so: no intersection, momenta to round-off, no
+    energy from nowhere but for the second order of turning surfaces."""
+    mesh, scene = two_blocks().scene.mesh, two_blocks().scene
+    force = ds.SemiImplicitSolver(scene.replace(terms=[ds.SelfContact(stiffness, WIDTH)]), dt=dt, substeps=1)
+    with pytest.raises(ds.Tunnelling, match=r"or pass SelfContact\(stage=True\)"):
+        ds.Simulator(force).run(40)
+    staged = scene.replace(terms=[ds.SelfContact(stiffness, WIDTH, stage=True)])
+    simulator = ds.Simulator(ds.SemiImplicitSolver(staged, dt=dt))
     judge = ExactJudge(mesh.vertices, mesh.surface_triangles, (), mesh.elements, np.arange(mesh.num_vertices))
     energy, (p, L, size) = simulator.compute_energy(), momenta(simulator)
     for _ in range(8):
@@ -377,6 +382,17 @@ def test_the_stage_keeps_surfaces_apart_whatever_the_stiffness(stiffness, dt):
     lower = mesh.vertex_sets["body_0"]
     assert np.linalg.norm(simulator.velocities[lower].mean(0)) > 0.1  # they met
     assert simulator.compute_energy() <= 1.02 * energy
+
+
+def test_a_stage_where_there_is_none_is_refused():
+    scene = two_blocks(stage=True).scene
+    for solver in (
+        lambda: ds.SemiImplicitSolver(scene, dt=DT, contact="force"),
+        lambda: ds.VelocityVerletSolver(scene.replace(reduced={"body_0": "affine"}), dt=DT),
+    ):
+        with pytest.raises(ValueError, match="leave stage out, or take an implicit solver"):
+            solver()
+    ds.ImplicitEulerSolver(scene, dt=DT)
 
 
 def test_one_per_scene_and_gap_needs_it():

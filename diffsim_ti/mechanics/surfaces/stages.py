@@ -42,6 +42,8 @@ class SurfaceForces(Stage):
         try:
             self.pairs.check_pass(at.history.u, at.end, float(at.ws.solver.schedule.length(at.j)))
         except Tunnelling as error:
+            if at.ws.solver.stages_contact and not at.ws.scene.reduced:
+                error.args = (f"{error}; or pass SelfContact(stage=True), a stage that no step is too large for",)
             raise at.ws.dated(error, at.j, at.num_passes) from None
 
     @contextmanager

@@ -68,8 +68,8 @@ class ExplicitSolver(Solver):
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
         are `reduced` take obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
-        SelfContact acts likewise: as a stage in parts of each pass (surfaces/contact_stage.py), which keeps surfaces apart
-        whatever its stiffness, with friction in it; as a force by "force" and in scenes with reduced sets.
+        SelfContact(stage=True) acts likewise, in parts of each pass (surfaces/contact_stage.py): it keeps surfaces apart
+        whatever its stiffness, with friction in it; it needs "stage", and no reduced sets.
         In both, what is narrower than faces acts on points within them in a stage of its own, which integrates the pass
         again in as many parts as barrier and speed ask for (explicit_face_kernels.py), and then friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
@@ -99,6 +99,12 @@ class ExplicitSolver(Solver):
         self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
         if getattr(scene, "reduced", False):
             self.check_bodies(scene, contact)
+        term = scene.term(SelfContact) if hasattr(scene, "term") else None
+        if term and term.stage and (contact == "force" or scene.reduced):
+            raise ValueError(
+                f'SelfContact(stage=True) needs contact="stage" and a scene without reduced sets, got contact={contact!r}'
+                f"{' and reduced sets' if scene.reduced else ''}; leave stage out, or take an implicit solver"
+            )
         super().__init__(scene, dt, substeps, parallel, allow_unstable, check_start)
 
     def check_contact_forces(self) -> None:
@@ -189,7 +195,9 @@ class ExplicitWorkspace(Workspace):
 
     @property
     def stages_pairs(self) -> bool:
-        return bool(self.pairs) and self.solver.stages_contact and not self.scene.reduced
+        term = self.scene.term(SelfContact)
+        asked = bool(self.pairs) and (term is None or term.stage)  # obstacles alone always are
+        return asked and self.solver.stages_contact and not self.scene.reduced
 
     @property
     def has_unnoted_work(self) -> bool:
