@@ -108,10 +108,6 @@ def test_of_says_which_side_of_an_interface_is_meant(order):
     middle = frames["both"][0][np.isclose(x, 0.5), 0, 0]
     assert middle.min() > 15 and middle.max() < 45
     assert frames["one"] == pytest.approx(frames["mean"], abs=1e-12)
-    with pytest.raises(
-        ValueError, match='of= says which tetrahedra count at their vertices; it goes with at="vertices"'
-    ):
-        ds.Stress(of="soft")
     with pytest.raises(ValueError, match="no tetrahedron set is called 'hard'"):
         ds.Stress(at="vertices", of="hard").settled(scene)
 
