@@ -79,6 +79,7 @@ class Guard:
         soon = solver.explicit and (solver.starts_deformed() or pulled)
         usual = self.close if solver.automatic and solver.knows_limit else self.usual
         self._passes, self.every, self.steady = 0, self.first if soon else usual, Steady()
+        self._unseen = 0  # passes since sliding bodies were looked at
         self._seen_omega2 = 0.0
 
     def restart_with_solver(self) -> None:
@@ -143,10 +144,12 @@ class Guard:
                 balance.after(stop, num_passes, stop - first)
             self._warn_of_gained_energy(stop, num_passes)
             self._passes += stop - first
+            self._unseen += stop - first
+            if self.chatter and self._unseen >= self.usual:  # what shakes soon after an impact is none
+                self._unseen = 0
+                self.chatter.check(stop, num_passes)
             if self._passes >= self.every:
                 self._passes = 0
-                if self.chatter:
-                    self.chatter.check(stop, num_passes)
                 self._check_step(stop, num_passes)
             first = stop
             if first < last:
