@@ -381,3 +381,13 @@ def test_two_branches_are_found_from_creep():
 def test_what_does_not_fit_is_refused(build, words):
     with pytest.raises(ValueError, match=words):
         build()
+
+
+@pytest.mark.parametrize("kind", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver])
+def test_the_energy_of_a_viscous_body_on_a_floor_has_that_of_the_contact(kind):
+    mesh = ds.TetrahedralMesh.create_box(2, 0.1).translated((0, 0.005, 0))
+    law = ds.KelvinVoigt(ds.StableNeoHookean(3e4, 0.35), time=3e-4)
+    scene = ds.Scene(mesh, law, 1000.0, [ds.Gravity(), ds.Ground(stiffness=2e3, width=0.01)], precision="f64")
+    simulator = ds.Simulator(kind(scene, dt=1e-4))
+    floor = -2e3 * (0.005 - 0.01) ** 2 * np.log(0.5) * 4  # four vertices at half of the width
+    assert simulator.compute_energy().parts["contact"] == pytest.approx(floor, rel=1e-12)

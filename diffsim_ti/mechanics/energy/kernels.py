@@ -44,9 +44,10 @@ class PotentialKernels:
     def obstacles(self) -> ObstaclePotential:
         return ObstaclePotential(self.features, self.law.precision)
 
-    def _kernel(self, name: str, body, **arrays) -> Kernel:
+    def _kernel(self, name: str, body, reads_law: bool = True, **arrays) -> Kernel:
         own = dict(scene=needed(SCENE, self.features), pass_=PASS if self.features.groups else {}) | arrays
-        own |= dict(at=with_pass(arrays["at"], self.law))
+        if reads_law:
+            own |= dict(at=with_pass(arrays["at"], self.law))
         return Kernel(name, body, self.law.precision, own, NUMBERS)
 
     @ti.func
@@ -103,7 +104,8 @@ class PotentialKernels:
     @cached_property
     def barrier_energy(self) -> Kernel:
         """Energy of the barriers [J] of each vertex."""
-        return self._kernel("barrier_energy", self.barrier_energies, at=dict(u="vectors2"), out=dict(contact="scalars"))
+        arrays = dict(at=dict(u="vectors2"), out=dict(contact="scalars"))
+        return self._kernel("barrier_energy", self.barrier_energies, reads_law=False, **arrays)
 
     # ---- forces ------------------------------------------------------------------------------------------------------
 
