@@ -39,7 +39,8 @@ def loss_and_seeds(frames):
 def batch(**options) -> ds.Batch:
     terms = [ds.Gravity(-9.8), ds.Drag(0.4)]
     scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=terms, precision="f64")
-    return ds.Batch(ds.SemiImplicitSolver(scene, dt=2e-3), STEPS, B, save_every=2, **dict(gradients="all") | options)
+    solver = ds.SemiImplicitSolver(scene, dt=2e-3, substeps=1)
+    return ds.Batch(solver, STEPS, B, save_every=2, **dict(gradients="all") | options)
 
 
 def taped(batch, k=None):
