@@ -50,9 +50,10 @@ class SelfContact(Term):
     Inputs with gradient: "self_contact_stiffness", "self_contact_width", with friction "self_contact_friction_speed" and
     "self_contact_friction", of a dict shape (pairs,); or "<name>.stiffness" and so on.
     One per scene. In explicit steps it is a force, whose stiffness shortens stable steps; or with stage=True a stage that no
-    step is too large for (`contact_damping` of their solvers): what the stiffness cannot hold is lost as in an inelastic
-    impact. A pass with near pairs takes some twenty times as long then. Implicit solvers keep surfaces apart during the
-    whole motion of every step; ImplicitMidpointSolver raises Tunnelling where the end of a step lies beyond a contact.
+    step is too large for (`contact_damping` of their solvers), as it always is beside obstacles that act by pairs: what the
+    stiffness cannot hold is lost as in an inelastic impact. A pass with near pairs takes some twenty times as long then.
+    Implicit solvers keep surfaces apart during the whole motion of every step; ImplicitMidpointSolver raises Tunnelling
+    where the end of a step lies beyond a contact.
 
     Raises ValueError for stiffness, width or friction_speed <= 0, friction < 0, names that are no sets, sets of a dict that
     share a vertex, and, when a run starts, for a width beyond four mean edges of the surface, for primitives that touch at

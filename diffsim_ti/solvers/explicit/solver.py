@@ -196,7 +196,7 @@ class ExplicitWorkspace(Workspace):
     @property
     def stages_pairs(self) -> bool:
         term = self.scene.term(SelfContact)
-        asked = bool(self.pairs) and (term is None or term.stage)  # obstacles alone always are
+        asked = bool(self.pairs) and (term is None or term.stage or bool(self.pairs.obstacles))  # which always are
         return asked and self.solver.stages_contact and not self.scene.reduced
 
     @property

@@ -65,6 +65,7 @@ class Sphere(Obstacle):
 
     @property
     def all_primitives(self):
+        """Its centre, unless bodies are inside it."""
         return None if self.inside else BALL
 
     def distance(self, positions):
