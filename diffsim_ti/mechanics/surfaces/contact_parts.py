@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from diffsim_ti.mechanics.surfaces import host_geometry as geometry
 from diffsim_ti.mechanics.surfaces.host_geometry import TINY, dot
@@ -156,6 +155,7 @@ class PartSolver:
     @staticmethod
     def inverse(J, K: np.ndarray):
         """x to (1 + J^T K J)^-1 x."""
+        from scipy.linalg import cho_factor, cho_solve
         from scipy.sparse import diags
         from scipy.sparse.linalg import splu
 
