@@ -86,7 +86,7 @@ def study_growth(scenes: dict, duration: float, share: float = 0.1, frames: int 
     for name, scene in scenes.items():
         dt = share * stable_dt(scene).dt
         steps = int(np.ceil(duration / dt))
-        out[name] = growth(VelocityVerletSolver(scene, dt=duration / steps), steps, min(frames, steps))
+        out[name] = growth(VelocityVerletSolver(scene, dt=duration / steps, substeps=1), steps, min(frames, steps))
     return out
 
 

@@ -45,7 +45,7 @@ def judge(scene: Scene, kind: type[Solver], dt: float, steps: int = 200, overrid
     try:
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            simulator = Simulator(kind(scene, dt=dt, **options))
+            simulator = Simulator(kind(scene, dt=dt, substeps=1, **options))
             first, moving, kept, _ = measure(simulator)
             rise, change, behind, most = 0.0, 0.0, 0.0, 0.0
             for _ in range(20):
