@@ -5,6 +5,16 @@ Of a product of parameters a mark would leave out a whole row or column. Ids are
 
 # what proves the same -> tests
 LEFT_OUT = {
+    "distances, forces and gradients of meshes in `test_mesh_obstacle.py`": """
+        test_contact_gradients::test_every_input[mesh]
+        test_contact::test_distance_and_force[mesh]
+    """,
+    "transposes of the same; other places, laws and curves": """
+        test_curved_contact::test_gradients_agree_with_differences[BDF2Solver]
+        test_far_from_origin::test_it_does_not_matter_where_a_scene_is[SemiImplicitSolver-far]
+        test_identify_experiments::test_a_force_curve_tells_two_numbers_of_a_law
+        test_open_laws::test_everything_follows_from_the_energy[tissue-f64-lanes]
+    """,
     "the same in f64, and its other solvers and places": """
         test_contact_faces::test_the_adjoint_is_the_transpose_of_the_tangent[thin box-SemiImplicitSolver-f32-options3]
         test_curved_contact::test_the_adjoint_is_the_transpose_of_the_tangent[VelocityVerletSolver-capsule-options1-f32]
@@ -91,8 +101,6 @@ LEFT_OUT = {
     "rigid ones": """
         test_reduced_explicit::test_all_threads_do_what_one_does[affine]
         test_reduced_explicit::test_self_contact_pushes_a_body[affine]
-    """,
-    "capsules; transposes and impacts before a mesh": """
     """,
     "obstacles as forces, backward Euler": """
         test_contact_area::test_equal_areas_are_equal_stiffnesses[SemiImplicitSolver]

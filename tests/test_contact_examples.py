@@ -16,7 +16,7 @@ def test_incline(capsys):
 def test_bounce_gradients(capsys, tmp_path):
     """Soft balls: the stage's gradients are good at the longest steps of the body, and get better with shorter ones."""
     cases = [("balls", 2e-3), ("blocks", 0.01)]
-    found = example("contact/bounce_gradients").main(tmp_path, starts=2, finest=1 / 8, cases=cases)
+    found = example("contact/bounce_gradients").main(tmp_path, starts=2, finest=1 / 8, cases=cases, shares=(0.8, 0.1))
     errors, edges = found.values()
     default = errors["stage, default"]
     assert edges["stage, default"].max() < 0.01  # sharp edges, and the width that obstacles have by default

@@ -88,13 +88,13 @@ def gradient(scene: ds.Scene, substep: float, options: dict) -> tuple[float, boo
     return float(found), not frames.contact_resolution.resolved
 
 
-def errors_of(body: str, width: float, starts: int, finest: float) -> dict:
-    """{kind: (median errors, runs that failed, that warned), one for each of SHARES}"""
+def errors_of(body: str, width: float, starts: int, finest: float, shares: tuple) -> dict:
+    """{kind: (median errors, runs that failed, that warned), one for each of the shares}"""
     scenes, found = [thrown_scene(k, body, width) for k in range(starts)], {}
     steps = limits(scenes)
     right = np.array([gradient(s, finest * h, dict(contact_damping=0.0))[0] for s, h in zip(scenes, steps)])
     for kind, options in KINDS.items():
-        runs = np.array([[gradient(s, x * h, options) for s, h in zip(scenes, steps)] for x in SHARES])
+        runs = np.array([[gradient(s, x * h, options) for s, h in zip(scenes, steps)] for x in shares])
         values, warned = runs[..., 0], runs[..., 1] > 0
         failed = np.isnan(values)
         off = np.where(failed, np.inf, np.abs(values / right - 1))
@@ -102,19 +102,25 @@ def errors_of(body: str, width: float, starts: int, finest: float) -> dict:
     return found
 
 
-def main(chart_folder: str | None = None, starts: int = 20, finest: float = 1 / 32, cases: tuple | None = None) -> dict:
-    """Returns {(body, width): {kind: median errors, by SHARES}}; a run that fails counts as infinitely wrong."""
+def main(
+    chart_folder: str | None = None,
+    starts: int = 20,
+    finest: float = 1 / 32,
+    cases: tuple | None = None,
+    shares: tuple = SHARES,
+) -> dict:
+    """Returns {(body, width): {kind: median errors, by shares}}; a run that fails counts as infinitely wrong."""
     results = {}
     print(
         f"| median error of {starts} throws, substep over the body's limit | "
-        + " | ".join(f"{x:g}" for x in SHARES)
+        + " | ".join(f"{x:g}" for x in shares)
         + " |"
     )
-    print("| --- |" + " ---: |" * len(SHARES))
+    print("| --- |" + " ---: |" * len(shares))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of substeps that are too long; they are counted
         for body, width in cases or [(body, width) for body in BODIES for width in WIDTHS]:
-            found = errors_of(body, width, starts, finest)
+            found = errors_of(body, width, starts, finest, shares)
             results[body, width] = {kind: medians for kind, (medians, _, _) in found.items()}
             for kind, (medians, failed, warned) in found.items():
                 cells = [f"{100 * x:.2g} %" if np.isfinite(x) else "-" for x in medians]
@@ -124,11 +130,11 @@ def main(chart_folder: str | None = None, starts: int = 20, finest: float = 1 / 
                 ]
                 print(f"| {body}, {1e3 * width:g} mm: {kind} | " + " | ".join(cells) + " |", flush=True)
     if chart_folder:
-        save_chart(Path(chart_folder) / "bounce_gradients.png", results)
+        save_chart(Path(chart_folder) / "bounce_gradients.png", results, shares)
     return results
 
 
-def save_chart(path: Path, results: dict) -> None:
+def save_chart(path: Path, results: dict, shares: tuple) -> None:
     """Median errors against the substep, a panel for each body and width."""
     from matplotlib.figure import Figure
 
@@ -137,11 +143,11 @@ def save_chart(path: Path, results: dict) -> None:
     for axes, ((body, width), errors) in zip(panels, results.items()):
         for kind, values in errors.items():
             seen = np.isfinite(values)
-            axes.loglog(np.array(SHARES)[seen], 100 * values[seen], "o-", label=kind, lw=1.2, ms=4)
+            axes.loglog(np.array(shares)[seen], 100 * values[seen], "o-", label=kind, lw=1.2, ms=4)
         axes.axhline(2, color="0.7", lw=1)
         axes.set_title(f"{body}, a barrier of {1e3 * width:g} mm", loc="left", fontsize=10)
         axes.set_xlabel("substep over the body's limit")
-        axes.set_xticks(SHARES, [f"{x:g}" for x in SHARES])
+        axes.set_xticks(shares, [f"{x:g}" for x in shares])
         axes.minorticks_off()
     panels[0].set_ylabel("median error of the gradient [%]")
     panels[-1].legend(frameon=False, fontsize=8, loc="lower right")
