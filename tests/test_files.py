@@ -130,6 +130,39 @@ def test_numbers_of_cells_by_any_name(tmp_path):
     assert sets(cell_ids=TAGS) == sets(number=np.arange(12)) == sets(stress=np.linspace(0, 1, 12)) == {}
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("suffix", ["msh", "inp"])
+def test_numbers_and_order_of_nodes_do_not_matter(tmp_path, suffix, seed):
+    """Nodes are listed in any order, with any numbers."""
+    rng = np.random.default_rng(seed)
+    number, listed = rng.choice(10**6, len(P), replace=False) + 1, rng.permutation(len(P))
+    between = ", " if suffix == "inp" else " "
+    nodes = "".join(between.join(map(str, [number[k], *P[k].tolist()])) + "\n" for k in listed)
+    first = dict(msh="4 2 7 7 ", inp="")[suffix]
+    cells = "".join(f"{k}{between}{first}" + between.join(map(str, number[t])) + "\n" for k, t in enumerate(T, 5))
+    heads = dict(
+        msh=f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n{len(P)}\n{nodes}$EndNodes\n"
+        f"$Elements\n{len(T)}\n{cells}$EndElements\n",
+        inp=f"*NODE\n{nodes}*ELEMENT, TYPE=C3D4\n{cells}",
+    )
+    path = tmp_path / f"any.{suffix}"
+    path.write_text(heads[suffix])
+    mesh = silent(path)
+    np.testing.assert_array_equal(mesh.vertices[mesh.tetrahedra], P[T])
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_ten_nodes_of_tetgen(tmp_path, first):
+    """As TetGen numbers them: each mid-edge vertex lies in the middle of its edge."""
+    tetgen = pytest.importorskip("tetgen")
+    X, cells = tetgen.TetGen(P, BAR.surface_triangles.astype(np.int32)).tetrahedralize(order=2, nobisect=True)[:2]
+    path = tmp_path / "ten.ele"
+    path.with_suffix(".node").write_text(f"{len(X)} 3 0 0\n" + mesh_files.numbered(np.asarray(X).tolist(), first))
+    path.write_text(f"{len(cells)} 10 0\n" + mesh_files.numbered((np.asarray(cells) + first).tolist(), first))
+    mesh = silent(path)
+    assert mesh.order == 2 and not mesh.curved.any() and mesh.volume == pytest.approx(BAR.volume)
+
+
 # ---- Abaqus ------------------------------------------------------------------------------------------------------------
 
 
@@ -340,6 +373,10 @@ def test_the_command_checks_and_mends(tmp_path, capsys):
     assert silent(out).volume == pytest.approx(BAR.volume)
     found, _ = read_mesh(path)
     assert not findings(mended(found))
+    path.write_text(re.sub(r"0\.10*1?\b", "nan", text, count=1))
+    with pytest.raises(SystemExit):
+        app.main(["check", str(path)])
+    assert "1 vertex has coordinates that are not finite" in capsys.readouterr().out
 
 
 def test_sets_that_are_empty_are_refused_where_they_are_used():

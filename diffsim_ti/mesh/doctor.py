@@ -46,6 +46,10 @@ def findings(parts: tuple) -> Findings:
     constructor of a mesh refuses."""
     vertices, elements, vertex_sets, tetrahedron_sets, triangles = parts
     corners, out = elements[:, :4], []
+    if not np.all(np.isfinite(vertices)):
+        bad = int((~np.isfinite(vertices)).any(1).sum())
+        what = f"{counted(bad, 'vertex has', 'vertices have')} coordinates that are not finite"
+        return Findings([Finding(what, "export the file again")])
     volumes = signed_volumes(edge_matrices(vertices, corners))
     size = float(np.ptp(vertices[np.unique(corners)], 0).max())
     turned, repeated = int((volumes < 0).sum()), len(corners) - len(np.unique(np.sort(corners, 1), axis=0))

@@ -217,17 +217,17 @@ class PartSolver:
             at.P = self.pushes(part, of, at, at.end)[0]
         at.pressed = at.B.T @ (at.P[:, None] * at.n)
         at.delta = at.h * of.inverse[:, None] * near.freed(at.pressed)
-        at.rubbed = self._rub(part, of, at) if of.rough else 0 * at.delta
+        at.friction = self._friction(part, of, at) if of.rough else 0 * at.delta
         blend = 0.5 * (1 + part.c)
-        at.w_drift = part.b + blend * at.delta + at.rubbed
-        return part.e + at.alpha * at.w_drift, part.b + at.delta + at.rubbed
+        at.w_drift = part.b + blend * at.delta + at.friction
+        return part.e + at.alpha * at.w_drift, part.b + at.delta + at.friction
 
     def impulses(self, at, own: np.ndarray, of) -> tuple[np.ndarray, np.ndarray]:
         """What some pairs gave the nodes in a part that was taken [N s], by push and by friction."""
         B = at.B[np.flatnonzero(own)]
         pushed = at.h * (B.T @ (at.P[own, None] * at.n[own]))
-        rubbed = B.T @ at.impulse[own] if of.rough else 0 * pushed
-        return self.near.freed(pushed), self.near.freed(rubbed)
+        by_friction = B.T @ at.impulse[own] if of.rough else 0 * pushed
+        return self.near.freed(pushed), self.near.freed(by_friction)
 
     def _follow(self, part: Part, of, at) -> None:
         real = SimpleNamespace(**{k: x.real if isinstance(x, np.ndarray) else x for k, x in vars(at).items()})
@@ -250,7 +250,7 @@ class PartSolver:
         at.zeta = base + 1j * change
         residual(at.zeta)
 
-    def _rub(self, part: Part, of, at) -> np.ndarray:
+    def _friction(self, part: Part, of, at) -> np.ndarray:
         """What friction adds to velocities."""
         near = self.near
         at.V = of.motion / of.alpha + part.b
@@ -265,8 +265,8 @@ class PartSolver:
         at.bound = at.h * (at.sizes @ (of.inverse * at.S))
         at.kappa, at.share_of_mu, at.ratio, at.slip = slip(at.s, at.bound, of.speed, TINY, ARRAYS)
         at.impulse = (-at.h * at.load * at.kappa)[:, None] * at.t
-        at.rub_sum = at.B.T @ at.impulse
-        return of.inverse[:, None] * near.freed(at.rub_sum)
+        at.friction_sum = at.B.T @ at.impulse
+        return of.inverse[:, None] * near.freed(at.friction_sum)
 
     # ---- adjoint -------------------------------------------------------------------------------------------------------
 
@@ -277,13 +277,13 @@ class PartSolver:
         blend, inverse = 0.5 * (1 + part.c), of.inverse[:, None]
         by_alpha = (e_adj * at.w_drift).sum()
         e_prev, b_prev = e_adj.copy(), b_adj + at.alpha * e_adj
-        delta_adj, rub_adj = b_adj + at.alpha * blend * e_adj, b_adj + at.alpha * e_adj
+        delta_adj, friction_adj = b_adj + at.alpha * blend * e_adj, b_adj + at.alpha * e_adj
         by = SimpleNamespace(
             w=np.zeros_like(at.w), n=np.zeros_like(at.n), d=0 * at.d, P=0 * at.d, m=0 * at.d, motion=0 * at.X
         )
         at_corners = lambda nodes: near.points(nodes)[near.corners]  # noqa: E731
         if of.rough:
-            b_prev += self._rub_back(of, at, rub_adj, by, adj, at_corners)
+            b_prev += self._friction_vjp(of, at, friction_adj, by, adj, at_corners)
         # delta
         freed = near.freed(delta_adj)
         pulled = at.h * inverse * freed
@@ -336,16 +336,16 @@ class PartSolver:
         adj.alpha += part.share * by_alpha
         return e_prev + X_adj, b_prev + at.alpha * f_adj
 
-    def _rub_back(self, of, at, rub_adj, by, adj, at_corners) -> np.ndarray:
+    def _friction_vjp(self, of, at, friction_adj, by, adj, at_corners) -> np.ndarray:
         """Adjoint of b by friction."""
         near, inverse = self.near, of.inverse[:, None]
-        freed = near.freed(rub_adj)
+        freed = near.freed(friction_adj)
         pulled = inverse * freed
-        adj.inverse += dot(freed, at.rub_sum)
+        adj.inverse += dot(freed, at.friction_sum)
         r_adj = at.B @ pulled
         by.w += np.einsum("pd,pkd->pk", at.impulse, at_corners(pulled))
-        for own, _, rubbed in of.seeds:
-            q = near.freed(rubbed)
+        for own, _, by_friction in of.seeds:
+            q = near.freed(by_friction)
             r_adj = r_adj + own[:, None] * (at.B @ q)
             by.w += own[:, None] * np.einsum("pd,pkd->pk", at.impulse, at_corners(q))
         e = at.t / np.maximum(at.s, TINY)[:, None]

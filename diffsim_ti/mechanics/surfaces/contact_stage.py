@@ -221,7 +221,7 @@ class PairContact(Stage):
         return out
 
     def _mark_done(self, near: np.ndarray) -> None:
-        """The stage has looked after these: `check_pass` need not."""
+        """The stage has checked these pairs: `check_pass` need not."""
         plane = whole(self.inner.plane)
         plane[near, 3] = 1e30
         if runtime.view(self.inner.plane) is None:
@@ -265,9 +265,9 @@ class PairContact(Stage):
         half = 0.5 * D / W
         share = np.where(half.real < 1, half, 1)
         inverse = np.where(inverse_mass[nodes] > 0, 1 / np.where(mass[nodes] > 0, mass[nodes], 1), 0)
-        mu, rubs = np.zeros(len(one.pairs), numbers.dtype), own.mu >= 0
-        mu[rubs] = numbers[own.mu[rubs]]
-        speed = np.where(rubs, numbers[own.speed], 1.0)
+        mu, with_friction = np.zeros(len(one.pairs), numbers.dtype), own.mu >= 0
+        mu[with_friction] = numbers[own.mu[with_friction]]
+        speed = np.where(with_friction, numbers[own.speed], 1.0)
         return SimpleNamespace(
             x=rest[nodes] + start, motion=end - start, inverse=inverse, h=now.h, alpha=h_alpha, stiffness=k / share,
             width=share * W, mu=mu, speed=speed, wall=mass[self.a.mesh.surface_vertices].mean(), rough=self.rough,
@@ -469,9 +469,9 @@ class PairContact(Stage):
             at_corners = (by_D[:, None] * weights)[:, :, None] * plane[:, None, :3]
             np.add.at(self.by_fine_rest, one.pairs, at_corners)
         if self.rough:
-            rubs = numbers.mu >= 0
-            np.add.at(self.by_numbers, numbers.speed[rubs], adj.speed[rubs])
-            np.add.at(self.by_numbers, numbers.mu[rubs], adj.mu[rubs])
+            with_friction = numbers.mu >= 0
+            np.add.at(self.by_numbers, numbers.speed[with_friction], adj.speed[with_friction])
+            np.add.at(self.by_numbers, numbers.mu[with_friction], adj.mu[with_friction])
 
     def clear(self) -> None:
         a, path = self.a, self.a.rows.get("path")

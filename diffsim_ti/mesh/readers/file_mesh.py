@@ -1,11 +1,11 @@
 """What a file holds of a mesh, and what of it goes into a TetrahedralMesh."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from diffsim_ti.mesh.geometry import sorted_faces
+from diffsim_ti.mesh.sets import places_of_triangles
 
 DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle": 2, "triangle6": 2, "tetra": 3, "tetra10": 3}
 THIN = ("quad", "line4", "line5", "line6", "triangle7", "triangle10", "triangle15", "polygon")  # beginnings of kinds
@@ -131,23 +131,14 @@ def _left_over(mesh: FileMesh, tetrahedra: np.ndarray, triangles: dict) -> list[
     faces, order, same = sorted_faces(tetrahedra[:, :4], len(mesh.points))
     inner = np.zeros(len(order), bool)
     inner[order[:-1][same]] = inner[order[1:][same]] = True
-    keys = {what: _keys(np.asarray(rows), len(mesh.points)) for what, rows in (("all", faces), ("inner", faces[inner]))}
-    out, alone = [], ~np.isin(_keys(own, len(mesh.points)), keys["all"])
+    out, alone = [], places_of_triangles(own, faces) < 0
     if alone.any():
         out.append(f"{alone.sum()} triangles that are no faces of tetrahedra")
-    within = {n: int(np.isin(_keys(rows, len(mesh.points)), keys["inner"]).sum()) for n, rows in triangles.items()}
+    within = {n: int((places_of_triangles(rows, faces[inner]) >= 0).sum()) for n, rows in triangles.items()}
     named = ", ".join(f"{name} ({count})" for name, count in within.items() if count)
     if named:
         out.append(f"triangles within the body, of which vertex sets keep the vertices: {named}")
     return out
-
-
-def _keys(triangles: np.ndarray, count: int) -> np.ndarray:
-    """A number for each triangle, whatever the order of its corners."""
-    a, b, c = np.sort(triangles, 1).T.astype(np.int64)
-    if count < 2**21:
-        return (a * count + b) * count + c
-    return np.ascontiguousarray(np.stack([a, b, c], 1)).view([("", np.int64)] * 3).ravel()
 
 
 def _merge_repeated(tetrahedra: np.ndarray, sets: dict) -> tuple[np.ndarray, dict]:
@@ -163,13 +154,3 @@ def _merge_repeated(tetrahedra: np.ndarray, sets: dict) -> tuple[np.ndarray, dic
     keep = np.sort(first)
     new = np.searchsorted(keep, first[inverse.ravel()])
     return tetrahedra[keep], {name: np.unique(new[rows]) for name, rows in sets.items()}
-
-
-def blocks_of(kinds: Iterable, cells: Iterable) -> tuple[list[tuple[str, np.ndarray]], list[np.ndarray]]:
-    """(blocks of one kind each, the positions of their cells in the file) from a kind and nodes for each cell."""
-    kinds, cells = list(kinds), list(cells)
-    places: dict[str, list[int]] = {}
-    for at, kind in enumerate(kinds):
-        places.setdefault(kind, []).append(at)
-    blocks = [(kind, np.array([cells[k] for k in own], np.int64)) for kind, own in places.items()]
-    return blocks, [np.array(own) for own in places.values()]
