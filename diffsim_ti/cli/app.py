@@ -18,6 +18,7 @@ from diffsim_ti.cli import study, view
 from diffsim_ti.cli.check import check
 from diffsim_ti.cli.config import write_options
 from diffsim_ti.cli.identify import identify
+from diffsim_ti.cli.selftest import selftest
 from diffsim_ti.cli.sweep import sweep
 from diffsim_ti.common import interrupts
 from diffsim_ti.common.progress import LOG
@@ -50,6 +51,7 @@ for command in (
     view.view,
     identify,
     check,
+    selftest,
 ):
     app.command()(command)
 
