@@ -4,7 +4,7 @@
 
 FOLDER is what make.py wrote. Needs pip install ".[docs]" and a Chromium, of the system or of playwright. Each page is opened
 at the width of a desk and of a phone: it must not be wider than the screen, its pictures must show, it may ask no other
-server for anything, and no script may fail. --pictures: screenshots of some pages go there. Exit code 1 if anything is wrong.
+server for anything, and no script may fail, or the exit code is 1. --pictures: screenshots of some pages go there.
 """
 
 import argparse
@@ -110,7 +110,9 @@ def main() -> int:
         for screen, (width, height, scheme) in SCREENS.items():
             page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
             page.on("pageerror", lambda error, page=page: visit.wrong.append(f"{page.url}: {error}"))
-            page.on("request", lambda r: r.url.startswith((root, "data:", "blob:")) or visit.wrong.append(f"asks {r.url}"))
+            page.on(
+                "request", lambda r: r.url.startswith((root, "data:", "blob:")) or visit.wrong.append(f"asks {r.url}")
+            )
             visit.open_all(page, root, screen)
             if screen == "desk":
                 for words, expected in WORDS.items():

@@ -20,7 +20,11 @@ def legible(docstring: str) -> str:
 def _text(words: str) -> str:
     parts = re.split(r"(`[^`\n]*`|^ {4,}.*$)", words, flags=re.MULTILINE)  # code and formulas stay as they are
     words = "".join(part if k % 2 else re.sub(r"<(?=\w)", "&lt;", part) for k, part in enumerate(parts))
-    words = re.sub(r"(?<=\w)\*(?=\w)|(?<= )\*(?= )|(?<=[\w\]])_(?=[\w\[])", r"\\\g<0>", words) if "`" not in words else words
+    words = (
+        re.sub(r"(?<=\w)\*(?=\w)|(?<= )\*(?= )|(?<=[\w\]])_(?=[\w\[])", r"\\\g<0>", words)
+        if "`" not in words
+        else words
+    )
     return ARGUMENT.sub("  \n", words)
 
 

@@ -1,7 +1,7 @@
 """The site, of guides, gallery, reference and pages for whoever carries it on, by mkdocs: needs pip install ".[docs]".
 
-    python assets/reference/make.py [FOLDER]           # default html beside it, which git ignores
-    python assets/reference/make.py --serve [FOLDER]   # also serves it, since the search needs a server
+python assets/reference/make.py [FOLDER]           # default html beside it, which git ignores
+python assets/reference/make.py --serve [FOLDER]   # also serves it, since the search needs a server
 """
 
 import functools
@@ -55,7 +55,9 @@ REFERENCE = {
     "Errors and reports": ("", ""),  # of all other folders
 }
 # guides in the order in which they are read; others follow
-GUIDES = "first_steps meshes materials loads_and_supports contact_and_friction solvers_and_steps gradients identify design "
+GUIDES = (
+    "first_steps meshes materials loads_and_supports contact_and_friction solvers_and_steps gradients identify design "
+)
 GUIDES += "batches_and_cards results_and_pictures extend units_and_limits coming_from_others"
 BOOST = {"examples": 3, "README": 2, "tests": 0.5, "CHANGELOG": 0.3}  # how much of it the search counts; else 1
 PAGES = {
