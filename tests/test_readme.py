@@ -2,18 +2,26 @@
 
 import contextlib
 import io
+import os
 import re
 import shlex
+import sys
 from itertools import dropwhile
 from pathlib import Path
 
 import areas
+import nbclient
+import nbformat
 import pytest
 import typer
 
 from diffsim_ti.cli.app import app
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "examples"))
+
+import notebooks  # noqa: E402
+
 GUIDES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "examples/guides").glob("*.md"))
 PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "examples/README.md", "tests/README.md", *GUIDES)}
 BLOCKS = [
@@ -57,11 +65,24 @@ def test_code_block_runs_and_prints_what_is_shown(code, printed, tmp_path, monke
     assert len(got.splitlines()) >= len(printed.splitlines())
 
 
-@pytest.mark.parametrize("page", GUIDES)
+@pytest.mark.parametrize("page", ["README.md", *GUIDES])
+def test_pages_are_short(page):
+    assert len(PAGES[page].splitlines()) <= (150 if page in GUIDES else 180)
+
+
+@pytest.mark.parametrize("name", notebooks.NOTEBOOKS)
+def test_a_notebook_of_a_guide_runs(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
+    path = next(path for path in notebooks.main(tmp_path) if path.stem == name)
+    shown = nbformat.read(path, as_version=4)
+    nbclient.NotebookClient(shown, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert any(cell.get("outputs") for cell in shown.cells)
+
+
+@pytest.mark.parametrize("page", [page for page in GUIDES if Path(page).stem not in notebooks.NOTEBOOKS])
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_guide_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert len(PAGES[page].splitlines()) <= 150
     run("\n".join(re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL)))
 
 
