@@ -1,13 +1,14 @@
-"""The pictures and films of the examples, as assets/pictures/gallery_<example>.png or .gif.
+"""The pictures and films of the examples, as assets/pictures/gallery_<example>.png or .gif, and of the guides, as guide_<guide>.png.
 
-Each example runs by the command that examples/README.md shows, in a process and a folder of its own; pictures are then
-made small enough for a repository. `--list` prints the commands.
+Each example runs by the command that the pages show, in a process and a folder of its own, and so do a guide's code
+blocks, one after the other; pictures are then made small enough for a repository. `--list` prints the commands.
 
     python examples/gallery.py [--only NAME] [--folder assets/pictures] [--list]
 """
 
 import argparse
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -49,6 +50,7 @@ EXAMPLES = {
     "benchmarks/cantilever": ("--quick output", "cantilever.png"),
     "benchmarks/cooks_membrane": ("--quick output", "cooks_membrane.png"),
 }
+GUIDES = {f"guides/{path.stem}": path for path in sorted((HERE / "guides").glob("*.md")) if "/guide_" in path.read_text()}
 TORCHRUN = {"identify/train_distributed": "--nproc_per_node=2"}  # examples of several processes
 
 
@@ -58,23 +60,32 @@ def command(name: str) -> str:
     return f"{start} examples/{name}.py {EXAMPLES[name][0]}".strip()
 
 
+def code(guide: str) -> str:
+    """The code blocks of a guide's text as one script."""
+    return "\n".join(re.findall(r"```python\n(.*?)```", guide, re.DOTALL))
+
+
 def make(name: str, folder: Path) -> Path:
-    """Run an example and keep its picture, made small; RuntimeError with what it said if there is none."""
-    arguments, made = EXAMPLES[name]
+    """Run an example or a guide and keep its picture, made small; RuntimeError with what it said if there is none."""
+    stem, is_guide = Path(name).name, name in GUIDES
+    arguments, made = ("", f"{stem}.png") if is_guide else EXAMPLES[name]
     with tempfile.TemporaryDirectory() as temporary:
+        script = Path(temporary) / "guide.py" if is_guide else HERE / f"{name}.py"
+        if is_guide:
+            script.write_text(code(GUIDES[name].read_text()))
         paths = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")])
         start = ["-m", "torch.distributed.run", "--standalone", *TORCHRUN[name].split()] if name in TORCHRUN else []
         done = subprocess.run(
-            [sys.executable, *start, HERE / f"{name}.py", *arguments.split()],
+            [sys.executable, *start, script, *arguments.split()],
             cwd=temporary,
             text=True,
             capture_output=True,
             env=os.environ | {"PYTHONPATH": paths},
         )
-        made = Path(temporary) / "output" / made
+        made = Path(temporary) / ("" if is_guide else "output") / made
         if done.returncode or not made.exists():
             raise RuntimeError(f"{name}: saved no picture (exit status {done.returncode})\n{done.stderr[-2000:]}")
-        out = folder / f"gallery_{Path(name).name}{made.suffix}"
+        out = folder / f"{'guide' if is_guide else 'gallery'}_{stem}{made.suffix}"
         (shrink_film if made.suffix == ".gif" else shrink_picture)(made, out)
     return out
 
@@ -110,12 +121,13 @@ def shrink_film(source: Path, target: Path) -> None:
 
 
 def main(only: str | None = None, folder=PICTURES) -> dict:
-    """{example: its picture's path}; ValueError for an example that saves no picture."""
-    if only is not None and only not in EXAMPLES:
-        raise ValueError(f"--only: must be one of {', '.join(EXAMPLES)}, got {only!r}")
+    """{example or guide: its picture's path}; ValueError for one that saves no picture."""
+    names = [*EXAMPLES, *GUIDES]
+    if only is not None and only not in names:
+        raise ValueError(f"--only: must be one of {', '.join(names)}, got {only!r}")
     folder, out = Path(folder), {}
     folder.mkdir(parents=True, exist_ok=True)
-    for name in [only] if only else EXAMPLES:
+    for name in [only] if only else names:
         start = time.perf_counter()
         out[name] = make(name, folder)
         size = out[name].stat().st_size
@@ -125,7 +137,7 @@ def main(only: str | None = None, folder=PICTURES) -> dict:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", metavar="NAME", help="make this one: " + ", ".join(EXAMPLES))
+    parser.add_argument("--only", metavar="NAME", help="make this one: " + ", ".join([*EXAMPLES, *GUIDES]))
     parser.add_argument("--folder", default=PICTURES, help="where pictures go")
     parser.add_argument("--list", action="store_true", help="print the commands that make them")
     options = parser.parse_args()

@@ -37,8 +37,8 @@ def test_every_picture_is_there_small_and_not_blank(gallery):
             assert len(frames) >= 20 and np.abs(frames[0] - frames[-1]).max(-1).mean() > 1, path.name  # it moves
 
 
-def test_readme_shows_each_with_its_command(gallery):
-    readme = (ROOT / "examples" / "README.md").read_text()
+def test_pages_show_each_with_its_command(gallery):
+    readme = "".join((ROOT / "examples" / page).read_text() for page in ("README.md", "benchmarks/README.md"))
     shown = set(re.findall(r"assets/pictures/(gallery_\w+\.\w+)", readme))
     assert shown == {p.name for p in pictures()}
     for name in gallery.EXAMPLES:

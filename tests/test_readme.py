@@ -14,7 +14,9 @@ import nbclient
 import nbformat
 import pytest
 import typer
+from PIL import Image
 
+import diffsim_ti as ds
 from diffsim_ti.cli.app import app
 
 ROOT = Path(__file__).parent.parent
@@ -23,67 +25,106 @@ sys.path.insert(0, str(ROOT / "examples"))
 import notebooks  # noqa: E402
 
 GUIDES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "examples/guides").glob("*.md"))
-PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "examples/README.md", "tests/README.md", *GUIDES)}
+PLAIN = "README.md", "examples/README.md", "examples/benchmarks/README.md", "tests/README.md"
+PAGES = {name: (ROOT / name).read_text() for name in (*PLAIN, *GUIDES)}
+
+
+def blocks(text: str) -> list[tuple[str, str]]:
+    """(code, what it prints or nothing) of each Python block of a page."""
+    return re.findall(r"```python\n(.*?)```(?:\s*```text\n(.*?)```)?", text, re.DOTALL)
+
+
 BLOCKS = [
     pytest.param(*block, id=f"{page.removesuffix('README.md')}block{k}")
-    for page, text in PAGES.items()
-    if page not in GUIDES
-    for k, block in enumerate(re.findall(r"```python\n(.*?)```(?:\s*```text\n(.*?)```)?", text, re.DOTALL))
+    for page in PLAIN
+    for k, block in enumerate(blocks(PAGES[page]))
 ]
 
 
-def numbers(text: str) -> list[float]:
-    return [float(x) for x in re.findall(r"-?\d+\.?\d*(?:e[+-]?\d+)?", text)]
+def numbers(text: str) -> list[tuple[float, float]]:
+    """(a number, one in its last digit behind the point) for all of a text."""
+    found = re.findall(r"(-?\d+\.?(\d*)(?:e([+-]?\d+))?)", text)
+    return [(float(x), 10.0 ** (int(power or 0) - len(digits)) if digits else 0.0) for x, digits, power in found]
 
 
 def run(code: str) -> str:
-    code = code.replace('ds.init(precision="f64")', 'ds.runtime.set_precision("f64")')  # the session has its runtime
+    """What a script prints. The session has its runtime: ds.init chooses the precision alone, which is float32 without."""
     path = ROOT / "tests" / f"_readme_{abs(hash(code))}.py"
     path.write_text(code)  # Taichi reads kernels from their file
     out = io.StringIO()
+    init, ds.init = ds.init, lambda backend="cpu", precision="f32": ds.runtime.set_precision(precision)
+    ds.runtime.set_precision("f32")
     try:
         with contextlib.redirect_stdout(out):
             exec(compile(code, str(path), "exec"), {"__name__": "readme"})
     finally:
+        ds.init = init
+        ds.runtime.set_precision("f64")
         path.unlink()
     return out.getvalue()
+
+
+def compare(got: str, printed: str) -> None:
+    """The numbers of what was printed, line by line, with those that a page shows; some at the end may be left out."""
+    for line, expected in zip(got.splitlines(), printed.splitlines()):
+        a, b = numbers(line), numbers(expected)
+        assert len(a) == len(b), (line, expected)
+        if "right" in expected:  # a row of check_gradients: the error itself is round-off
+            a, b = a[:2], b[:2]
+        for (x, _), (y, digit) in zip(a, b):  # what is rounded may be rounded the other way
+            assert x == pytest.approx(y, rel=2e-5, abs=1.01 * digit), (line, expected)
+    assert len(got.splitlines()) >= len(printed.splitlines())
 
 
 @pytest.mark.parametrize("code, printed", BLOCKS)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_code_block_runs_and_prints_what_is_shown(code, printed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    got = run(code)
-    if not printed:
-        return
-    for line, expected in zip(got.splitlines(), printed.splitlines()):
-        a, b = numbers(line), numbers(expected)
-        assert len(a) == len(b), (line, expected)
-        if "right" in expected:  # a row of check_gradients: the error itself is round-off
-            a, b = a[:2], b[:2]
-        assert a == pytest.approx(b, rel=2e-5), (line, expected)
-    assert len(got.splitlines()) >= len(printed.splitlines())
+    compare(run(code), printed)
 
 
-@pytest.mark.parametrize("page", ["README.md", *GUIDES])
-def test_pages_are_short(page):
-    assert len(PAGES[page].splitlines()) <= (150 if page in GUIDES else 180)
+def as_a_notebook(page: str, folder: Path) -> list[str]:
+    """What each cell of code of a guide prints, as a notebook in a process of its own."""
+    made = notebooks.notebook(ROOT / page, folder)
+    client = nbclient.NotebookClient(made, timeout=300, resources={"metadata": {"path": str(folder)}})
+    cells = [cell for cell in client.execute().cells if cell.cell_type == "code"]
+    return ["".join(out.get("text", "") for out in cell.outputs if out.get("name") == "stdout") for cell in cells]
 
 
-@pytest.mark.parametrize("name", notebooks.NOTEBOOKS)
-def test_a_notebook_of_a_guide_runs(name, tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
-    path = next(path for path in notebooks.main(tmp_path) if path.stem == name)
-    shown = nbformat.read(path, as_version=4)
-    nbclient.NotebookClient(shown, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    assert any(cell.get("outputs") for cell in shown.cells)
-
-
-@pytest.mark.parametrize("page", [page for page in GUIDES if Path(page).stem not in notebooks.NOTEBOOKS])
+@pytest.mark.parametrize("page", GUIDES)
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_guide_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
+def test_a_guide_runs_from_top_to_bottom_and_prints_what_is_shown(page, tmp_path, monkeypatch):
+    """Its blocks share one namespace; the picture that it shows is one that it makes. Five run as notebooks."""
     monkeypatch.chdir(tmp_path)
-    run("\n".join(re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL)))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
+    shown = blocks(PAGES[page])
+    if Path(page).stem in notebooks.NOTEBOOKS:
+        printed = as_a_notebook(page, tmp_path)
+    else:
+        printed = run("\nprint(chr(0))\n".join(code for code, _ in shown)).split("\0\n")
+    for got, (_, expected) in zip(printed, shown, strict=True):
+        compare(got, expected)
+    for name in re.findall(r"guide_(\w+\.(?:png|gif))", PAGES[page]):
+        with Image.open(tmp_path / name) as made:
+            assert made.width >= 300 and len(made.convert("RGB").getcolors(1 << 24)) > 50
+
+
+def test_notebooks_are_written_by_one_command(tmp_path):
+    written = notebooks.main(tmp_path / "made")
+    assert len(written) == 5
+    for path in written:
+        shown = nbformat.read(path, as_version=4)
+        nbformat.validate(shown)
+        for target in re.findall(r"\]\((?!http|#)([^)#]+)", "".join(cell.source for cell in shown.cells)):
+            assert (path.parent / target).exists(), target
+
+
+LENGTHS = {"README.md": 180, "examples/README.md": 120, **dict.fromkeys(GUIDES, 150)}
+
+
+@pytest.mark.parametrize("page", LENGTHS)
+def test_pages_are_short(page):
+    assert len(PAGES[page].splitlines()) <= LENGTHS[page]
 
 
 def without_blocks(text: str) -> str:
@@ -126,7 +167,7 @@ def check(command: str) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_are_there(page):
     shown = commands(PAGES[page])
-    assert len(shown) >= 3
+    assert len(shown) >= 3 or page in GUIDES
     for command in shown:
         try:
             check(command)

@@ -2,7 +2,7 @@
 
     python examples/benchmarks/implicit_solves.py                       # a table in Markdown, and the exponents
     python examples/benchmarks/implicit_solves.py --against ../old      # beside another checkout, back to back
-    python examples/benchmarks/implicit_solves.py --write               # the table also into examples/README.md
+    python examples/benchmarks/implicit_solves.py --write               # the table also into examples/benchmarks/README.md
 
 The beam of implicit_steps.py in float64, tolerance 1e-6. Equilibrium: E = 1e5 Pa, it sags by its length, in one load step,
 preconditioner and all but compiling included. Steps: backward Euler, 10 ms, E = 1e6 Pa; the mean of four after the first,
@@ -13,9 +13,11 @@ because a machine may have other things to do.
 import argparse
 import json
 import os
+import platform
 import subprocess
 import sys
 import time
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,8 @@ from threadpoolctl import threadpool_limits
 import diffsim_ti as ds
 
 SIZES, STEPS = [10_000, 25_000, 50_000, 100_000, 200_000], 4
-PAGE = Path(__file__).parent.parent / "README.md"
+PAGE = Path(__file__).parent / "README.md"
+WRITTEN = "Written by `implicit_solves.py --write` on"
 HEAD = ["tetrahedra", "equilibrium [s]", "iterations", "step [s]", "iterations per step", "gradient of a step [s]"]
 
 
@@ -107,11 +110,12 @@ def table(head: list, rows: list) -> str:
 
 
 def write(text: str) -> None:
-    """Replace the table with our head in examples/README.md."""
+    """Replace the table with our head in examples/benchmarks/README.md, and below it when and where it was measured."""
     lines, first = PAGE.read_text().split("\n"), text.split("\n")[0]
     at = lines.index(first)
-    end = next(k for k in range(at, len(lines)) if not lines[k].startswith("|"))
-    PAGE.write_text("\n".join([*lines[:at], text, *lines[end:]]))
+    end = next(k for k in range(at, len(lines)) if lines[k].startswith(WRITTEN))
+    where = f"{WRITTEN} {date.today():%d %B %Y}, on {os.cpu_count()} cores of {platform.machine()}, {platform.system()}."
+    PAGE.write_text("\n".join([*lines[:at], text, "", where, *lines[end + 1 :]]))
 
 
 def main() -> None:
@@ -119,7 +123,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of tetrahedra, about")
     parser.add_argument("--repeats", type=int, default=3, help="of each measurement, of which the least counts")
     parser.add_argument("--against", help="another checkout to compare with")
-    parser.add_argument("--write", action="store_true", help="put the table into examples/README.md")
+    parser.add_argument("--write", action="store_true", help="put the table into examples/benchmarks/README.md")
     options = parser.parse_args()
     here = str(Path(__file__).parent.parent.parent)
     rows, others = [], []
