@@ -21,7 +21,7 @@ MAGIC = b"diffsim_ti optimisation state, version 1\n"
 
 
 def save_state(path: str | Path, mesh: TetrahedralMesh, state: dict) -> None:
-    """Write tensors, numbers and state_dicts to `path`, at once or not at all; the file before it stays as `.previous`.
+    """Write tensors, numbers and state_dicts to `path`, as a whole or not at all; the file before it stays as `.previous`.
 
     The file carries its version, the mesh's content hash and a checksum. If writing fails (disk full, read-only), the old
     files are as they were, the temporary one is removed, and the exception goes on.
@@ -74,7 +74,7 @@ def _read(path: Path, mesh) -> dict:
     data = path.read_bytes()
     if not data.startswith(MAGIC):
         first = data.split(b"\n", 1)[0][:60]
-        kind = "written by another version" if first.startswith(MAGIC[:20]) else "not a state of ours"
+        kind = "written by another version" if first.startswith(MAGIC[:20]) else "not a saved state"
         raise ValueError(f"{kind}: it begins with {first!r}, expected {MAGIC.strip()!r}")
     digest, _, body = data[len(MAGIC) :].partition(b"\n")
     if hashlib.sha256(body).hexdigest().encode() != digest:

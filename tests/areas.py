@@ -28,7 +28,7 @@ AREAS = {
     "charts, maps, advice": "sweep study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film marks "
     "optimization_picture writers viewer viewer_window gallery",
-    "examples and pages": "types release reference examples environment contact_examples static_examples "
+    "examples and pages": "types release reference words examples environment contact_examples static_examples "
     "torch_examples readme",
     "command line, resources, backends": "cli manners calls advice hard_use strength layout resources devices launch "
     "executed_ptx single_precision fewer_variables kernel_sizes tracer",

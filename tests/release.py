@@ -1,13 +1,16 @@
 """What a release holds, and whether it works: python tests/release.py [--url URL] [--out dist] [--bare]
 
 Builds the source archive and, from it, the wheel, of the files that git tracks. Refuses archives with too much or too
-little in them. --bare: installs the wheel into a virtual environment of its own, without extras, and runs the demo there.
+little in them, and a long description that an index would not render, where twine is installed. --bare: installs the wheel
+into a virtual environment of its own, without extras, and runs the demo and the self-test there.
 
 --url: where the repository is, as https://HOST/OWNER/NAME. It becomes the project's url, and the pictures and pages that
 README.md names are those of the tag there, so that they show on a package index. Without it links stay as they are.
 """
 
 import argparse
+import importlib.util
+import os
 import re
 import shutil
 import subprocess
@@ -94,13 +97,22 @@ def check_wheel(wheel: Path, files: list[str]) -> None:
     assert "diffsim_ti/py.typed" in held and any(name.endswith("licenses/LICENSE") for name in held)
 
 
+def check_description(*archives: Path) -> None:
+    """That an index renders it, as twine says."""
+    if importlib.util.find_spec("twine"):
+        subprocess.run([sys.executable, "-m", "twine", "check", "--strict", *map(str, archives)], check=True)
+    else:
+        print("twine is not installed: whether an index renders the description is not checked")
+
+
 def run_bare(wheel: Path, folder: Path) -> None:
-    """The demo, by the wheel alone."""
+    """The demo and the self-test, by the wheel alone."""
     subprocess.run([sys.executable, "-m", "venv", str(folder / "bare")], check=True)
-    programs = folder / "bare" / "bin"
+    programs = folder / "bare" / ("Scripts" if os.name == "nt" else "bin")
     subprocess.run([str(programs / "pip"), "install", "-q", str(wheel)], check=True)
     subprocess.run([str(programs / "diffsim-ti"), "demo"], check=True, cwd=folder)
     pictures = [path for path in folder.rglob("*.png") if "bare" not in path.relative_to(folder).parts]
+    subprocess.run([str(programs / "diffsim-ti"), "selftest"], check=True, cwd=folder)
     assert pictures and all(path.stat().st_size > 10_000 for path in pictures), "the demo wrote no picture"
 
 
@@ -108,7 +120,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--url", help="of the repository, for the links of README.md")
     parser.add_argument("--out", type=Path, help="keep both archives there")
-    parser.add_argument("--bare", action="store_true", help="run the demo in an environment of the wheel alone")
+    parser.add_argument("--bare", action="store_true", help="run demo and self-test in an environment of the wheel")
     arguments = parser.parse_args()
     files = tracked()
     with tempfile.TemporaryDirectory() as name:
@@ -117,6 +129,7 @@ def main() -> None:
         source, wheel = build(folder / "tree", folder / "dist")
         check_source(source, files)
         check_wheel(wheel, files)
+        check_description(source, wheel)
         for archive in (source, wheel):
             print(f"{archive.name}: {archive.stat().st_size / 1e6:.1f} MB")
             if arguments.out:
@@ -125,7 +138,7 @@ def main() -> None:
         if arguments.bare:
             (folder / "run").mkdir()
             run_bare(wheel, folder / "run")
-            print("the demo ran by the wheel alone")
+            print("the demo and the self-test ran by the wheel alone")
 
 
 if __name__ == "__main__":

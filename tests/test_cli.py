@@ -15,7 +15,7 @@ from open_laws.viscous import ViscousRubber
 import diffsim_ti
 from diffsim_ti import picture
 from diffsim_ti.cli import app as cli
-from diffsim_ti.cli import options
+from diffsim_ti.cli import options, selftest
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.mesh import TetrahedralMesh
@@ -559,3 +559,25 @@ def test_help_says_units_exit_codes_and_the_version(capsys):
             cli.main(arguments)
         said = " ".join(capsys.readouterr().out.split())
         assert stop.value.code == 0 and all(word in said for word in words), said
+
+
+# ---- selftest ---------------------------------------------------------------------------------------------------------
+
+
+def test_selftest_tells_right_from_wrong(monkeypatch, capsys):
+    """All of its scenes run from the wheel alone, by release.py; here three verdicts, without a clock."""
+
+    def fails():
+        raise OSError("no such library")
+
+    first, *others = selftest.STORED
+    scenes = {first: selftest._scenes()[first], others[0]: selftest._scenes()[first], others[1]: fails}
+    assert {*selftest._scenes()} == {*selftest.STORED}
+    monkeypatch.setattr(selftest, "_scenes", lambda: scenes)
+    monkeypatch.setattr(selftest, "_speed", lambda: (1.0, 100.0))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["selftest"])
+    said = capsys.readouterr().out
+    verdicts = re.findall(r"(?<=  )(right|WRONG|SLOW|as it should be)$", said, re.MULTILINE)
+    assert stop.value.code == 1 and verdicts == ["right", "WRONG", "WRONG", "as it should be", "SLOW"]
+    assert "OSError: no such library" in said and "3 not as stored" in said and "taichi 1.7.4" in said

@@ -12,6 +12,7 @@ import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.materials.linear_elastic import LinearElasticLaw
 from diffsim_ti.runtime import repeated_loops
+from diffsim_ti.state.corners import clear_from
 
 pytestmark = pytest.mark.backends
 
@@ -238,3 +239,10 @@ def test_kernels_of_a_plain_scene_take_no_array_that_they_do_not_read(solver, bu
     scenes = [(parts, read) for parts, read in bundles if "tets" in parts]
     spare = {"start", "corner_of", "corner", "inverse_mass", "parameters"}  # which some kernels of a kind read
     assert len(scenes) >= 2 and all(parts <= read | spare for parts, read in scenes)
+
+
+def test_corners_are_cleared_from_a_place_on():
+    corner = runtime.array(ti.f32, 9)
+    runtime.fill(corner, 1.0)
+    clear_from(corner, 4)
+    assert runtime.fetch(corner).tolist() == [1] * 4 + [0] * 5

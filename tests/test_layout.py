@@ -60,6 +60,18 @@ def test_all_warnings_point_at_the_line_of_the_user():
     assert [p.name for p in MODULES if re.search(r"warnings\.warn\b|stacklevel", p.read_text())] == []
 
 
+def test_texts_are_read_and_written_in_utf_8():
+    """And not in what the system's locale says."""
+    for path, tree in MODULES.items():
+        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+            name = getattr(call.func, "id", getattr(call.func, "attr", ""))
+            named = {word.arg for word in call.keywords}
+            modes = [x.value for x in call.args if isinstance(x, ast.Constant) and isinstance(x.value, str)]
+            opens = name == "open" and isinstance(call.func, ast.Name) and not any("b" in mode for mode in modes)
+            if opens or name in ("read_text", "write_text") and isinstance(call.func, ast.Attribute):
+                assert "encoding" in named, f"{path.name}, line {call.lineno}"
+
+
 def test_at_the_top_stand_folders_and_doors():
     """Modules there are what pages teach to import; all else lies in folders."""
     assert len(list(PACKAGE.glob("*.py"))) <= 12

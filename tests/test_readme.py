@@ -2,12 +2,16 @@
 
 import contextlib
 import io
+import os
 import re
 import shlex
+import sys
 from itertools import dropwhile
 from pathlib import Path
 
 import areas
+import nbclient
+import nbformat
 import pytest
 import typer
 from PIL import Image
@@ -16,9 +20,13 @@ import diffsim_ti as ds
 from diffsim_ti.cli.app import app
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "examples"))
+
+import notebooks  # noqa: E402
+
 GUIDES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "examples/guides").glob("*.md"))
-PLAIN = "README.md", "examples/README.md", "examples/benchmarks/README.md", "tests/README.md"
-PAGES = {name: (ROOT / name).read_text() for name in (*PLAIN, *GUIDES)}
+PLAIN = "README.md", "examples/README.md", "examples/glossary.md", "examples/benchmarks/README.md", "tests/README.md"
+PAGES = {name: (ROOT / name).read_text(encoding="utf-8") for name in (*PLAIN, *GUIDES)}
 
 
 def blocks(text: str) -> list[tuple[str, str]]:
@@ -42,7 +50,7 @@ def numbers(text: str) -> list[tuple[float, float]]:
 def run(code: str) -> str:
     """What a script prints. The session has its runtime: ds.init chooses the precision alone, which is float32 without."""
     path = ROOT / "tests" / f"_readme_{abs(hash(code))}.py"
-    path.write_text(code)  # Taichi reads kernels from their file
+    path.write_text(code, encoding="utf-8")  # Taichi reads kernels from their file
     out = io.StringIO()
     init, ds.init = ds.init, lambda backend="cpu", precision="f32": ds.runtime.set_precision(precision)
     ds.runtime.set_precision("f32")
@@ -75,21 +83,41 @@ def test_code_block_runs_and_prints_what_is_shown(code, printed, tmp_path, monke
     compare(run(code), printed)
 
 
-@pytest.mark.parametrize("page", GUIDES)
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_guide_runs_from_top_to_bottom_and_prints_what_is_shown(page, tmp_path, monkeypatch):
-    """Its blocks share one namespace; the picture that it shows is one that it makes."""
-    monkeypatch.chdir(tmp_path)
-    shown = blocks(PAGES[page])
-    printed = run("\nprint(chr(0))\n".join(code for code, _ in shown)).split("\0\n")
-    for got, (_, expected) in zip(printed, shown, strict=True):
+def check_guide(page: str, printed: list[str], folder: Path) -> None:
+    """That blocks printed what the guide shows, and that the picture which it shows is one that it made."""
+    for got, (_, expected) in zip(printed, blocks(PAGES[page]), strict=True):
         compare(got, expected)
     for name in re.findall(r"guide_(\w+\.(?:png|gif))", PAGES[page]):
-        with Image.open(tmp_path / name) as made:
+        with Image.open(folder / name) as made:
             assert made.width >= 300 and len(made.convert("RGB").getcolors(1 << 24)) > 50
 
 
-@pytest.mark.parametrize("page, most", [("examples/README.md", 120), *((page, 150) for page in GUIDES)])
+@pytest.mark.parametrize("page", [page for page in GUIDES if Path(page).stem not in notebooks.NOTEBOOKS])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_guide_runs_from_top_to_bottom_and_prints_what_is_shown(page, tmp_path, monkeypatch):
+    """Its blocks share one namespace."""
+    monkeypatch.chdir(tmp_path)
+    code = "\nprint(chr(0))\n".join(code for code, _ in blocks(PAGES[page]))
+    check_guide(page, run(code).split("\0\n"), tmp_path)
+
+
+@pytest.mark.parametrize("name", notebooks.NOTEBOOKS)
+def test_a_notebook_of_a_guide_runs_and_prints_what_is_shown(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
+    path = next(path for path in notebooks.main(tmp_path) if path.stem == name)
+    shown = nbformat.read(path, as_version=4)
+    nbclient.NotebookClient(shown, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    streams = [[out for out in cell.get("outputs", []) if out.get("name") == "stdout"] for cell in shown.cells]
+    printed = [
+        "".join(out.text for out in outs) for cell, outs in zip(shown.cells, streams) if cell.cell_type == "code"
+    ]
+    check_guide(f"examples/guides/{name}.md", printed, tmp_path)
+
+
+LONGEST = {"README.md": 180, "examples/README.md": 120} | dict.fromkeys(GUIDES, 150)
+
+
+@pytest.mark.parametrize("page, most", LONGEST.items())
 def test_pages_are_short(page, most):
     assert len(PAGES[page].splitlines()) <= most
 
@@ -134,7 +162,7 @@ def check(command: str) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_are_there(page):
     shown = commands(PAGES[page])
-    assert len(shown) >= 3 or page in GUIDES
+    assert len(shown) >= 3 or page in GUIDES or page == "examples/glossary.md"
     for command in shown:
         try:
             check(command)
@@ -157,20 +185,20 @@ def test_commands_that_are_not_there_are_found(wrong):
         check(wrong)
 
 
+def anchors(page: Path) -> set[str]:
+    """What a link can name behind #, of each heading."""
+    titles = re.findall(r"^#+ (.+)$", without_blocks(page.read_text(encoding="utf-8")), re.M)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_links_and_pictures_are_there(page):
-    headings = {}
-    for name, text in PAGES.items():
-        titles = re.findall(r"^#+ (.+)$", without_blocks(text), re.M)
-        headings[(ROOT / name).resolve()] = {
-            re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles
-        }
     for target in re.findall(r"\]\(([^)]+)\)", PAGES[page]):
         if not target.startswith("https://"):
             path, _, part = target.partition("#")
             file = (ROOT / page).parent / path if path else ROOT / page
             assert file.exists(), target
-            assert not part or part in headings[file.resolve()], target
+            assert not part or part in anchors(file), target
 
 
 def prose(text: str) -> list[str]:

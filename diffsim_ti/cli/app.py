@@ -1,5 +1,6 @@
 """The command line: `diffsim-ti` or `python -m diffsim_ti`. One function per command."""
 
+import io
 import logging
 import sys
 import time
@@ -18,6 +19,7 @@ from diffsim_ti.cli import study, view
 from diffsim_ti.cli.check import check
 from diffsim_ti.cli.config import write_options
 from diffsim_ti.cli.identify import identify
+from diffsim_ti.cli.selftest import selftest
 from diffsim_ti.cli.sweep import sweep
 from diffsim_ti.common import interrupts
 from diffsim_ti.common.progress import LOG
@@ -50,6 +52,7 @@ for command in (
     view.view,
     identify,
     check,
+    selftest,
 ):
     app.command()(command)
 
@@ -67,6 +70,9 @@ def everywhere(
 def main(arguments: list[str] | None = None) -> None:
     """Run a command and exit: 0 done, 2 an error, 130 interrupted."""
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a name that a console of another locale cannot show ends no run
+            stream.reconfigure(errors="backslashreplace")
     try:
         said, code = _ran(arguments)
     except KeyboardInterrupt:  # of a signal that came just as the command ended

@@ -16,7 +16,7 @@ CURVE = ("displacement", "force")
 
 def read_tracks(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """(times [s], places [m] of shape (times, markers, 3)) of a CSV; NaN where missing."""
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8-sig") as file:
         reader = csv.DictReader(file)
         missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
@@ -33,7 +33,7 @@ def read_tracks(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def read_curve(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """(displacements [m], forces [N], NaN where missing) of a CSV."""
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8-sig") as file:
         rows = [[float(row[name] or "nan") for name in CURVE] for row in csv.DictReader(file)]
     ways, forces = np.array(rows).reshape(-1, 2).T
     if len(ways) == 0 or not np.isfinite(ways).all():
@@ -43,7 +43,7 @@ def read_curve(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def is_curve(path: Path) -> bool:
     """Whether a CSV has the columns of a force curve."""
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8-sig") as file:
         return set(CURVE) <= set(csv.DictReader(file).fieldnames or ())
 
 

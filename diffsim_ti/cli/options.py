@@ -300,7 +300,7 @@ def print_summary(run: ForwardRun, setup: float, writing: float, files: list[str
         if acting:
             row("energy by work", f"{share(change - drift)}{said}: {', '.join(acting)}")
         row("energy drift", f"{share(drift)}{said}: of the steps themselves")
-    inverted = f", {seen.inverted} tetrahedra inside-out at once" if seen.inverted else ""
+    inverted = f", {seen.inverted} tetrahedra inside-out" if seen.inverted else ""
     row("smallest J", f"{seen.J:.4g}{inverted}")
     if run.obstacles:
         width = min(float(t.values["barrier_width"]) for t in run.obstacles)

@@ -82,7 +82,9 @@ def axis(text: str) -> tuple[str, list[float]]:
 
 def sweep(
     scene: Annotated[Path, typer.Argument(help="a mesh, or a Python file that defines scene or rollout, which is run")],
-    over: Annotated[list[str], typer.Option(help="E=1e4..1e6:20:log, speed=0..2:5 or nu=.3,.4; more than one: a grid")],
+    over: Annotated[
+        list[str], typer.Option(help="E=1e4..1e6:20:log, speed=0..2:5 or nu=0.3,0.4; more than one: a grid")
+    ],
     output: opt.Folder = Path("output/sweep"),
     duration: Annotated[float, typer.Option(help="of a scene [s]")] = 0.2,
     frames: Annotated[int, typer.Option(help="of a scene")] = 20,

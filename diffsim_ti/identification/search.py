@@ -31,7 +31,7 @@ class Search:
         self.path = Path(resume) if isinstance(resume, str | Path) else None
         state = resume
         if self.path is not None:
-            state = json.loads(self.path.read_text()) if self.path.exists() else None
+            state = json.loads(self.path.read_text(encoding="utf-8")) if self.path.exists() else None
         self.is_resumed, t = state is not None, np.zeros(problem.size) if start is None else start
         if state is not None:
             if state["labels"] != problem.labels:
@@ -68,7 +68,7 @@ class Search:
         """Write the state, if there is a path for it."""
         if self.path:
             temporary = self.path.with_name(self.path.name + ".tmp")
-            temporary.write_text(json.dumps(self.state))
+            temporary.write_text(json.dumps(self.state), encoding="utf-8")
             temporary.replace(self.path)
 
     def row(self, iteration: int, promised: float | None = None, why: str | None = None) -> dict:

@@ -211,7 +211,7 @@ class Inputs:
         ]
         if any(term.acts_on_surface for term in scene.terms):
             out.append(SurfaceAreas(mesh))
-        all_own = {term: f"numbers of term {k}" for k, term in enumerate(scene.ordered_terms)}
+        all_own = {term: f"parameters of term {k}" for k, term in enumerate(scene.ordered_terms)}
         kind_of = {term: x for x in scene.interactions for term in x.terms}
         for term, own in all_own.items():
             names, rows, kind = named[term], self.parameters.of(term), kind_of.get(term)

@@ -21,7 +21,7 @@ class EnergyLaw(Law):
     volume="patches" needs `theta(H)`, and the last coefficient as the factor of theta^2 / 2 and nowhere else.
 
     A law with a state (`state_names`, law.py) writes `psi(H, p, z)` and `next_state(H, p, z, h)`, z being a list of the S
-    numbers: z is held while psi gives stresses, and next_state is what it becomes in a pass of length h [s]. Write that
+    numbers: z is held while psi gives stresses, and next_state is what it becomes in a substep of length h [s]. Write that
     as the exact solution for a frozen H where there is one: relaxation towards H within a time tau is
     z + (1 - exp(-h / tau)) (H - z). `lame` of its material says the moduli of what is fast, all springs together.
 
@@ -47,7 +47,7 @@ class EnergyLaw(Law):
         raise NotImplementedError(f"{type(self).__name__} writes psi(H, p)")
 
     def next_state(self, H: Tensor, p: list, z: list, h: Number) -> list:
-        """What the state z becomes in a pass of length h [s]: one number for each of `state_names`."""
+        """What the state z becomes in a substep of length h [s]: one number for each of `state_names`."""
 
     def dissipation(self, H: Tensor, H_dot: Tensor, p: list) -> Number:
         """phi [W/m^3] of a law that reads ("H", "H_dot"): its stress is dpsi/dF + dphi/dF_dot, F_dot = H_dot.

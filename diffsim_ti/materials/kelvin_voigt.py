@@ -147,7 +147,7 @@ class KelvinVoigt(Around):
     lost digits: gradients by viscosity are then good to 1e-3.
     volume="patches" does not support it.
     Simo, Hughes, Computational Inelasticity, 1998, ch. 10, doi:10.1007/b98904.
-    Raises ValueError for negative numbers, both spellings at once, and a material with a viscosity of its own.
+    Raises ValueError for negative numbers, both spellings together, and a material with a viscosity of its own.
     """
 
     units = {"viscous_time": "s", "shear_viscosity": "Pa s", "bulk_viscosity": "Pa s"}

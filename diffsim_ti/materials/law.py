@@ -92,7 +92,7 @@ class Law(metaclass=Public):
     def in_steps(self) -> "Law":
         """The law as implicit passes take it, of the displacement gradient alone. One that reads rates can be an energy
         there, of the change from what is held in a pass, numbers of `frozen_names`, and of a rate [1/s]: they follow
-        the state in p. Itself, where it does not know how."""
+        the state in p. Itself, where it has no other form."""
         return self
 
     @traced

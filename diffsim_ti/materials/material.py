@@ -22,7 +22,7 @@ _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
 
 @answered
 class Material(metaclass=Public):
-    """A law and its numbers, in one of these spellings, never two at once:
+    """A law and its numbers, in one of these spellings, never two together:
 
     (E, nu) or youngs_modulus= or E= [Pa], > 0, and poissons_ratio= or nu= [-], in (-1, 0.5): those of small strains,
     mu= > 0 and lam= > -2/3 mu [Pa], the Lame parameters,

@@ -62,7 +62,7 @@ class Prony(Around):
     the isotropic part. `Prony(material, shares, times)`: g_i >= 0 [-], of the moduli that last, which are the material's,
     and tau_i > 0 [s], N numbers for all or of shape (num_tetrahedra, N); inputs with gradient, prony_shares and
     prony_times. At once the body is 1 + sum g_i times as stiff, and at constant strain the stress relaxes by exp(-t /
-    tau_i). A series given as shares a_i of what is stiff at once, E_0, has g_i = a_i / (1 - sum a), and the material E
+    tau_i). A series given as shares a_i of the instantaneous modulus E_0 has g_i = a_i / (1 - sum a), and the material E
     = (1 - sum a) E_0.
 
     z_i are numbers of each tetrahedron that a run keeps with its state, moved on exactly for the strain of each substep

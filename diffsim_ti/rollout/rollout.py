@@ -350,7 +350,7 @@ class Rollout(metaclass=Public):
         """Run from the input fields and fill the outputs' fields; in a `ti.ad.Tape`, the tape will pull gradients back.
 
         In a Rollout of several `runs`, run k fills row k of these fields: kernels may write the inputs of run k + 1 from the
-        frames of run k, in one tape. Input fields are read at once, and may be overwritten for the next run. The device
+        frames of run k, in one tape. Input fields are read immediately, and may be overwritten for the next run. The device
         keeps what the reverse sweep needs of one run: all but the last run once more when the tape goes back.
         Gradients add to the .grad of the input fields; `gradients` has their sum over the runs of the tape.
         Raises RuntimeError for a run that this tape already holds, ValueError for k outside 0 .. runs - 1.

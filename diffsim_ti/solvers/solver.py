@@ -51,7 +51,7 @@ class Solver(metaclass=Public):
         "auto" for one.
     parallel: each substep on all threads, or many of them in a row on one; None chooses by size.
     allow_unstable: take a step beyond the stable one all the same: neither the start nor the run is checked.
-    check_start: whether the constructor looks at the stable step, which a number of substeps may not exceed; False where
+    check_start: whether the constructor checks the stable step, which a number of substeps may not exceed; False where
         `substeps` is chosen later, before each step or by `choose_substeps`. The run is checked all the same.
     Raises ValueError for dt <= 0, substeps < 1, substeps beyond the stable step, and where "auto" would take over 10 000.
     """

@@ -16,7 +16,7 @@ def stable_dt(scene: Scene, tight: bool = True) -> StepLimit:
     """Largest stable explicit step [s] of a scene at its start.
 
     Pressures of gases, tensions and lengths of cables are the stiffest of all keyframes and steps; functions of time are
-    looked at by runs, which sample them.
+    checked by runs, which sample them.
     tight: 2 / omega_max of the assembled system, self-contact included (`lanczos_limit`); else the element bound at rest,
     without contact (`element_limit`), which needs no kernels and is smaller. Obstacles limit no step unless a solver is told
     contact="force"; that solver's own `stable_dt(tight=True)` knows them. Scenes with sets that are `reduced`, for which

@@ -36,8 +36,8 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
 @runtime.untaped
 @runtime.kernel
 def _clear_from(corner: ti.types.ndarray(ndim=1), first: ti.i32):
-    for c in range(first, corner.shape[0]):
-        corner[c] = 0 * corner[c]
+    for c in range(corner.shape[0] - first):  # Vulkan takes no outermost loop from a variable on
+        corner[first + c] = 0 * corner[first + c]
 
 
 def clear_from(corner, first: int) -> None:

@@ -101,13 +101,13 @@ def save(figure: "Figure", path: str | Path) -> None:
 def write_json(record: dict, path: str | Path) -> None:
     """Numbers and words as JSON, NaN as null."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text(json.dumps(record, indent=1, default=str) + "\n")
+    Path(path).write_text(json.dumps(record, indent=1, default=str) + "\n", encoding="utf-8")
 
 
 def write_csv(rows: list[dict], path: str | Path) -> None:
     """Rows with the same keys as CSV."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="") as file:
+    with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows(rows)

@@ -57,7 +57,7 @@ class Problem(metaclass=Public):
     """What is computed, over how long, and against what it is measured.
 
     scene(cells, pattern, precision, **element) -> Scene, on a mesh of so many cells across.
-    duration [s], frames: how long it moves, and at how many equal times it is looked at.
+    duration [s], frames: how long it moves, and at how many equal times it is evaluated.
     quantity(frames, gradients) -> the numbers to get right; frames are a Rollout's, gradients those of `adjoint`.
     exact: the closed form's numbers, or None: a converged reference is computed, with its own error.
     scale: what errors are divided by; default the largest of the exact numbers.

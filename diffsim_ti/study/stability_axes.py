@@ -20,7 +20,7 @@ from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 def power_limit(scene: Scene, rounds: int = 3000, tolerance: float = 1e-7) -> float:
     """The explicit limit 2 / omega_max [s] at the scene's start, by plain power iteration on the assembled stiffness.
 
-    Independent of the Lanczos iteration by which solvers look at their steps; converges from above. With viscosity, the step
+    Independent of the Lanczos iteration by which solvers check their steps; converges from above. With viscosity, the step
     whose rate 2 / dt makes omega_max as large (`Stiffness`), by bisection.
     """
     stiffness = Stiffness(start_workspace(scene))

@@ -122,7 +122,7 @@ class FilledChamber(Chamber):
     multiplier: so a chamber is followed beyond the largest pressure that it bears. Static solves go from the volume at
     rest in load steps. Explicit solvers hold V at the end of each substep too, as velocity Verlet does in the manner of
     SHAKE and RATTLE: a stage after contact, on the host, to round-off and without a penalty, that no step is too large
-    for. There a volume that jumps is reached within one substep: give keyframes. A contact of the chamber's own wall is
+    for. There a volume that jumps is reached within one substep: give keyframes. A contact of the chamber's own boundary is
     pushed after it. Raises ValueError for surfaces that enclose no volume, numbers that are not positive, and what does
     not fit. Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, 17.3 and 18.4, doi:10.1007/978-0-387-40065-5;
     Leimkuhler, Reich, Simulating Hamiltonian Dynamics, 2004, 7.2, doi:10.1017/CBO9780511614118.

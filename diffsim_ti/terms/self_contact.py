@@ -29,15 +29,15 @@ class SelfContact(Term):
     sets of vertices or tetrahedra, {("palm", "ball"): 0.6}, and other pairs have no friction; a pair whose corners are
     in several sets belongs to those of its vertex, or of each edge's first one, and of the triangle's first one.
     friction_speed [m/s]: the speed of sliding below which friction is smoothed, and with which what is held may creep:
-    mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each pass that
+    mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each substep that
     adds no energy, whatever the step (friction_kernels.py), with N as the stage of contact finds it or, where contact
-    is a force, from where the pass begins; in implicit ones a force, with N and the normal from where the step begins.
+    is a force, from where the substep begins; in implicit ones a force, with N and the normal from where the step begins.
     Its forces F act at the two ends of the gap d: a couple d x F, which changes angular momentum by less than the
     width times the impulse of friction. Edges that pass each other are bumps, which take energy: a slab on a slope
     went as with 0.0005 more friction at a width of 4 mm, and as with 0.0001 at 1 mm, whatever friction_speed and step.
     A narrower and stiffer barrier is smoother.
 
-    Pairs of one body whose distance D at rest is below twice the width, neighbours along its surface or walls of a slit,
+    Pairs of one body whose distance D at rest is below twice the width, neighbours along its surface or sides of a slit,
     have a width and a stiffness of their own, so that a body at rest does not press on itself:
 
         own width = share width,   own stiffness = stiffness / share,   share = min(1, D / (2 width))

@@ -24,7 +24,7 @@ HELD = 4  # vertices that a pair is to stop, with what is behind it
 
 
 class Tunnelling(FloatingPointError, metaclass=Public):
-    """In one pass, surfaces moved so far that they may have gone through each other. Of explicit steps it carries stable_dt
+    """Surfaces moved so far in one substep that they may have crossed. Of explicit steps it carries stable_dt
     [s], a substep that resolves the barrier, and stiffness [N/m], one that stops them, or None where theirs would do."""
 
     stable_dt: float | None = None

@@ -64,13 +64,13 @@ MOST_PASSES = 16  # in a launch on all threads of a GPU, whose cost for the host
 class ExplicitSolver(Solver):
     """Explicit steps: each costs one force evaluation, and dt may not exceed 2 / omega_max.
 
-    contact: "stage", the default: obstacles act in a stage of each pass (contact_stage.py), which no step is too large
+    contact: "stage", the default: obstacles act in a stage of each substep (contact_stage.py), which no step is too large
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
         are `reduced` take obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
-        SelfContact(stage=True) acts likewise, in parts of each pass (surfaces/contact_stage.py): it keeps surfaces apart
+        SelfContact(stage=True) acts likewise, in parts of each substep (surfaces/contact_stage.py): it keeps surfaces apart
         whatever its stiffness, with friction in it; it needs "stage", and no reduced sets.
-        In both, what is narrower than faces acts on points within them in a stage of its own, which integrates the pass
+        In both, what is narrower than faces acts on points within them in a stage of its own, which integrates the substep
         again in as many parts as barrier and speed ask for (explicit_face_kernels.py), and then friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the

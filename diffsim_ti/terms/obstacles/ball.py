@@ -46,7 +46,7 @@ class SphereForce(ObstacleForce):
 
 
 class Sphere(Obstacle):
-    """A ball, or with inside=True the wall of a hollow one (a bowl, seen from within): center, radius [m].
+    """A ball, or with inside=True the inner surface of a hollow one (a bowl, seen from within): center, radius [m].
 
     Inputs with gradient: "sphere_center", shape (3,), "sphere_radius", and those of every `Obstacle`, whose other
     arguments it takes.

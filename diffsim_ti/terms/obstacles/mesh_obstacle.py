@@ -34,8 +34,8 @@ class MeshObstacle(Obstacle):
     vertices [m], shape (k, 3); triangles, shape (t, 3), segments, shape (s, 2), points, shape (p,), any of them, name
     vertices by index; where none is given all vertices are points. position [m]: where the vertices' origin lies.
     Parts whose triangles are closed, each edge passed once each way, have an inside, which their normals point out of: they
-    push out what got into them, and no body may start there; triangles that face inwards are the wall of a room. All
-    other triangles, segments and points are felt from both sides alike. Vertices of bodies find what is nearest in a tree
+    push out what got into them, and no body may start there; triangles that face inwards bound a room. All
+    other triangles, segments and points act on both sides alike. Vertices of bodies find what is nearest in a tree
     of boxes, so that triangles that are far away cost next to nothing. Segments, points, and edges and corners that are
     sharp for the body's faces also act on edges and faces of bodies, by pairs.
     shapeable: whether vertices are an input; in gradients each vertex of the body then has 3 k numbers of its own.
@@ -113,7 +113,7 @@ class MeshObstacle(Obstacle):
         return points + self.values["mesh_position"], triangles
 
     def settled(self, scene, density, initial_positions, initial_velocities):
-        """With those of its edges and corners that faces of the body are wide enough to feel between their own corners."""
+        """With those of its edges and corners that faces of the body are wide enough to meet between their own corners."""
         out = copy(super().settled(scene, density, initial_positions, initial_velocities))
         if "barrier_width" in self.left_to_scene:
             out._check_rounding()

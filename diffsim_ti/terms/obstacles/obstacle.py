@@ -64,8 +64,8 @@ class Obstacle(Term):
     other, exactly: a ball's centre on triangles, at the distance less the radius; of a capsule its axis on edges and its
     ends on triangles, of a box its twelve edges and eight corners. Energy of a pair as of a vertex, m b(d) with m of
     `SelfContact`; the stiffness per area is multiplied by the triangle's area in the mesh, or by a third of that of the
-    triangles at the edge. Mesh obstacles always do so with what is sharp of them. Otherwise points within faces feel what
-    is narrower than these.
+    triangles at the edge. Mesh obstacles always do so with what is sharp of them. Otherwise contact points within faces meet
+    what is narrower than these.
 
     Inputs with gradient: the shape's own numbers, "barrier_stiffness_per_area" or "barrier_stiffness", "barrier_width",
     with friction also "friction" and "friction_speed", with a path "<shape>_path", shape (steps + 1, 3), of a pose
@@ -77,7 +77,7 @@ class Obstacle(Term):
     with substeps of 2 ms, and a gradient by up to 12 % (that of friction_speed); half of both with 1 ms. Elsewhere, and in
     implicit steps, swapping changes round-off alone.
     A shape of one's own says of its inputs which are places, Input(..., axes="xyz"), of a height axes="y" (origin.py).
-    Raises ValueError for numbers out of range, both stiffnesses at once, or a body that starts on or in the obstacle.
+    Raises ValueError for numbers out of range, both stiffnesses together, or a body that starts on or in the obstacle.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
 
@@ -221,7 +221,7 @@ class Obstacle(Term):
         return self.distance(brought_back(np.asarray(positions, np.float64), np.asarray(offset), self.about))
 
     def way(self, positions: np.ndarray, before: np.ndarray, after: np.ndarray) -> float:
-        """How far it goes between two rows of its path, the most at the positions [m]."""
+        """How far it goes between two keyframes of its path, the most at the positions [m]."""
         if not self.turns:
             return float(np.linalg.norm(after - before))
         there = carried(brought_back(positions, before, self.about), after, self.about)
@@ -252,7 +252,7 @@ class Obstacle(Term):
         return None
 
     def surface_at(self, size: float, time: float, row: np.ndarray | None = None) -> Triangles | None:
-        """`surface` where its path has taken it at a time [s], or a row of its path."""
+        """`surface` where its path has taken it at a time [s], or at a keyframe of its path."""
         shape = self.surface(size)
         if shape is None or self.path is None:
             return shape
