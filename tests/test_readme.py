@@ -83,43 +83,48 @@ def test_code_block_runs_and_prints_what_is_shown(code, printed, tmp_path, monke
     compare(run(code), printed)
 
 
-def check_guide(page: str, printed: list[str], folder: Path) -> None:
-    """That blocks printed what the guide shows, and that the picture which it shows is one that it made."""
-    for got, (_, expected) in zip(printed, blocks(PAGES[page]), strict=True):
+def as_a_notebook(page: str, folder: Path) -> list[str]:
+    """What each cell of code of a guide prints, as a notebook in a process of its own."""
+    made = notebooks.notebook(ROOT / page, folder)
+    client = nbclient.NotebookClient(made, timeout=300, resources={"metadata": {"path": str(folder)}})
+    cells = [cell for cell in client.execute().cells if cell.cell_type == "code"]
+    return ["".join(out.get("text", "") for out in cell.outputs if out.get("name") == "stdout") for cell in cells]
+
+
+@pytest.mark.parametrize("page", GUIDES)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_guide_runs_from_top_to_bottom_and_prints_what_is_shown(page, tmp_path, monkeypatch):
+    """Its blocks share one namespace; the picture that it shows is one that it makes. Five run as notebooks."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
+    shown = blocks(PAGES[page])
+    if Path(page).stem in notebooks.NOTEBOOKS:
+        printed = as_a_notebook(page, tmp_path)
+    else:
+        printed = run("\nprint(chr(0))\n".join(code for code, _ in shown)).split("\0\n")
+    for got, (_, expected) in zip(printed, shown, strict=True):
         compare(got, expected)
     for name in re.findall(r"guide_(\w+\.(?:png|gif))", PAGES[page]):
-        with Image.open(folder / name) as made:
+        with Image.open(tmp_path / name) as made:
             assert made.width >= 300 and len(made.convert("RGB").getcolors(1 << 24)) > 50
 
 
-@pytest.mark.parametrize("page", [page for page in GUIDES if Path(page).stem not in notebooks.NOTEBOOKS])
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_guide_runs_from_top_to_bottom_and_prints_what_is_shown(page, tmp_path, monkeypatch):
-    """Its blocks share one namespace."""
-    monkeypatch.chdir(tmp_path)
-    code = "\nprint(chr(0))\n".join(code for code, _ in blocks(PAGES[page]))
-    check_guide(page, run(code).split("\0\n"), tmp_path)
+def test_notebooks_are_written_by_one_command(tmp_path):
+    written = notebooks.main(tmp_path / "made")
+    assert len(written) == 5
+    for path in written:
+        shown = nbformat.read(path, as_version=4)
+        nbformat.validate(shown)
+        for target in re.findall(r"\]\((?!http|#)([^)#]+)", "".join(cell.source for cell in shown.cells)):
+            assert (path.parent / target).exists(), target
 
 
-@pytest.mark.parametrize("name", notebooks.NOTEBOOKS)
-def test_a_notebook_of_a_guide_runs_and_prints_what_is_shown(name, tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
-    path = next(path for path in notebooks.main(tmp_path) if path.stem == name)
-    shown = nbformat.read(path, as_version=4)
-    nbclient.NotebookClient(shown, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    streams = [[out for out in cell.get("outputs", []) if out.get("name") == "stdout"] for cell in shown.cells]
-    printed = [
-        "".join(out.text for out in outs) for cell, outs in zip(shown.cells, streams) if cell.cell_type == "code"
-    ]
-    check_guide(f"examples/guides/{name}.md", printed, tmp_path)
+LENGTHS = {"README.md": 180, "examples/README.md": 120, **dict.fromkeys(GUIDES, 150)}
 
 
-LONGEST = {"README.md": 180, "examples/README.md": 120} | dict.fromkeys(GUIDES, 150)
-
-
-@pytest.mark.parametrize("page, most", LONGEST.items())
-def test_pages_are_short(page, most):
-    assert len(PAGES[page].splitlines()) <= most
+@pytest.mark.parametrize("page", LENGTHS)
+def test_pages_are_short(page):
+    assert len(PAGES[page].splitlines()) <= LENGTHS[page]
 
 
 def without_blocks(text: str) -> str:
