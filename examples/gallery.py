@@ -1,4 +1,4 @@
-"""The pictures and films of the examples, as assets/pictures/gallery_<example>.png or .gif, and of the guides, as guide_<guide>.png.
+"""Pictures and films of the examples, gallery_<example>.png or .gif, and guides, guide_<guide>.png, in assets/pictures.
 
 Each example runs by the command that the pages show, in a process and a folder of its own, and so do a guide's code
 blocks, one after the other; pictures are then made small enough for a repository. `--list` prints the commands.
@@ -50,7 +50,9 @@ EXAMPLES = {
     "benchmarks/cantilever": ("--quick output", "cantilever.png"),
     "benchmarks/cooks_membrane": ("--quick output", "cooks_membrane.png"),
 }
-GUIDES = {f"guides/{path.stem}": path for path in sorted((HERE / "guides").glob("*.md")) if "/guide_" in path.read_text()}
+GUIDES = {
+    f"guides/{path.stem}": path for path in sorted((HERE / "guides").glob("*.md")) if "/guide_" in path.read_text()
+}
 TORCHRUN = {"identify/train_distributed": "--nproc_per_node=2"}  # examples of several processes
 
 

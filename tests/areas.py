@@ -35,8 +35,8 @@ AREAS = {
 }
 # files of a minute or so, the longest first: in several processes they come before all others
 LONGEST = (
-    "curved_contact gradient_fuzz contact_force far_from_origin optimization torch_examples face_friction quadratic_outputs "
-    "term_order every_adjoint "
+    "curved_contact gradient_fuzz readme contact_force far_from_origin optimization torch_examples face_friction "
+    "quadratic_outputs term_order every_adjoint "
     "loads_together static_examples contact_examples examples implicit_contact swept hertz implicit "
     "contact_gradients contact_stage contact_faces outputs locking chambers springs quadratic_solvers torch_physics "
     "quadratic_loads self_contact_implicit contact_rollers unequal_steps open_laws laws_with_state quadratic "

@@ -34,7 +34,7 @@ def test_any_stiffness_with_any_damping_is_bounded_up_to_the_limit(stages):
     "xi, kicks, less", [(2, 3, 1.2), (5, 4, 2.1), (10, 6, 2.9), (20, 8, 4.1), (50, 13, 6.6), (100, 18, 9.2)]
 )
 def test_the_table_of_the_page(xi, kicks, less):
-    """examples/benchmarks/README.md: time gone by in an evaluation of forces, at the best number of kicks, against one kick."""
+    """benchmarks/README.md: time gone by in an evaluation of forces, at the best number of kicks, against one kick."""
     gone = {n: 2 / np.sqrt(ViscousStages(n).squared_rate(1.0, 2.0 * xi)) / n for n in range(1, MOST + 1)}
     assert max(gone, key=gone.get) == kicks and gone[kicks] / gone[1] == pytest.approx(less, abs=0.05)
 

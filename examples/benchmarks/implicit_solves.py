@@ -114,7 +114,9 @@ def write(text: str) -> None:
     lines, first = PAGE.read_text().split("\n"), text.split("\n")[0]
     at = lines.index(first)
     end = next(k for k in range(at, len(lines)) if lines[k].startswith(WRITTEN))
-    where = f"{WRITTEN} {date.today():%d %B %Y}, on {os.cpu_count()} cores of {platform.machine()}, {platform.system()}."
+    where = (
+        f"{WRITTEN} {date.today():%d %B %Y}, on {os.cpu_count()} cores of {platform.machine()}, {platform.system()}."
+    )
     PAGE.write_text("\n".join([*lines[:at], text, "", where, *lines[end + 1 :]]))
 
 
