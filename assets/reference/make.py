@@ -167,6 +167,8 @@ def main(folder: str = str(HERE / "html")) -> None:
         for section, files in {"Guides": guides(), **PAGES}.items():
             files = [file for file in files if (ROOT / file).exists()]
             titles = [{copy_page(file, pages): file} for file in files]
+            if section == "Guides":  # by their names: the questions are long
+                titles = [{Path(file).stem.replace("_", " ").capitalize(): file} for file in files]
             nav.append({section: titles if len(titles) > 1 else files[0]})
         nav.insert(-2, {"Reference": write_reference(pages)})
         build(load_config(str(HERE / "mkdocs.yml"), docs_dir=name, site_dir=str(Path(folder).resolve()), nav=nav))
