@@ -12,6 +12,7 @@ from diffsim_ti.materials.kelvin_voigt import KelvinVoigt
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.measured import Library, Measured, library
 from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
 from diffsim_ti.materials.ogden import Ogden
 from diffsim_ti.materials.prony import Prony
@@ -23,5 +24,15 @@ from diffsim_ti.materials.yeoh import Yeoh
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
 __all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw", "KelvinVoigt"]
-__all__ += ["Law", "LinearElastic", "Material", "MooneyRivlin", "Ogden", "Prony", "SmithNeoHookean"]
-__all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh", "invariants"]
+__all__ += [
+    "Law",
+    "Library",
+    "LinearElastic",
+    "Material",
+    "Measured",
+    "MooneyRivlin",
+    "Ogden",
+    "Prony",
+    "SmithNeoHookean",
+]
+__all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh", "invariants", "library"]
