@@ -66,9 +66,8 @@ def fit(
             entry["density"] = density
         entries[name or title(file.stem)] = _rounded(entry)
     output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(
-        json.dumps(dict(source=source, materials=entries), indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
+    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(entry, ensure_ascii=False)}" for key, entry in entries.items())
+    output.write_text(f'{{"materials": {{\n{lines}\n}}}}\n', encoding="utf-8")
     library = Library(output)
     print(library.describe() if len(files) > 1 else next(iter(library.values())).describe())
     for text in failed:

@@ -16,23 +16,24 @@ from diffsim_ti.materials.measured import Library, Measured, library
 from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
 from diffsim_ti.materials.ogden import Ogden
 from diffsim_ti.materials.prony import Prony
+from diffsim_ti.materials.rubber_fit import fit_rubber
 from diffsim_ti.materials.smith_neo_hookean import SmithNeoHookean
 from diffsim_ti.materials.st_venant_kirchhoff import StVenantKirchhoff
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookean
+from diffsim_ti.materials.tensile_test import TensileTest
 from diffsim_ti.materials.yeoh import Yeoh
 
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
 __all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw", "KelvinVoigt"]
+__all__ += ["Law", "Library", "LinearElastic", "Material", "Measured", "MooneyRivlin", "Ogden", "Prony"]
 __all__ += [
-    "Law",
-    "Library",
-    "LinearElastic",
-    "Material",
-    "Measured",
-    "MooneyRivlin",
-    "Ogden",
-    "Prony",
     "SmithNeoHookean",
+    "StVenantKirchhoff",
+    "StableNeoHookean",
+    "StrainLaw",
+    "TensileTest",
+    "Yeoh",
+    "fit_rubber",
 ]
-__all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh", "invariants", "library"]
+__all__ += ["invariants", "library"]

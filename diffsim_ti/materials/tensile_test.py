@@ -52,20 +52,20 @@ class TensileTest:
         first = next((k for k, m in zip(numeric, numeric[2:]) if m == k + 2), None)
         if first is None:
             raise ValueError(f"{path}: no three lines with two numbers or more follow each other: {REMEDY}")
+        titled = [k for k, row in enumerate(rows[:first]) if re.search(f"{STRESS}|{FORCE}", " ".join(row[1:]).lower())]
+        if titled:  # what lies between is damaged
+            first = titled[-1] + 1 + _are_units(rows[titled[-1] + 1])
         titles, header = _titles(rows[:first], path)
         table = [_numbers(row) for row in rows[first:]]
         kept = [row for row in table if row is not None and len(row) >= len(titles)]
-        if len(kept) < len([row for row in table if row is not None]) / 2 or len(kept[0]) > len(titles):
+        if not kept or len(kept) < sum(row is not None for row in table) / 2 or len(kept[0]) > len(titles):
             raise ValueError(
-                f"{path}: lines have {len(_numbers(rows[first]))} cells and the titles {len(titles)}: give each column one; "
-                "where commas part the cells, decimals need points"
+                f"{path}: lines have {len(kept[0]) if kept else 'too few'} cells and the titles {len(titles)}: give each "
+                "column one; where commas part the cells, decimals need points"
             )
         columns = {title: np.array([row[k] for row in kept]) for k, title in reversed(list(enumerate(titles))) if title}
-        said = (
-            []
-            if len(kept) == len(table)
-            else [f"{len(table) - len(kept)} lines that are no row of numbers are left out"]
-        )
+        lost = len(table) - len(kept)
+        said = [f"{lost} lines that are no row of numbers are left out"] if lost else []
         stretch = _stretch(columns, header, path)
         stress = _stress(columns, header, stretch, path)
         return cls(*_first_loading(stretch, stress, said, path), kind, header, said)
@@ -90,7 +90,9 @@ def _cells(path) -> list[list[str]]:
     else:
         raise ValueError(f"{path}: is not a text file; save the table as CSV")
     lines = [line for line in text.splitlines() if line.strip(' \t;,"')]
-    parted = [list(csv.reader(lines, delimiter=mark)) for mark in ";\t,"] + [[line.split() for line in lines]]
+    parted = [[next(csv.reader([line], delimiter=mark)) for line in lines] for mark in ";\t,"] + [
+        [line.split() for line in lines]
+    ]
     return max(parted, key=lambda rows: sum(_numbers(row) is not None for row in rows))
 
 
@@ -112,6 +114,10 @@ def _numbers(row: list[str]) -> list[float] | None:
     return numbers if np.isfinite(numbers).sum() >= 2 else None
 
 
+def _are_units(row: list[str]) -> bool:
+    return all(re.fullmatch(rf"[(\[]?{UNIT}?[)\]]?", cell.strip().lower()) for cell in row)
+
+
 def _titles(above: list[list[str]], path) -> tuple[list[str], dict[str, str]]:
     """Titles of the columns in lower case, with units, and {name: value} of the other lines."""
     while above and sum(bool(cell.strip()) for cell in above[-1]) < 2:
@@ -119,7 +125,7 @@ def _titles(above: list[list[str]], path) -> tuple[list[str], dict[str, str]]:
     if not above:
         raise ValueError(f"{path}: nothing says what the columns are: {REMEDY}")
     titles, above = [cell.strip().lower() for cell in above[-1]], above[:-1]
-    if above and all(re.fullmatch(rf"[(\[]?{UNIT}?[)\]]?", title) for title in titles):
+    if above and _are_units(titles):
         titles, above = [f"{a.strip().lower()} {b}" for a, b in zip(above[-1], titles)], above[:-1]
     while titles and not titles[-1]:
         titles.pop()
@@ -197,6 +203,10 @@ def _first_loading(stretch: np.ndarray, stress: np.ndarray, said: list[str], pat
 
     known = np.isfinite(stretch) & np.isfinite(stress)
     stretch, stress = stretch[known], stress[known]
+    strange = np.abs(stretch - median_filter(stretch, 5, mode="nearest")) > 0.05 * np.ptp(stretch)
+    if strange.any():
+        said.append(f"{strange.sum()} spikes of the stretch are left out")
+        stretch, stress = stretch[~strange], stress[~strange]
     if len(stretch) < FEWEST:
         raise ValueError(
             f"{path}: {len(stretch)} rows have stretch and stress; {FEWEST} are the fewest that are fitted"
@@ -218,6 +228,11 @@ def _first_loading(stretch: np.ndarray, stress: np.ndarray, said: list[str], pat
             f"{path}: of {len(known)} rows {end} are left before the largest stress, to stretch "
             f"{max(stretch, default=1):.3g}: a test in tension needs {FEWEST}, to 1.05 or more, with stresses above zero"
         )
+    typical = median_filter(stress, 5, mode="nearest")
+    spikes = np.abs(stress - typical) > 0.05 * typical.max()
+    if spikes.any():
+        said.append(f"{spikes.sum()} spikes of the stress are left out")
+        stretch, stress = stretch[~spikes], stress[~spikes]
     strain = np.concatenate([[0.0], stretch - 1])  # without slack half of the stress is there at half of the strain
     none = stress < 0.05 * np.interp(2 * strain[1:], strain, np.concatenate([[0.0], stress]))
     slack = strain[np.flatnonzero(none).max(initial=-1) + 1]
@@ -225,8 +240,4 @@ def _first_loading(stretch: np.ndarray, stress: np.ndarray, said: list[str], pat
         said.append(f"slack: the stress begins at stretch {1 + slack:.3g}, which is taken as the length at rest")
         taut = stretch > 1 + slack
         stretch, stress = stretch[taut] / (1 + slack), stress[taut]
-    typical = median_filter(stress, 5, mode="nearest")
-    spikes = np.abs(stress - typical) > 0.05 * stress.max()
-    if spikes.any():
-        said.append(f"{spikes.sum()} spikes of the stress are left out")
-    return stretch[~spikes], stress[~spikes]
+    return stretch, stress
