@@ -18,6 +18,7 @@ from diffsim_ti.cli import options as opt
 from diffsim_ti.cli import study, view
 from diffsim_ti.cli.check import check
 from diffsim_ti.cli.config import write_options
+from diffsim_ti.cli.fit import fit
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.selftest import selftest
 from diffsim_ti.cli.sweep import sweep
@@ -38,9 +39,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # for which [s] is no unit
-    epilog="Exit codes: 0 done; 1 check-gradients found a wrong gradient, check something in a mesh, selftest a number that "
-    "is not as stored, or stability a run that is wrong and does not say so; 2 an error, said in one line on stderr; "
-    "130 interrupted.",
+    epilog="Exit codes: 0 done; 1 check-gradients found a wrong gradient, check something in a mesh, fit a file that is no "
+    "test, selftest a number that is not as stored, or stability a run that is wrong and does not say so; 2 an error, said "
+    "in one line on stderr; 130 interrupted.",
 )
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
 for command in (
@@ -52,6 +53,7 @@ for command in (
     view.render,
     view.view,
     identify,
+    fit,
     check,
     selftest,
 ):

@@ -12,16 +12,28 @@ from diffsim_ti.materials.kelvin_voigt import KelvinVoigt
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.measured import Library, Measured, library
 from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
 from diffsim_ti.materials.ogden import Ogden
 from diffsim_ti.materials.prony import Prony
+from diffsim_ti.materials.rubber_fit import fit_rubber
 from diffsim_ti.materials.smith_neo_hookean import SmithNeoHookean
 from diffsim_ti.materials.st_venant_kirchhoff import StVenantKirchhoff
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookean
+from diffsim_ti.materials.tensile_test import TensileTest
 from diffsim_ti.materials.yeoh import Yeoh
 
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
 __all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw", "KelvinVoigt"]
-__all__ += ["Law", "LinearElastic", "Material", "MooneyRivlin", "Ogden", "Prony", "SmithNeoHookean"]
-__all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh", "invariants"]
+__all__ += ["Law", "Library", "LinearElastic", "Material", "Measured", "MooneyRivlin", "Ogden", "Prony"]
+__all__ += [
+    "SmithNeoHookean",
+    "StVenantKirchhoff",
+    "StableNeoHookean",
+    "StrainLaw",
+    "TensileTest",
+    "Yeoh",
+    "fit_rubber",
+]
+__all__ += ["invariants", "library"]

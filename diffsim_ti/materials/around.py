@@ -25,6 +25,7 @@ class Around(Material):
                 "viscosity around all else"
             )
         self.material, self.own, self.J_floor, self._extra = material, tuple(numbers), None, ""
+        self.density, self.valid_to = material.density, material.valid_to
         self._numbers = numbers | material._numbers
         self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
 

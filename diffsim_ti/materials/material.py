@@ -49,6 +49,8 @@ class Material(metaclass=Public):
     from_lame = np.eye(2)
     to_lame: np.ndarray | None = None
     from_own: np.ndarray | None = None  # None: the coefficients are the numbers themselves
+    density = 1000.0  # [kg/m^3], of a Scene that is given none
+    valid_to = np.inf  # the stretch to which the law is known; runs beyond it warn
 
     def __init__(self, *numbers: PerTetrahedron | None, J_floor: float | None = None, **named: PerTetrahedron | None):
         if J_floor is not None and not 0 < J_floor < 1:

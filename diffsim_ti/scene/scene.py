@@ -39,8 +39,10 @@ def _kind(term) -> tuple:
     return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
 
 
-def _density(given: ArrayLike | Mapping[str, float], mesh: TetrahedralMesh) -> ArrayLike:
-    """One number or one per tetrahedron, from those of sets too."""
+def _density(given: ArrayLike | Mapping[str, float] | None, mesh: TetrahedralMesh, material: Material) -> ArrayLike:
+    """One number or one per tetrahedron, from those of sets too; the material's where none is given."""
+    if given is None:
+        return material.density
     if not isinstance(given, Mapping):
         return given
     if not given:
@@ -55,7 +57,7 @@ class SceneArguments(TypedDict, total=False):
 
     mesh: TetrahedralMesh
     material: Material
-    density: ArrayLike | Mapping[str, float]
+    density: ArrayLike | Mapping[str, float] | None
     terms: Term | Iterable[Term]
     fixed: Fixed | None
     motion: Motion | Pose | Mapping[str, Motion | Pose] | None
@@ -72,9 +74,9 @@ class Scene(MadeAgain):
 
     mesh: TetrahedralMesh, the rest shape.
     material: a law with its numbers (materials/).
-    density [kg/m^3]: one number, one per tetrahedron, or {tetrahedron set: number}, such as bodies by name; vertices carry
-        the lumped mass sum rho V / 4. Ten-node tetrahedra have consistent masses and weight, lumped ones (HRZ) in explicit
-        steps.
+    density [kg/m^3]: one number, one per tetrahedron, or {tetrahedron set: number}, such as bodies by name; default that of
+        the material, which is 1000 of laws without a density of their own. Vertices carry the lumped mass sum rho V / 4.
+        Ten-node tetrahedra have consistent masses and weight, lumped ones (HRZ) in explicit steps.
     terms: loads, contacts, damping (terms/); gravity, drag, a rotating frame and self-contact at most once. What is not
         listed costs nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act
         one after the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs:
@@ -117,7 +119,7 @@ class Scene(MadeAgain):
         self,
         mesh: TetrahedralMesh,
         material: Material,
-        density: ArrayLike | Mapping[str, float] = 1000.0,
+        density: ArrayLike | Mapping[str, float] | None = None,
         terms: Term | Iterable[Term] = (),
         fixed: Fixed | None = None,
         motion: Motion | Pose | Mapping[str, Motion | Pose] | None = None,
@@ -137,7 +139,7 @@ class Scene(MadeAgain):
         if volume not in ("tetrahedra", "patches"):
             raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
         self.volume = volume
-        density = _density(density, mesh)
+        density = _density(density, mesh, self.material)
         self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
@@ -182,7 +184,7 @@ class Scene(MadeAgain):
             return self
         out, given = self._twin(), self.arguments
         out.consistent, out.mass_scaling = self.mesh.order > 1, None
-        density = _density(given["density"], self.mesh)
+        density = _density(given["density"], self.mesh, self.material)
         out.inputs = Inputs(out, density, given["initial_positions"], given["initial_velocities"])
         return out
 
