@@ -567,11 +567,12 @@ def test_help_says_units_exit_codes_and_the_version(capsys):
 def test_selftest_tells_right_from_wrong(monkeypatch, capsys):
     """All of its scenes run from the wheel alone, by release.py; here three verdicts, without a clock."""
 
-    def fails():
+    def no_solver():
         raise OSError("no such library")
 
     first, *others = selftest.STORED
-    scenes = {first: selftest._scenes()[first], others[0]: selftest._scenes()[first], others[1]: fails}
+    beam = selftest._scenes()[first]
+    scenes = {first: beam, others[0]: beam, others[1]: (no_solver, 1, "density")}
     assert {*selftest._scenes()} == {*selftest.STORED}
     monkeypatch.setattr(selftest, "_scenes", lambda: scenes)
     monkeypatch.setattr(selftest, "_speed", lambda: (1.0, 100.0))

@@ -29,3 +29,8 @@ def test_a_release_holds_all_that_its_tests_need():
     names = released(tracked())
     assert {"tests/conftest.py", "tests/release.py", "assets/make_meshes.py", "pyproject.toml", "CITATION.cff"} <= names
     assert not any(name.startswith(".ci") for name in names)
+
+
+def test_messages_name_the_bounds_of_torch():
+    bounds = re.search(r'"(torch>=[^"]+)"', (ROOT / "pyproject.toml").read_text())[1]
+    assert bounds in (ROOT / "diffsim_ti/torch_bridge/autograd.py").read_text()

@@ -20,7 +20,7 @@ from playwright.sync_api import sync_playwright
 
 HERE = Path(__file__).parent
 SCREENS = {"desk": (1280, 900, "light"), "phone": (390, 844, "dark")}
-# what a reader types -> the pages of which one must be among the first five results
+# what a reader types -> the pages of which one must be among the first results
 WORDS = {
     "StableNeoHookean": "reference/materials.html",
     "friction": "guides/contact_and_friction.html glossary.html reference/contact.html",

@@ -8,7 +8,7 @@ try:
 except ImportError as error:
     raise ImportError(
         "the PyTorch interface of diffsim_ti (diff_physics, diff_simulator) needs torch, which could not be imported "
-        f"({error}): pip install 'torch>=2.2,<2.14' (CPU only: add --index-url https://download.pytorch.org/whl/cpu); "
+        f"({error}): pip install 'torch>=2.4,<2.14' (CPU only: add --index-url https://download.pytorch.org/whl/cpu); "
         "the rest of diffsim_ti works without it"
     ) from error
 
