@@ -40,8 +40,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # for which [s] is no unit
     epilog="Exit codes: 0 done; 1 check-gradients found a wrong gradient, check something in a mesh, fit a file that is no "
-    "test, selftest a number that is not as stored, or stability a run that is wrong and does not say so; 2 an error, said in "
-    "one line on stderr; 130 interrupted.",
+    "test, selftest a number that is not as stored, or stability a run that is wrong and does not say so; 2 an error, said "
+    "in one line on stderr; 130 interrupted.",
 )
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
 for command in (
