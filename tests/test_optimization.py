@@ -39,11 +39,11 @@ def test_round_trip_and_previous(tmp_path):
     "damage, reason",
     [
         (lambda data: data[: len(data) // 2], "truncated or damaged"),
-        (lambda data: data[:30], "another version|not a state of ours"),
-        (lambda data: b"", "not a state of ours"),
+        (lambda data: data[:30], "another version|not a saved state"),
+        (lambda data: b"", "not a saved state"),
         (lambda data: data[:-5] + b"xxxxx", "truncated or damaged"),
         (lambda data: data.replace(b"version 1", b"version 9", 1), "written by another version"),
-        (lambda data: b"PK\x03\x04" + data, "not a state of ours"),
+        (lambda data: b"PK\x03\x04" + data, "not a saved state"),
     ],
     ids=["half", "head", "empty", "bits", "version", "foreign"],
 )
