@@ -48,8 +48,9 @@ def numbers(text: str) -> list[tuple[float, float]]:
 
 
 def run(code: str) -> str:
-    """What a script prints. The session has its runtime: ds.init chooses the precision alone, which is float32 without."""
-    path = ROOT / "tests" / f"_readme_{abs(hash(code))}.py"
+    """What a script prints, run in the working folder. The session has its runtime: ds.init chooses the precision alone,
+    which is float32 without."""
+    path = Path("script.py").resolve()
     path.write_text(code, encoding="utf-8")  # Taichi reads kernels from their file
     out = io.StringIO()
     init, ds.init = ds.init, lambda backend="cpu", precision="f32": ds.runtime.set_precision(precision)
@@ -60,7 +61,6 @@ def run(code: str) -> str:
     finally:
         ds.init = init
         ds.runtime.set_precision("f64")
-        path.unlink()
     return out.getvalue()
 
 

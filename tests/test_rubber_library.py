@@ -256,7 +256,8 @@ def test_a_folder_goes_on_after_a_file_that_is_no_test(tmp_path, capsys):
 def test_fit_refuses_what_it_cannot_read(tmp_path, capsys):
     (tmp_path / "b.csv").write_text("nothing\n")
     assert "no three lines with two numbers" in fails(capsys, "fit", tmp_path / "b.csv")
-    assert "there is no CSV file" in fails(capsys, "fit", tmp_path / "sub")
+    (tmp_path / "empty").mkdir()
+    assert "there is no CSV file" in fails(capsys, "fit", tmp_path / "empty")
 
 
 # ---- the specimen --------------------------------------------------------------------------------------------------------
@@ -264,8 +265,10 @@ def test_fit_refuses_what_it_cannot_read(tmp_path, capsys):
 
 @pytest.mark.filterwarnings("ignore:Measured")
 def test_dumbbell(capsys):
-    """One kind of grip, to a crosshead strain of a third."""
-    numbers = example("identify/dumbbell").main(steps=3, cells=(8, 2, 1), top=1.3)
-    shoulders = numbers["outside the shoulders"]
-    assert shoulders["error"] < 0.02 and np.all(shoulders["share"] < 0.85)
+    """To a crosshead's strain of 8 %, on a coarse mesh: within 2 % of the closed form; the shoulders take a third."""
+    numbers = example("identify/dumbbell").main(steps=1, cells=(8, 2, 1), top=1.08)
+    narrow, shoulders = numbers["at the narrow part"], numbers["12 mm farther out"]
+    assert max(narrow["error"], shoulders["error"]) < 0.02
+    assert 1 < narrow["share"][0] < 1.05 and 0.65 < shoulders["modulus"] < 0.72
+    assert abs(numbers["found"] - numbers["truth"]) < 4 * numbers["deviation"] < 0.02 * numbers["truth"]
     assert "of the closed form" in capsys.readouterr().out

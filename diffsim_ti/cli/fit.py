@@ -79,11 +79,11 @@ def fit(
 
 
 def title(stem: str) -> str:
-    """A name from that of a file: "dragon_skin_30" is "Dragon Skin 30"."""
+    """A name from that of a file: "dragon_skin_fx_20t" is "Dragon Skin FX 20T"."""
     words = stem.replace("_", " ").split()
+    short = [any(x.isdigit() for x in w) or not set(w) & set("aeiouy") for w in words]  # no word that is said
     return " ".join(
-        w if w != w.lower() else w.upper() if len(w) < 3 or any(x.isdigit() for x in w) else w.capitalize()
-        for w in words
+        w if w != w.lower() else w.upper() if letters else w.capitalize() for w, letters in zip(words, short)
     )
 
 

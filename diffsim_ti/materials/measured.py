@@ -41,7 +41,7 @@ class Measured(Around):
     source: who measured what, and under which licence. said: what was left out of the data, in words.
 
     The bulk modulus is none of the test's: 1 GPa, as silicone has it. `up_to` gives the law with a smaller one.
-    Treloar, The Physics of Rubber Elasticity, 3rd ed. 1975.
+    Tests of the library: Marechal et al., doi:10.1089/soro.2019.0115.
     """
 
     takes_moduli = remembers = False
