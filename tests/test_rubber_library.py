@@ -6,7 +6,7 @@ import warnings
 import battery_of_fits
 import numpy as np
 import pytest
-from example_files import example
+from example_files import EXAMPLES, example
 from test_cli import fails
 
 import diffsim_ti as ds
@@ -192,9 +192,8 @@ def test_names_are_answered_and_nothing_is_read_on_import():
     with pytest.raises(KeyError, match=r"did you mean 'Dragon Skin 30'\? There are Bodydouble"):
         library["Dragonskin 3O"]
     fresh = Library(library.path)
-    assert (
-        "_entries" not in vars(fresh) and "| Ecoflex 00-30 | Yeoh |" in fresh.describe() and "_entries" in vars(fresh)
-    )
+    assert "_entries" not in vars(fresh) and len(fresh) == 15 and "_entries" in vars(fresh)
+    assert library.describe() in (EXAMPLES / "guides" / "which_material.md").read_text()
 
 
 def test_viscosity_goes_around_a_rubber_and_keeps_its_density_and_range():
@@ -235,7 +234,7 @@ def fit(*arguments) -> int:
 
 def test_fit_writes_a_library_that_gives_materials(tmp_path, capsys):
     (tmp_path / "my_rubber_20.csv").write_text(
-        "Density (g/cm^3);1.12\nLab;Ours\n" + FORMS["two columns"].replace(",", ";")
+        "Density (g/cm3);1.12\nLab;Ours\n" + FORMS["two columns"].replace(",", ";")
     )
     assert fit(tmp_path / "my_rubber_20.csv", "-o", tmp_path / "own.json", "--source", "ours") == 0
     out = capsys.readouterr().out

@@ -8,7 +8,7 @@ import typer
 
 from diffsim_ti.materials.measured import Library
 from diffsim_ti.materials.rubber_fit import fit_rubber
-from diffsim_ti.materials.tensile_test import TensileTest
+from diffsim_ti.materials.tensile_test import TensileTest, of_header
 
 PUBLISHED = {  # words of headers, and what of them is said of the source
     "lab": "{}",
@@ -44,7 +44,8 @@ def fit(
 
     `diffsim_ti.materials.Library(output)[name]` is the material. Exit code 1 if a file gave none.
     """
-    files = sorted(file for path in tests for file in (path.glob("*.csv") if path.is_dir() else [path]))
+    found = (file for path in tests for file in (path.iterdir() if path.is_dir() else [path]))
+    files = sorted(file for file in found if file in tests or file.suffix.lower() == ".csv")
     if not files:
         raise ValueError(f"{', '.join(map(str, tests))}: there is no CSV file")
     others = [
@@ -56,15 +57,16 @@ def fit(
     for file in files:
         try:
             own = [TensileTest.from_file(path, kind) for path, kind in ((file, "uniaxial"), *others)]
+            entry = fit_rubber(own) | _about(own, source)
         except ValueError as error:
             if len(files) == 1:
                 raise
             failed.append(str(error))
             continue
-        entry = fit_rubber(own) | _about(own, source)
         if density:
             entry["density"] = density
-        entries[name or title(file.stem)] = _rounded(entry)
+        own_name = name or title(file.stem)
+        entries[str(file) if own_name in entries else own_name] = _rounded(entry)
     output.parent.mkdir(parents=True, exist_ok=True)
     lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(entry, ensure_ascii=False)}" for key, entry in entries.items())
     output.write_text(f'{{"materials": {{\n{lines}\n}}}}\n', encoding="utf-8")
@@ -94,10 +96,9 @@ def _about(tests: list[TensileTest], source: str) -> dict:
         source="; ".join([*parts, *([source] if source else [])]), said=[text for test in tests for text in test.said]
     )
     for unit, factor in (("g/cm", 1e3), ("g/cc", 1e3), ("kg/m", 1.0)):
-        for key, value in header.items():
-            if "density" in key and unit in key:
-                out["density"] = factor * float(value.replace(",", "."))
-                break
+        known = of_header(header, "density", unit)
+        if known and factor * known > 100:
+            out["density"] = factor * known
     return out | ({"rate": tests[0].rate} if tests[0].rate else {})
 
 

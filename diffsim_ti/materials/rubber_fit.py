@@ -238,9 +238,10 @@ def fit_rubber(tests: TensileTest | Sequence[TensileTest]) -> dict:
     """
     tests = [tests] if isinstance(tests, TensileTest) else list(tests)
     end = max(test.stretch[-1] for test in tests)
-    tops = [x for x in 1 + (end - 1) * np.arange(20, 3, -1) / 20 if x >= min(LOW, end)]
-    for top in tops:
+    for top in [end, *(x for x in 1 + (end - 1) * np.arange(19, 3, -1) / 20 if x >= LOW)]:
         curves = [c for c in (Curve.of(test, top) for test in tests) if c]
+        if not curves:  # too few rows so far down
+            break
         found = []
         for law, count in LAWS:
             p, errors = _judged(law, count, curves, top)

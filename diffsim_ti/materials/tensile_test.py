@@ -73,7 +73,7 @@ class TensileTest:
     @property
     def rate(self) -> float | None:
         """Nominal rate of strain at the beginning [1/s], from the header's speed and length."""
-        speed, length = (_of_header(self.header, word, "mm") for word in ("speed", "length"))
+        speed, length = (of_header(self.header, word, "mm") for word in ("speed", "length"))
         return speed / 60 / length if speed and length else None
 
 
@@ -133,10 +133,10 @@ def _titles(above: list[list[str]], path) -> tuple[list[str], dict[str, str]]:
     return titles, header
 
 
-def _of_header(header: dict[str, str], word: str, unit: str) -> float | None:
+def of_header(header: dict[str, str], word: str, unit: str) -> float | None:
     """The first number of the header whose name has this word and unit."""
     for name, value in header.items():
-        if word in name and re.search(rf"\b{unit}\b", name):
+        if word in name and re.search(rf"\b{unit}(\b|[23²³])", name):
             try:
                 return _number(value)
             except ValueError:
@@ -161,7 +161,7 @@ def _stretch(columns: dict, header: dict, path) -> np.ndarray:
             continue
         values, unit = columns[title], _unit(title)
         if unit in ("mm", "cm", "m"):
-            length = _of_header(header, "length", unit)
+            length = of_header(header, "length", unit)
             if length is None:
                 raise ValueError(
                     f'{path}: the column {title!r} needs the length at rest: a line "Length ({unit});33" above'
@@ -190,7 +190,7 @@ def _stress(columns: dict, header: dict, stretch: np.ndarray, path) -> np.ndarra
     title = _find(columns, FORCE)
     if title is None or _unit(title) not in ("n", "kn"):
         raise ValueError(f"{path}: no column is a stress, or a force [N] ({', '.join(columns)}): {REMEDY}")
-    sides = [_of_header(header, word, "mm") for word in ("width", "thickness")]
+    sides = [of_header(header, word, "mm") for word in ("width", "thickness")]
     if None in sides:
         raise ValueError(
             f'{path}: {title!r} needs the cross-section: lines "Width (mm);6" and "Thickness (mm);3" above'
