@@ -8,12 +8,14 @@ from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.fibre_reinforced import FibreReinforced
 from diffsim_ti.materials.gent import Gent
 from diffsim_ti.materials.grown import Grown
+from diffsim_ti.materials.initial_stress import InitialStress
 from diffsim_ti.materials.kelvin_voigt import KelvinVoigt
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
 from diffsim_ti.materials.ogden import Ogden
+from diffsim_ti.materials.orthotropic import Orthotropic
 from diffsim_ti.materials.prony import Prony
 from diffsim_ti.materials.smith_neo_hookean import SmithNeoHookean
 from diffsim_ti.materials.st_venant_kirchhoff import StVenantKirchhoff
@@ -22,6 +24,16 @@ from diffsim_ti.materials.yeoh import Yeoh
 
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
-__all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw", "KelvinVoigt"]
-__all__ += ["Law", "LinearElastic", "Material", "MooneyRivlin", "Ogden", "Prony", "SmithNeoHookean"]
+__all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InitialStress", "InvariantLaw"]
+__all__ += [
+    "KelvinVoigt",
+    "Law",
+    "LinearElastic",
+    "Material",
+    "MooneyRivlin",
+    "Ogden",
+    "Orthotropic",
+    "Prony",
+    "SmithNeoHookean",
+]
 __all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh", "invariants"]

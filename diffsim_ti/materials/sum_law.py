@@ -30,6 +30,27 @@ class SumLaw(Law):
     def lanes(self):
         return self.base.lanes
 
+    @property
+    def last_without_lam(self):
+        factors = self.base.last_without_lam
+        return (0,) * len(self.added.coefficient_names) + tuple(factors) if factors else ()
+
+    @property
+    def has_dilatation(self):
+        return self.base.has_dilatation
+
+    @traced
+    def dilatation(self, H):
+        return self.base.dilatation(H)
+
+    @traced
+    def dilatation_gradient(self, H):
+        return self.base.dilatation_gradient(H)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        return self.base.dilatation_gradient_differential(H, dH)
+
     @traced
     def _parts(self, q):
         """(what the added law takes, what the base takes)"""
