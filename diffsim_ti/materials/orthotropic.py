@@ -9,7 +9,7 @@ from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 
 ROWS, COLUMNS = np.triu_indices(6)
-TINY = 1e-100  # an imaginary part whose square vanishes: derivatives of analytic formulas to round-off
+TINY = 1e-100  # scale of imaginary parts, whose squares vanish: derivatives are exact to round-off
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,7 @@ class Orthotropic(Material):
         return (N @ self._stiffness(x) @ np.swapaxes(N, -1, -2))[..., ROWS, COLUMNS]
 
     def _stepped(self, values: dict, tangents: dict) -> dict:
+        """The values with their change as an imaginary part, which analytic formulas carry through."""
         return {name: x + 1j * TINY * np.asarray(tangents.get(name, 0.0)) for name, x in values.items()}
 
     def _pulled_back(self, values: dict, jvp, adjoint: np.ndarray) -> dict[str, np.ndarray]:
@@ -163,19 +164,22 @@ class Orthotropic(Material):
         return tuple(np.moveaxis(self._moduli(self._stiffness(values)), -1, 0))
 
     def _moduli(self, C, dC=None) -> np.ndarray:
-        """(mu, lam), or their change."""
-        scale = np.array([1, 1, 1, 2**0.5, 2**0.5, 2**0.5])
-        lam, rest = (lambda c: c[..., [0, 1, 0], [1, 2, 2]].mean(-1)), np.zeros((6, 6))
-        rest[:3, :3] = 1
+        """(mu, lam), or their change: 2 mu is the largest eigenvalue of C less lam 1 (x) 1, on strains of unit length."""
+        length = np.array([1, 1, 1, 2**0.5, 2**0.5, 2**0.5])
 
-        def without_lam(c):
-            return c * np.outer(scale, scale) - lam(c)[..., None, None] * rest
+        def parts(c):
+            lam = c[..., [0, 1, 0], [1, 2, 2]].mean(-1)
+            rest = c * np.outer(length, length)
+            rest[..., :3, :3] -= lam[..., None, None]
+            return lam, rest
 
-        sizes, vectors = np.linalg.eigh(without_lam(C))
+        lam, rest = parts(C)
+        sizes, vectors = np.linalg.eigh(rest)
         if dC is None:
-            return np.stack([sizes[..., -1] / 2, lam(C)], -1)
+            return np.stack([sizes[..., -1] / 2, lam], -1)
+        d_lam, d_rest = parts(dC)
         v = vectors[..., -1]
-        return np.stack([np.einsum("...i,...ij,...j", v, without_lam(dC), v) / 2, lam(dC)], -1)
+        return np.stack([np.einsum("...i,...ij,...j", v, d_rest, v) / 2, d_lam], -1)
 
     def _moduli_jvp(self, values, tangents) -> np.ndarray:
         return self._moduli(self._stiffness(values), self._stiffness(self._stepped(values, tangents)).imag / TINY)

@@ -9,7 +9,10 @@ from diffsim_ti.runtime import let, traced
 
 @dataclass(frozen=True)
 class SumLaw(Law):
-    """A law `base`, and one that a subclass adds to it: `added`, whose coefficients come first; it may have a state."""
+    """A law `base`, and one that a subclass adds to it: `added`, whose coefficients come first; it may have a state.
+
+    What resists a change of volume is that of the base.
+    """
 
     base: Law | None = None
 
