@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.materials.evaluate import evaluate
 
 
 def relaxed(mesh, material, **support) -> np.ndarray:
@@ -69,6 +70,23 @@ def test_tension_raises_frequencies_at_rest():
     s = np.sqrt(E * h**2 / (12 * S)) / L
     exact = np.sqrt(S / 1000.0) / (2 * L) * (1 + 2 * s + (4 + np.pi**2 / 2) * s**2)
     assert ds.modes(scene, 1).frequencies[0] == pytest.approx(exact, rel=3e-3)
+
+
+def test_what_grew_with_directions_takes_its_size_without_stress():
+    """F_g by strain, as it was given; and the same strain held back is a stress of -C : e, for small ones."""
+    mesh, e = ds.TetrahedralMesh.create_cube(2, 1.0), np.array([2e-2, -1e-2, 5e-3, 4e-3, -3e-3, 8e-3])
+    F = np.eye(3) + e[[[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
+    matter = ds.StVenantKirchhoff(1e6, 0.3)
+    grown, small = ds.Grown(matter, strain=e), ds.Grown(matter, strain=1e-6 * e)
+    p, q = (m.coefficients(m.values(mesh)) for m in (grown, small))
+    assert np.abs(evaluate(grown.law("f64"), F[None], p)[1]).max() < 1e-8
+    held = evaluate(small.law("f64"), np.eye(3)[None], q)[1][0]
+    stress = evaluate(matter.law("f64"), np.eye(3)[None] + 1e-6 * (F - np.eye(3)), q[6:])[1][0]
+    np.testing.assert_allclose(held, -stress, rtol=0, atol=1e-6 * np.abs(stress).max())
+    with pytest.raises(ValueError, match="least principal value of growth_strain must be > -1, got -1.2"):
+        ds.Grown(matter, strain=[-1.2, 0, 0, 0, 0, 0])
+    with pytest.raises(ValueError, match="needs growth or strain, got neither"):
+        ds.Grown(matter)
 
 
 def test_a_second_stress_at_rest_is_refused():

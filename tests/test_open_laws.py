@@ -95,6 +95,12 @@ def tensioned(F, *numbers):
     return mp.fsum(s * e for s, e in zip(numbers, six(F))) + yeoh(F, *numbers[6:])
 
 
+def swollen(F, xx, yy, zz, yz, xz, xy, mu, lam):
+    G = mp.eye(3) + mp.matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    E = (F * G**-1).T * (F * G**-1) / 2 - mp.eye(3) / 2
+    return mp.det(G) * (mu * squares(E) + lam / 2 * (E[0, 0] + E[1, 1] + E[2, 2]) ** 2)
+
+
 WOOD = dict(E1=9.0, E2=2.0, E3=1.0, nu12=0.4, nu23=0.5, nu13=0.3, G12=1.5, G23=0.3, G13=1.0)
 TENSION = [0.3, -0.2, 0.1, 0.2, -0.1, 0.4]
 
@@ -110,6 +116,7 @@ OWN = {  # material, the energy again, one set of coefficients
     "grown": (Grown(ds.LinearElastic(mu=1.0, lam=2.0), 0.1), grown, [0.1, 1.0, 2.0]),
     "ogden": (Ogden([2.0, -0.5], [1.3, -2.0], 3.0), ogden, [2.0, -0.5, 1.3, -2.0, 3.0]),
     "orthotropic": (Orthotropic(**WOOD), hooke, np.linspace(3.0, -1.0, 21).tolist()),
+    "swollen": (Grown(ds.StVenantKirchhoff(mu=1.0, lam=2.0), strain=TENSION), swollen, [*TENSION, 1.0, 2.0]),
     "tensioned": (InitialStress(Yeoh(1.0, -0.1, 0.05, 3.0), TENSION), tensioned, [*TENSION, 1.0, -0.1, 0.05, 3.0]),
 }
 every_own = pytest.mark.parametrize("name", OWN)
@@ -368,6 +375,7 @@ MATERIALS = {
     "transversely isotropic": lambda: Orthotropic(
         E1=9e4, E2=per_tetrahedron(1e4, 2e4), nu12=0.4, nu23=0.3, G12=1e4, direction_1=(1.0, 0.5, -0.3)
     ),
+    "swollen": lambda: Grown(ds.StableNeoHookean(1e4, 0.3), strain=per_tetrahedron(-0.1, 0.1)[:, None] * TENSION),
     "tensioned": lambda: InitialStress(ds.StableNeoHookean(1e4, 0.3), per_tetrahedron(-1e3, 1e3)[:, None] * TENSION),
     "ogden": lambda: Ogden([8e3, -2e3], np.stack([per_tetrahedron(1.2, 2.5), per_tetrahedron(-3, -2)], 1), 3e4),
 }
