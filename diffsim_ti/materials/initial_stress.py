@@ -40,8 +40,8 @@ class InitialStress(Around):
     shape (6,), or (num_tetrahedra, 6), or by sets; an input with gradient, "initial_stress". A `StaticSolver` finds the
     equilibrium of the unloaded body; other solvers begin with what is out of balance, unless S balances itself. Tension
     stiffens, also what `modes` take at rest, and enough compression makes the body buckle.
-    A stretch at rest is `Grown(material, strain=e)`; for small e its stress is -C : e. Energies are those above, negative where a body
-    has relaxed.
+    A stretch at rest is `Grown(material, strain=e)`; for small e its stress is -C : e. Energies are those above, negative
+    where a body has relaxed.
     Holzapfel, Nonlinear Solid Mechanics, 2000, ch. 6.
     Raises ValueError for other shapes, and a material that has a state or a viscosity: these go around this one.
     """
