@@ -32,11 +32,13 @@ from diffsim_ti.materials import (
     FibreReinforced,
     Gent,
     Grown,
+    InitialStress,
     KelvinVoigt,
     LinearElastic,
     Material,
     MooneyRivlin,
     Ogden,
+    Orthotropic,
     Prony,
     SmithNeoHookean,
     StableNeoHookean,
@@ -114,7 +116,8 @@ from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
 __version__ = "0.2.0"
 __all__ = ["init", "TetrahedralMesh", "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated"]
-__all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "Ogden", "FibreReinforced", "KelvinVoigt"]
+__all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "InitialStress"]
+__all__ += ["Ogden", "Orthotropic", "FibreReinforced", "KelvinVoigt"]
 __all__ += ["Prony", "Gravity", "Drag", "ExternalForce", "Traction", "Pressure", "GasChamber", "FilledChamber"]
 __all__ += ["BodyForce", "Spring", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
 __all__ += ["Growth", "Muscle"]

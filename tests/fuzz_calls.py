@@ -34,6 +34,8 @@ LAWS = dict(
     ogden=ds.Ogden([2e4], [2.0], 2e5),
     fibres=ds.FibreReinforced(NEO, 1e4, 1.0, [1, 0, 0]),
     grown=ds.Grown(NEO, 0.01),
+    orthotropic=ds.Orthotropic(9e5, 2e5, 1e5, 0.4, 0.5, 0.3, 1e5, 3e4, 1e5),
+    tensioned=ds.InitialStress(NEO, [1e3, 0, 0, 0, 0, 0]),
     kelvin_voigt=ds.KelvinVoigt(NEO, time=1e-3),
     prony=ds.Prony(NEO, [0.5], [0.1]),
 )

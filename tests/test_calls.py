@@ -61,6 +61,8 @@ def calls() -> dict:
             ds.FibreReinforced,
             dict(matrix=ds.StableNeoHookean(1e5, 0.3), k1=1e4, k2=1.0, fibre=[1, 0, 0]),
         ),
+        "Orthotropic": (ds.Orthotropic, dict(E1=9.0, E2=2.0, nu12=0.3, nu23=0.4, G12=1.0, direction_1=[1, 0, 0])),
+        "InitialStress": (ds.InitialStress, dict(material=ds.StableNeoHookean(1e5, 0.3), stress=[1, 0, 0, 0, 0, 0])),
         "KelvinVoigt": (ds.KelvinVoigt, dict(material=ds.StableNeoHookean(1e5, 0.3), time=0.01)),
         "Prony": (ds.Prony, dict(material=ds.StableNeoHookean(1e5, 0.3), shares=[0.5], times=[0.1])),
         "Gravity": (ds.Gravity, dict(acceleration=-9.81)),

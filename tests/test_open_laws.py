@@ -13,7 +13,17 @@ from open_laws.viscous import ViscousRubber
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
 from diffsim_ti.differentiation import x_minus_log1p
-from diffsim_ti.materials import EnergyLaw, FibreReinforced, Gent, Grown, Material, Ogden, Yeoh
+from diffsim_ti.materials import (
+    EnergyLaw,
+    FibreReinforced,
+    Gent,
+    Grown,
+    InitialStress,
+    Material,
+    Ogden,
+    Orthotropic,
+    Yeoh,
+)
 from diffsim_ti.materials.calculus.tensor import Tensor, invariants
 from diffsim_ti.materials.gent import GentLaw
 from diffsim_ti.materials.ogden import OgdenLaw
@@ -71,6 +81,29 @@ def grown(F, growth, mu, lam):
     return (1 + growth) ** 3 * (mu * squares(e) + lam / 2 * trace**2)
 
 
+def six(F):
+    E = (F.T * F - mp.eye(3)) / 2
+    return [E[0, 0], E[1, 1], E[2, 2], 2 * E[1, 2], 2 * E[0, 2], 2 * E[0, 1]]
+
+
+def hooke(F, *c):
+    e, rest = six(F), iter(c)
+    return mp.fsum(next(rest) * e[i] * e[j] / (1 + (i == j)) for i in range(6) for j in range(i, 6))
+
+
+def tensioned(F, *numbers):
+    return mp.fsum(s * e for s, e in zip(numbers, six(F))) + yeoh(F, *numbers[6:])
+
+
+def swollen(F, xx, yy, zz, yz, xz, xy, mu, lam):
+    G = mp.eye(3) + mp.matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    E = (F * G**-1).T * (F * G**-1) / 2 - mp.eye(3) / 2
+    return mp.det(G) * (mu * squares(E) + lam / 2 * (E[0, 0] + E[1, 1] + E[2, 2]) ** 2)
+
+
+WOOD = dict(E1=9.0, E2=2.0, E3=1.0, nu12=0.4, nu23=0.5, nu13=0.3, G12=1.5, G23=0.3, G13=1.0)
+TENSION = [0.3, -0.2, 0.1, 0.2, -0.1, 0.4]
+
 OWN = {  # material, the energy again, one set of coefficients
     "yeoh": (Yeoh(1.0, -0.1, 0.05, 3.0), yeoh, [1.0, -0.1, 0.05, 3.0]),
     "gent": (Gent(2.0, 6.0, 3.0), gent, [2.0, 6.0, 3.0]),
@@ -82,6 +115,9 @@ OWN = {  # material, the energy again, one set of coefficients
     ),
     "grown": (Grown(ds.LinearElastic(mu=1.0, lam=2.0), 0.1), grown, [0.1, 1.0, 2.0]),
     "ogden": (Ogden([2.0, -0.5], [1.3, -2.0], 3.0), ogden, [2.0, -0.5, 1.3, -2.0, 3.0]),
+    "orthotropic": (Orthotropic(**WOOD), hooke, np.linspace(3.0, -1.0, 21).tolist()),
+    "swollen": (Grown(ds.StVenantKirchhoff(mu=1.0, lam=2.0), strain=TENSION), swollen, [*TENSION, 1.0, 2.0]),
+    "tensioned": (InitialStress(Yeoh(1.0, -0.1, 0.05, 3.0), TENSION), tensioned, [*TENSION, 1.0, -0.1, 0.05, 3.0]),
 }
 every_own = pytest.mark.parametrize("name", OWN)
 
@@ -324,11 +360,23 @@ def directions():
     return np.random.default_rng(1).standard_normal((ds.TetrahedralMesh.create_cube(2, 1.0).num_tetrahedra, 3))
 
 
+def orthotropic() -> Orthotropic:
+    axes = dict(direction_1=directions(), direction_2=directions()[::-1])
+    moduli = {name: x if name[0] == "n" else 1e4 * x for name, x in WOOD.items()}
+    return Orthotropic(**moduli | {"E3": per_tetrahedron(1e4, 1.2e4)}, **axes)
+
+
 MATERIALS = {
     "yeoh": lambda: Yeoh(5e3, -500.0, per_tetrahedron(50, 200), 3e4),
     "gent": lambda: Gent(mu=1e4, limit=per_tetrahedron(5, 8), bulk_modulus=3e4),
     "knowles": lambda: Knowles(1e4, 0.3, 0.5, per_tetrahedron(0.6, 0.9)),
     "tissue": lambda: FibreReinforced(ds.StableNeoHookean(mu=1e4, lam=2e4), 5e3, 2.0, directions()),
+    "orthotropic": orthotropic,
+    "transversely isotropic": lambda: Orthotropic(
+        E1=9e4, E2=per_tetrahedron(1e4, 2e4), nu12=0.4, nu23=0.3, G12=1e4, direction_1=(1.0, 0.5, -0.3)
+    ),
+    "swollen": lambda: Grown(ds.StableNeoHookean(1e4, 0.3), strain=per_tetrahedron(-0.1, 0.1)[:, None] * TENSION),
+    "tensioned": lambda: InitialStress(ds.StableNeoHookean(1e4, 0.3), per_tetrahedron(-1e3, 1e3)[:, None] * TENSION),
     "ogden": lambda: Ogden([8e3, -2e3], np.stack([per_tetrahedron(1.2, 2.5), per_tetrahedron(-3, -2)], 1), 3e4),
 }
 
@@ -341,13 +389,15 @@ def gates(r: ds.Rollout, round_off: float = 1e-12) -> None:
 
 
 @pytest.mark.parametrize(
-    "name, solver", [(name, ds.SemiImplicitSolver) for name in MATERIALS] + [("tissue", ds.ImplicitEulerSolver)]
+    "name, solver",
+    [(name, ds.SemiImplicitSolver) for name in MATERIALS]
+    + [(x, ds.ImplicitEulerSolver) for x in ("tissue", "tensioned")],
 )
 def test_gradients_by_every_number(name, solver):
     gates(rollout(scene(MATERIALS[name]()), solver), 1e-12 if solver in EXPLICIT else 1e-10)
 
 
-@pytest.mark.parametrize("name", ["gent", "tissue"])
+@pytest.mark.parametrize("name", ["gent", "tissue", "tensioned"])
 def test_gradients_on_patches(name):
     gates(rollout(scene(MATERIALS[name](), volume="patches")))
 

@@ -60,6 +60,8 @@ def parts() -> int:
         ds.Ogden([4e3], [2.0], 1e4),
         ds.Grown(soft, 0.01),
         ds.FibreReinforced(soft, 1e3, 1.0, (1.0, 0.0, 0.0)),
+        ds.Orthotropic(E1=9e5, E2=1e5, nu12=0.3, nu23=0.4, G12=1e5, direction_1=(1.0, 1.0, 0.0)),
+        ds.InitialStress(soft, (1e3, 0.0, 0.0, 0.0, 0.0, 0.0)),
         ds.KelvinVoigt(soft, time=1e-3),
         ds.Prony(soft, [0.5], [0.1]),
     ]

@@ -8,6 +8,7 @@ from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.fibre_reinforced import FibreReinforced
 from diffsim_ti.materials.gent import Gent
 from diffsim_ti.materials.grown import Grown
+from diffsim_ti.materials.initial_stress import InitialStress
 from diffsim_ti.materials.kelvin_voigt import KelvinVoigt
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
@@ -15,6 +16,7 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.measured import Library, Measured, library
 from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
 from diffsim_ti.materials.ogden import Ogden
+from diffsim_ti.materials.orthotropic import Orthotropic
 from diffsim_ti.materials.prony import Prony
 from diffsim_ti.materials.rubber_fit import fit_rubber
 from diffsim_ti.materials.smith_neo_hookean import SmithNeoHookean
@@ -25,15 +27,7 @@ from diffsim_ti.materials.yeoh import Yeoh
 
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
-__all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw", "KelvinVoigt"]
-__all__ += ["Law", "Library", "LinearElastic", "Material", "Measured", "MooneyRivlin", "Ogden", "Prony"]
-__all__ += [
-    "SmithNeoHookean",
-    "StVenantKirchhoff",
-    "StableNeoHookean",
-    "StrainLaw",
-    "TensileTest",
-    "Yeoh",
-    "fit_rubber",
-]
-__all__ += ["invariants", "library"]
+__all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InitialStress", "InvariantLaw"]
+__all__ += ["KelvinVoigt", "Law", "Library", "LinearElastic", "Material", "Measured", "MooneyRivlin", "Ogden"]
+__all__ += ["Orthotropic", "Prony", "SmithNeoHookean", "StVenantKirchhoff", "StableNeoHookean", "StrainLaw"]
+__all__ += ["TensileTest", "Yeoh", "fit_rubber", "invariants", "library"]

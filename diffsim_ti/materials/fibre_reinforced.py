@@ -9,7 +9,6 @@ from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.materials.sum_law import SumLaw
-from diffsim_ti.runtime import traced
 
 UNITS = {"k1": "Pa", "k2": "-", "fibre": "-"}
 
@@ -39,27 +38,6 @@ class FibreReinforcedLaw(SumLaw):
     @property
     def added(self) -> FibreLaw:
         return FibreLaw(self.precision)
-
-    @property
-    def last_without_lam(self):
-        factors = self.base.last_without_lam
-        return (0,) * len(FibreLaw.coefficient_names) + tuple(factors) if factors else ()
-
-    @property
-    def has_dilatation(self):
-        return self.base.has_dilatation
-
-    @traced
-    def dilatation(self, H):
-        return self.base.dilatation(H)
-
-    @traced
-    def dilatation_gradient(self, H):
-        return self.base.dilatation_gradient(H)
-
-    @traced
-    def dilatation_gradient_differential(self, H, dH):
-        return self.base.dilatation_gradient_differential(H, dH)
 
 
 class FibreReinforced(Around):

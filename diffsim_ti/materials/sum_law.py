@@ -9,7 +9,10 @@ from diffsim_ti.runtime import let, traced
 
 @dataclass(frozen=True)
 class SumLaw(Law):
-    """A law `base`, and one that a subclass adds to it: `added`, whose coefficients come first; it may have a state."""
+    """A law `base`, and one that a subclass adds to it: `added`, whose coefficients come first; it may have a state.
+
+    What resists a change of volume is that of the base.
+    """
 
     base: Law | None = None
 
@@ -29,6 +32,27 @@ class SumLaw(Law):
     @property
     def lanes(self):
         return self.base.lanes
+
+    @property
+    def last_without_lam(self):
+        factors = self.base.last_without_lam
+        return (0,) * len(self.added.coefficient_names) + tuple(factors) if factors else ()
+
+    @property
+    def has_dilatation(self):
+        return self.base.has_dilatation
+
+    @traced
+    def dilatation(self, H):
+        return self.base.dilatation(H)
+
+    @traced
+    def dilatation_gradient(self, H):
+        return self.base.dilatation_gradient(H)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        return self.base.dilatation_gradient_differential(H, dH)
 
     @traced
     def _parts(self, q):
