@@ -210,7 +210,7 @@ class SurfacePairs:
             pace = np.maximum(overall / self.age, last)
             pace += pace.mean(0)  # the mean, for what will be hit
             passes = self.typical_slack * self.width / max(float(np.median(pace.max(1))), 1e-300)
-            slack[:, :2] = np.clip(passes, self.fewest_passes, self.most_passes) * pace
+            slack[:, :2] = np.maximum(np.clip(passes, self.fewest_passes, self.most_passes) * pace, wanted)
             # the slack before, for what shakes
             slack[:, :2] = np.maximum(slack, 0.9 * whole(self.list.slack))[:, :2]
         for k, largest in enumerate(self.largest_reach):
