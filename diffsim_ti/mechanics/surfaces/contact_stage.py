@@ -27,6 +27,7 @@ from diffsim_ti.runtime.slots import VertexRows
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 MOST_LISTS = 6  # made for one pass
+PASSES = 6  # like this one, that a list made for it should hold for
 SHORTEST = 2.0**-14  # share of a pass
 
 
@@ -141,7 +142,7 @@ class PairContact(Stage):
         for _ in range(MOST_LISTS if now and now.alpha > 0 else 0):
             if stale:
                 moved = runtime.fetch_row(*self._fine(history.u, at.end))[inner.mesh.surface_vertices]
-                wanted = np.maximum(wanted, 1.1 * inner.travel(moved - runtime.fetch(inner.before)))
+                wanted = np.maximum(wanted, PASSES * inner.travel(moved - runtime.fetch(inner.before)))
                 self.rows.put(history.u, at.end, u[own])
                 self.rows.put(history.v, at.end, v)
                 self.rows.put(self.begin, 0, start[own])

@@ -26,12 +26,13 @@ MOST_ROUNDS = 60
 SURE = 1e-9  # relative change of distances at which Newton's method takes its last step
 EXACT = 1e-20  # relative square of the residual that conjugate gradients leave
 TOO_LONG, TAKEN, UNSOLVED = range(3)  # what came of a part
+LOOK, CHECK, CHECK_BEGIN, CHECK_END, DONE = range(5)  # steps of a part: normals are taken, surfaces are apart
 
 PAIRS = dict.fromkeys(("corners", "number", "chosen"), "ints")
 PAIRS |= dict.fromkeys(("scale", "stiffness", "width", "radius", "mu", "speed"), "scalars")
 NODES = dict(start="ints", index="ints", weight="scalars", x="vectors", motion="vectors", inverse="scalars", free="vectors")
 STATE = dict.fromkeys(("e", "b", "e_next", "b_next", "xi"), "vectors") | dict(result="ints", damping="scalars")
-WORK = dict(filled="ints", node="ints", share="scalars", row="vectors", n="vectors")
+WORK = dict(filled="ints", open="ints", node="ints", share="scalars", row="vectors", n="vectors")
 WORK |= dict.fromkeys(("fading", "begin", "end", "change", "P", "K", "stiff", "q", "r", "z", "p", "Ap"), "scalars")
 WORK |= dict.fromkeys(("at_begin", "at_look", "moved", "at_end", "f", "residual", "step", "sum"), "vectors")
 WORK |= dict.fromkeys(("root", "load", "gauss"), "scalars")
@@ -231,24 +232,30 @@ class PartKernels(Pair):
         return farthest
 
     @ti.func
-    def look(self, kind: A, p, c, pairs: A, nodes: A, work: A, plan: A):
-        """Where pair p is and how it would go; whether a part resolves it."""
-        y1, y2, y3 = self.relative(p, work.at_look, pairs)
-        f1, f2, f3 = self.relative(p, work.moved, pairs)
-        w, r, G = self.nearest(kind, y1, y2, y3)
-        length, theta, m = ti.sqrt(r.norm_sqr()), 0.5 * (1 - c), ti.cast(1, self.fp)
-        if ti.static(kind == EDGE_EDGE):
-            m, _, _ = self.mollifier((pairs.scale[p] * y1.cross(y3 - y2)).norm_sqr())
-        n, d = r / length, length - pairs.radius[p]
-        along = n.dot(w[1] * f1 + w[2] * f2 + w[3] * f3)
-        work.n[p], work.fading[p] = self.four(n), m
-        work.begin[p], work.end[p] = d - theta * along, d + (1 - theta) * along
-        self.set_row(p, w, pairs, nodes, work, plan)
-        for k in range(p * plan.room, p * plan.room + work.filled[p]):
-            i = work.node[k]
-            work.row[k] = work.share[k] * work.root[i] * self.four(self.freed(i, n, nodes))
-        before = self.parted(kind, p, n, work.at_begin, pairs) - pairs.radius[p]
-        return before > 0 and d > HALF * before
+    def look(self, kind: A, p, step, c, room, pairs: A, nodes: A, work: A, plan: A):
+        """LOOK: where pair p is and how it would go; whether a part resolves it. After the part: whether a plane parts it
+        where the part begins and where it ends, and so all the way: the plane from LOOK, or one where points look."""
+        w, r, m, n = self.vec4(0), self.vec3(0), ti.cast(1, self.fp), three(work.n[p])
+        if step != CHECK:
+            y1, y2, y3 = self.relative(p, work.at_look, pairs)
+            w, r, G = self.nearest(kind, y1, y2, y3)
+            n = r / ti.max(ti.sqrt(r.norm_sqr()), 1e-300)
+            if ti.static(kind == EDGE_EDGE):
+                m, by_q, by_qq = self.mollifier((pairs.scale[p] * y1.cross(y3 - y2)).norm_sqr())
+        before, fine = self.parted(kind, p, n, work.at_begin, pairs) - pairs.radius[p], False
+        if step == LOOK:
+            f1, f2, f3 = self.relative(p, work.moved, pairs)
+            d, theta, along = n.dot(r) - pairs.radius[p], 0.5 * (1 - c), n.dot(w[1] * f1 + w[2] * f2 + w[3] * f3)
+            work.n[p], work.fading[p] = self.four(n), m
+            work.begin[p], work.end[p] = d - theta * along, d + (1 - theta) * along
+            self.set_row(p, w, pairs, nodes, work, plan)
+            for k in range(p * plan.room, p * plan.room + work.filled[p]):
+                i = work.node[k]
+                work.row[k] = work.share[k] * work.root[i] * self.four(self.freed(i, n, nodes))
+            fine = before > 0 and d > HALF * before
+        else:
+            fine = ti.min(before, self.parted(kind, p, n, work.at_end, pairs) - pairs.radius[p]) > room
+        return fine
 
     @ti.func
     def across(self, p, x: A, work: A, plan: A):
@@ -398,55 +405,58 @@ class PartKernels(Pair):
         self.spread(work.at_end, work.sum, nodes, plan)
 
     @ti.func
-    def stays_apart(self, kind: A, p, room, pairs: A, work: A):
-        """Whether a plane parts pair p where the part begins and where it ends, and so all the way."""
-        n = three(work.n[p])
-        begin, end = self.parted(kind, p, n, work.at_begin, pairs), self.parted(kind, p, n, work.at_end, pairs)
-        return ti.min(begin, end) > room + pairs.radius[p]
+    def farthest_place(self, pairs: A, work: A, plan: A):
+        """The largest coordinate of a corner at the end."""
+        out = ti.cast(0, self.fp)
+        for p in range(plan.num_pairs):
+            if pairs.chosen[p] > 0:
+                for k in range(4 * p, 4 * p + 4):
+                    x = work.at_end[pairs.corners[k]]
+                    out = ti.max(out, ti.abs(x[0]), ti.abs(x[1]), ti.abs(x[2]))
+        return out
 
     @ti.func
     def take_all(self, pairs: A, nodes: A, state: A, work: A, plan: A):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            c, result, resolved, tries = plan.damping, TOO_LONG, 0, 0
-            wall = plan.wall / (plan.share * plan.h) ** 2
-            while resolved == 0 and tries < 2:
-                square, tries = self.place(c, pairs, nodes, state, work, plan), tries + 1
-                if square > LONGEST**2:
-                    tries = 2
+            c, result, step, room = plan.damping, TOO_LONG, LOOK, ti.cast(0, self.fp)
+            square = self.place(c, pairs, nodes, state, work, plan)
+            if square > LONGEST**2:
+                step = DONE
+            for p in range(plan.num_pairs):
+                work.open[p] = pairs.chosen[p]
+            while step < DONE:
+                left = 0  # pairs that are not fine
+                for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
+                    for p in range(first_of(kind, plan), behind(kind, plan)):
+                        if work.open[p] > 0:
+                            fine = self.look(kind, p, step, c, room, pairs, nodes, work, plan)
+                            if fine and step > LOOK:
+                                work.open[p] = 0
+                            left += ti.cast(not fine, ti.i32)
+                if step == LOOK and c < 1 and left > 0:
+                    if square > RESOLVED**2:
+                        step = DONE
+                    c = 1.0
+                    for i in range(plan.num_nodes):
+                        work.root[i] = ti.sqrt(2 / (1 + plan.damping)) * work.root[i]
+                    for i in range(plan.num_points):
+                        work.at_look[i] = work.at_begin[i]
+                elif step == LOOK:
+                    result, step = UNSOLVED, DONE
+                    if self.balance(c, plan.wall / (plan.share * plan.h) ** 2, pairs, state, work, plan):
+                        self.act(c, pairs, nodes, state, work, plan)
+                        room, step = plan.rounding * (1 + self.farthest_place(pairs, work, plan)), CHECK
+                elif left == 0:
+                    result, step = TAKEN, DONE
+                    for i in range(plan.num_nodes):
+                        state.e[i], state.b[i] = state.e_next[i], state.b_next[i]
                 else:
-                    resolved = 1
-                    for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-                        for p in range(first_of(kind, plan), behind(kind, plan)):
-                            if pairs.chosen[p] > 0:
-                                if not self.look(kind, p, c, pairs, nodes, work, plan):
-                                    resolved = 0
-                    if c == 1.0:
-                        resolved = 1
-                    elif resolved == 0:
-                        c = 1.0
-                        if square > RESOLVED**2:
-                            tries = 2
-            if resolved == 1:
-                result = UNSOLVED
-                if self.balance(c, wall, pairs, state, work, plan):
-                    result = TAKEN
-                    self.act(c, pairs, nodes, state, work, plan)
-                    room = ti.cast(0, self.fp)
-                    for p in range(plan.num_pairs):
-                        if pairs.chosen[p] > 0:
-                            for k in range(4 * p, 4 * p + 4):
-                                x = work.at_end[pairs.corners[k]]
-                                room = ti.max(room, ti.abs(x[0]), ti.abs(x[1]), ti.abs(x[2]))
-                    room = plan.rounding * (1 + room)
-                    for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-                        for p in range(first_of(kind, plan), behind(kind, plan)):
-                            if pairs.chosen[p] > 0:
-                                if not self.stays_apart(kind, p, room, pairs, work):
-                                    result = TOO_LONG
-            if result == TAKEN:
-                for i in range(plan.num_nodes):
-                    state.e[i], state.b[i] = state.e_next[i], state.b_next[i]
+                    result, step = TOO_LONG, step + 1
+                    for i in range(plan.num_points):
+                        work.at_look[i] = work.at_begin[i]
+                        if step == CHECK_END:
+                            work.at_look[i] = work.at_end[i]
             state.result[0], state.damping[0] = result, c
 
     @cached_property
