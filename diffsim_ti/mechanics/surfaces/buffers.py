@@ -115,7 +115,9 @@ class Buffers:
         """The array of that name, made anew, half as long again, if it is too short; then nothing stays bound."""
         have = self._arrays.get(name)
         if have is None or have.shape[0] < count:
-            self._arrays[name] = have = runtime.array(dtype, max(least, count + count // 2 if have is not None else count))
+            self._arrays[name] = have = runtime.array(
+                dtype, max(least, count + count // 2 if have is not None else count)
+            )
             self._launch.clear()
         return have
 

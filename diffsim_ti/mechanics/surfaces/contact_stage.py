@@ -27,7 +27,7 @@ from diffsim_ti.runtime.slots import VertexRows
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 MOST_LISTS = 6  # made for one pass
-PASSES = 6  # like this one, that a list made for it should hold for
+PASSES = 1.5, 15  # like this one, that a list made for it should hold for, at least and at most
 SHORTEST = 2.0**-14  # share of a pass
 
 
@@ -117,66 +117,62 @@ class PairContact(Stage):
     def _fine(self, u, slot: int) -> tuple:
         return (u, slot) if self.matrix is None else (self.pairs.fine(u, slot), 0)
 
-    def _look(self, u, slot: int) -> tuple[bool, bool]:
-        """(whether the list does not hold where the pass led, whether pairs of it may be near)"""
+    def _look(self, u, slot: int) -> tuple[bool, bool, bool]:
+        """Whether the list does not hold where the pass led, whether pairs beyond it may have crossed, and whether pairs of
+        it may be near."""
         inner = self.inner
         inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
-        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, lost=0.0, **inner.sizes_of_sums)
-        inner.run(inner.motion.find, dict(u=u), slot=slot, **bodies)
-        flags = runtime.view(inner.flags)
-        stale, _, near = runtime.fetch(inner.flags) if flags is None else flags
-        return bool(stale), bool(near)
+        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, **inner.sizes_of_sums)
+        inner.run(inner.motion.find, dict(u=u), slot=slot, lost=0.5 * inner.least_width, **bodies)
+        return tuple(bool(x) for x in whole(inner.flags))
 
     def _act(self, at: Passes, start: np.ndarray | None, corners: np.ndarray | None) -> None:
         """What contact does to a pass, anew with a longer list where one does not hold to the end. start, corners:
         displacements where it begins, of the body where the record has none, and of obstacles."""
         inner, history, own = self.inner, at.history, slice(self.num_own)
-        stale, any_near = self._look(*self._fine(history.u, at.end))
+        stale, lost, any_near = self._look(*self._fine(history.u, at.end))
         now = at.now if stale or any_near else None
         if now and now.alpha > 0:
             start = self.rows.get(history.u, at.slot) if start is None else start
             u, v = self.rows.get(history.u, at.end), self.rows.get(history.v, at.end)
             if self.obstacles:
                 start, u = np.concatenate([start, corners]), np.concatenate([u, self.obstacles.displacements])
-        one, wanted = None, 0.0
+        one, needed = None, 0.0
         for _ in range(MOST_LISTS if now and now.alpha > 0 else 0):
             if stale:
                 moved = runtime.fetch_row(*self._fine(history.u, at.end))[inner.mesh.surface_vertices]
-                wanted = np.maximum(wanted, PASSES * inner.travel(moved - runtime.fetch(inner.before)))
+                needed = np.maximum(needed, 1.1 * inner.travel(moved - runtime.fetch(inner.before)))
                 self.rows.put(history.u, at.end, u[own])
                 self.rows.put(history.v, at.end, v)
                 self.rows.put(self.begin, 0, start[own])
                 self._follow(at, AT_BEGIN)
                 begin = self._fine(self.begin, 0)
-                inner.build(*begin, wanted=wanted)
+                inner.build(*begin, wanted=self._passes(needed) * needed, needed=needed)
                 inner.forces(*begin, self.scratch)
                 self._follow(at, AT_STAGE)
-                stale, any_near = self._look(*self._fine(history.u, at.end))
+                _, lost, any_near = self._look(*self._fine(history.u, at.end))
             if any_near:
-                one, stale = self._contact(at, now, start, u, v, stale)
-            if not stale:
+                one, lost = self._contact(at, now, start, u, v, lost)
+            stale = lost
+            if not lost:
                 break
         inner.age += 1
-        if stale:
-            self._check(at)
+        if lost:
+            self._refuse(at, now)
         if at.stride:
             self.kept[at.end] = one
         if one and at.ws.impulses:
             of = self._numbers(one, now)
             self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
 
-    def _check(self, at: Passes) -> None:
-        """Raise Tunnelling unless pairs beyond the list are certain to be apart; those of the set are."""
-        inner = self.inner
-        plane = whole(inner.plane)
-        plane[self.set.numbers, 3] = 1e30
-        if runtime.view(inner.plane) is None:
-            runtime.fill(inner.plane, plane)
-        inner.check_pass(*self._fine(at.history.u, at.end), at.now.h)
+    def _passes(self, travel: np.ndarray) -> float:
+        """How many passes of such lengths of vertices' ways a list should hold for."""
+        share = self.inner.typical_slack * self.inner.width
+        return float(np.clip(share / max(float(np.median(travel.max(1))), 1e-300), *PASSES))
 
-    def _contact(self, at: Passes, now, start, u, v, stale: bool) -> tuple[ContactPass | None, bool]:
+    def _contact(self, at: Passes, now, start, u, v, lost: bool) -> tuple[ContactPass | None, bool]:
         """The stage, with the list as it is, of the pairs that would come near, and of those that do by what it does;
-        (what was done, whether the list does not hold where it led to)."""
+        (what was done, whether pairs beyond the list may have crossed)."""
         near, recording = self.set, bool(at.stride or at.ws.impulses)
         one, parts, b, led_to = None, [], None, u
         for tries in range(MOST_LISTS):
@@ -189,18 +185,18 @@ class PairContact(Stage):
             if not near.choose(led_to[place] - start[place]):
                 break
             near.start(motion)
-            parts = self._go(now, recording)
+            parts = self._go(at, now, recording)
             e, b = near.moved
             led_to, v_next = u.copy(), v.copy()
             led_to[place[own]] += e[own]
             v_next[place[own]] += now.decay * b[own]
             self.rows.put(at.history.u, at.end, led_to[: self.num_own])
             self.rows.put(at.history.v, at.end, v_next)
-            stale, _ = self._look(*self._fine(at.history.u, at.end))
+            _, lost, _ = self._look(*self._fine(at.history.u, at.end))
         if b is not None and recording:
             one = self.whole.of(near.chosen > 0, start, u, v)
             one.parts, one.b = parts, b
-        return one, stale
+        return one, lost
 
     def _extend(self, numbers: np.ndarray, now) -> None:
         """Take more pairs of the list into the set of those that have been near since it was made."""
@@ -299,7 +295,7 @@ class PairContact(Stage):
     def inverse(self) -> np.ndarray:
         return self.a.inverse_of(self.a.values.mass)
 
-    def _go(self, now, recording: bool) -> list[Part]:
+    def _go(self, at: Passes, now, recording: bool) -> list[Part]:
         """The parts of a pass, which are noted if it is recorded."""
         parts, begin, share, shortened = [], 0.0, 1.0, False
         numbers = dict(h=now.h, alpha=now.alpha, damping=self.damping, rounding=self.rounding)
@@ -310,25 +306,24 @@ class PairContact(Stage):
             if came_of != TAKEN:
                 share, shortened = 0.5 * share, True
                 if share < SHORTEST:
-                    self._refuse(now)
+                    self._refuse(at, now)
                 continue
             if recording:
                 parts.append(Part(begin, share, damping, *before, self.set.solution))
             begin, share, shortened = begin + share, share if shortened else 2 * share, False
         return parts
 
-    def _refuse(self, now) -> None:
-        near, chosen = self.whole.near, self.set.chosen > 0
-        move = near.relative(near.points(whole(self.set.arrays["nodes"].motion)[: len(self.whole.nodes), :3]))[chosen]
-        width = self._numbers(self.whole, now).W[chosen].min()
-        speed = float(np.sqrt((move**2).sum(-1)).max()) / now.h
-        corners = self.whole.pairs[chosen][int((move**2).sum(-1).max(1).argmax())]
-        self.inner.fresh = False
+    def _refuse(self, at: Passes, now) -> None:
+        inner, surface = self.inner, self.inner.mesh.surface_vertices
+        moved = runtime.fetch_row(*self._fine(at.history.u, at.end))[surface] - runtime.fetch(inner.before)
+        ways = np.linalg.norm(moved - moved.mean(0), axis=1)
+        i, h = int(ways.argmax()), now.h
+        inner.fresh = False
         error = Tunnelling(
-            f"contact of width {width:.3g} m does not keep surfaces apart near vertices {corners.tolist()}, which "
-            f"meet at {speed:.3g} m/s: take substeps of {0.25 * now.h:.3g} s"
+            f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep of "
+            f"{h:.3g} s, {ways[i] / h:.3g} m/s at vertex {surface[i]}: take substeps of {0.25 * h:.3g} s"
         )
-        error.stable_dt, error.stiffness = 0.25 * now.h, None
+        error.stable_dt, error.stiffness = 0.25 * h, None
         raise error
 
     @property

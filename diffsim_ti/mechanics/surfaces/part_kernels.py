@@ -28,21 +28,25 @@ EXACT = 1e-20  # relative square of the residual that conjugate gradients leave
 TOO_LONG, TAKEN, UNSOLVED = range(3)  # what came of a part
 LOOK, CHECK, CHECK_BEGIN, CHECK_END, DONE = range(5)  # steps of a part: normals are taken, surfaces are apart
 
-PAIRS = dict.fromkeys(("corners", "number", "chosen"), "ints")
+PAIRS = dict.fromkeys(("corners", "number", "chosen", "acting"), "ints")
 PAIRS |= dict.fromkeys(("scale", "stiffness", "width", "radius", "mu", "speed"), "scalars")
-NODES = dict(start="ints", index="ints", weight="scalars", x="vectors", motion="vectors", inverse="scalars", free="vectors")
-STATE = dict.fromkeys(("e", "b", "e_next", "b_next", "xi"), "vectors") | dict(result="ints", damping="scalars")
-WORK = dict(filled="ints", open="ints", node="ints", share="scalars", row="vectors", n="vectors")
-WORK |= dict.fromkeys(("fading", "begin", "end", "change", "P", "K", "stiff", "q", "r", "z", "p", "Ap"), "scalars")
-WORK |= dict.fromkeys(("at_begin", "at_look", "moved", "at_end", "f", "residual", "step", "sum"), "vectors")
-WORK |= dict.fromkeys(("root", "load", "gauss"), "scalars")
-OF_POINTS = "at_begin", "at_look", "moved", "at_end"
-OF_NODES = "f", "residual", "step", "sum", "root", "load"
+NODES = dict(
+    start="ints", index="ints", weight="scalars", x="vectors", motion="vectors", inverse="scalars", free="vectors"
+)
+STATE = dict.fromkeys(("e", "b", "e_next", "b_next", "xi"), "vectors")
+OF_NODES = dict.fromkeys(("f", "residual", "step", "sum"), "vectors") | dict.fromkeys(("root", "load"), "scalars")
+OF_POINTS = dict.fromkeys(("at_begin", "at_look", "moved", "at_end"), "vectors")
+OF_PAIRS = dict(filled="ints", open="ints", n="vectors")
+OF_PAIRS |= dict.fromkeys(("fading", "begin", "end", "change", "P", "K", "stiff", "q", "r", "z", "p", "Ap"), "scalars")
+OF_ROWS = dict(node="ints", share="scalars", row="vectors")
+RESULT = dict(result="ints", damping="scalars")
+WORK = OF_NODES | OF_POINTS | OF_PAIRS | OF_ROWS | dict(gauss="scalars")
 
 
 @dataclass(frozen=True)
 class PartKernels(Pair):
-    """pairs: of a set of pairs, those of vertex and triangle first; `chosen` act. nodes: C (points, nodes) by rows."""
+    """pairs: of a set, those of vertex and triangle first; `acting` are those of them that a part moves, and its kernel is
+    given their numbers for num_vt and num_pairs. nodes: C (points, nodes) by rows."""
 
     # ---- the barrier (host_geometry.py) --------------------------------------------------------------------------------
 
@@ -188,23 +192,26 @@ class PartKernels(Pair):
         for _ in range(1):
             self.spread(work.at_begin, nodes.x, nodes, plan)
             self.spread(work.moved, nodes.motion, nodes, plan)
-            more = 0
+            more, count = 0, 0
             for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
                 for p in range(first_of(kind, plan), behind(kind, plan)):
                     if list.near[pairs.number[p]] > 0 and pairs.chosen[p] == 0:
-                        if self.near(kind, p, pairs, work) > 0:
-                            pairs.chosen[p] = 1
-                            more += 1
+                        pairs.chosen[p] = self.near(kind, p, pairs, work)
+                        more += pairs.chosen[p]
+                    if pairs.chosen[p] > 0:
+                        pairs.acting[count] = p
+                        count += 1
+                state.result[1 + kind] = count
             state.result[0] = more
 
     @cached_property
     def choose(self) -> Kernel:
         """Choose those of the pairs that the list flags which come near between x and x + motion, by looks so often that
-        none misses a crossing; result: how many are new."""
+        none misses a crossing; result: how many are new, where in `acting` those chosen of each kind end."""
         return self._kernel("choose_near", self.choose_all, dict(list=dict(near="ints")))
 
     def _kernel(self, name: str, body, more: dict | None = None, **numbers) -> Kernel:
-        arrays = (more or {}) | dict(pairs=PAIRS, nodes=NODES, state=STATE, work=WORK)
+        arrays = (more or {}) | dict(pairs=PAIRS, nodes=NODES, state=STATE | RESULT, work=WORK)
         sizes = dict.fromkeys(("num_vt", "num_pairs", "num_points", "num_nodes", "room"), "int")
         return Kernel(name, body, self.precision, arrays, sizes | numbers)
 
@@ -224,11 +231,11 @@ class PartKernels(Pair):
         for i in range(plan.num_points):
             work.at_look[i] = work.at_begin[i] + theta * work.moved[i]
         farthest = ti.cast(0, self.fp)
-        for p in range(plan.num_pairs):
-            if pairs.chosen[p] > 0:
-                m1, m2, m3 = self.relative(p, work.moved, pairs)
-                square = ti.max(m1.norm_sqr(), m2.norm_sqr(), m3.norm_sqr())
-                farthest = ti.max(farthest, square / (pairs.width[p] * pairs.width[p]))
+        for k in range(plan.num_pairs):
+            p = pairs.acting[k]
+            m1, m2, m3 = self.relative(p, work.moved, pairs)
+            square = ti.max(m1.norm_sqr(), m2.norm_sqr(), m3.norm_sqr())
+            farthest = ti.max(farthest, square / (pairs.width[p] * pairs.width[p]))
         return farthest
 
     @ti.func
@@ -275,11 +282,10 @@ class PartKernels(Pair):
     def push_all(self, share, c, wall, pairs: A, work: A, plan: A):
         """P and K where the part ends at end + share change; P . change."""
         out = ti.cast(0, self.fp)
-        for p in range(plan.num_pairs):
-            if pairs.chosen[p] > 0:
-                y = work.end[p] + share * work.change[p]
-                work.P[p], work.K[p] = self.push(p, y, c, wall, pairs, work)
-                out += work.P[p] * work.change[p]
+        for k in range(plan.num_pairs):
+            p = pairs.acting[k]
+            work.P[p], work.K[p] = self.push(p, work.end[p] + share * work.change[p], c, wall, pairs, work)
+            out += work.P[p] * work.change[p]
         return out
 
     @ti.func
@@ -287,46 +293,44 @@ class PartKernels(Pair):
         """step = -(1 + J^T K J)^-1 residual; whether it was found."""
         for i in range(plan.num_nodes):
             work.step[i] = -1.0 * work.residual[i]
-        rz, first, rounds, most = ti.cast(0, self.fp), ti.cast(0, self.fp), 0, 50
-        for p in range(plan.num_pairs):
-            if pairs.chosen[p] > 0 and work.K[p] > 0:
-                square = ti.cast(0, self.fp)
-                for k in range(p * plan.room, p * plan.room + work.filled[p]):
-                    square += work.row[k].norm_sqr()
-                stiff = ti.sqrt(work.K[p])
-                work.q[p], work.stiff[p] = 0.0, stiff
-                work.r[p] = stiff * self.across(p, work.residual, work, plan)
-                work.z[p] = 1 / (1 + work.K[p] * square)
-                work.p[p] = work.z[p] * work.r[p]
-                rz += work.p[p] * work.r[p]
-                most += 4
-        first = rz
-        while rz > EXACT * first and rounds < most:
+        rz, rounds, failed = ti.cast(0, self.fp), 0, False
+        for k in range(plan.num_pairs):
+            p, square = pairs.acting[k], ti.cast(0, self.fp)
+            for m in range(p * plan.room, p * plan.room + work.filled[p]):
+                square += work.row[m].norm_sqr()
+            work.stiff[p], work.q[p] = ti.sqrt(work.K[p]), 0.0
+            work.r[p], work.z[p] = (
+                work.stiff[p] * self.across(p, work.residual, work, plan),
+                1 / (1 + work.K[p] * square),
+            )
+            work.p[p] = work.z[p] * work.r[p]
+            rz += work.p[p] * work.r[p]
+        least = EXACT * rz
+        while rz > least and not failed:
             for i in range(plan.num_nodes):
                 work.sum[i] = self.vec4(0)
-            for p in range(plan.num_pairs):
-                if pairs.chosen[p] > 0 and work.K[p] > 0:
-                    self.add_row(p, work.stiff[p] * work.p[p], work.sum, work, plan)
-            pAp = ti.cast(0, self.fp)
-            for p in range(plan.num_pairs):
-                if pairs.chosen[p] > 0 and work.K[p] > 0:
-                    work.Ap[p] = work.p[p] + work.stiff[p] * self.across(p, work.sum, work, plan)
-                    pAp += work.p[p] * work.Ap[p]
-            a, new = rz / pAp, ti.cast(0, self.fp)
-            for p in range(plan.num_pairs):
-                if pairs.chosen[p] > 0 and work.K[p] > 0:
-                    work.q[p] += a * work.p[p]
-                    work.r[p] = work.r[p] - a * work.Ap[p]
-                    new += work.z[p] * work.r[p] * work.r[p]
-            for p in range(plan.num_pairs):
-                if pairs.chosen[p] > 0 and work.K[p] > 0:
-                    work.p[p] = work.z[p] * work.r[p] + new / rz * work.p[p]
-            rz = new
-            rounds += 1
-        for p in range(plan.num_pairs):
-            if pairs.chosen[p] > 0 and work.K[p] > 0:
-                self.add_row(p, work.stiff[p] * work.q[p], work.step, work, plan)
-        return rz <= EXACT * first
+            for k in range(plan.num_pairs):
+                p = pairs.acting[k]
+                self.add_row(p, work.stiff[p] * work.p[p], work.sum, work, plan)
+            along, after = ti.cast(0, self.fp), ti.cast(0, self.fp)
+            for k in range(plan.num_pairs):
+                p = pairs.acting[k]
+                work.Ap[p] = work.p[p] + work.stiff[p] * self.across(p, work.sum, work, plan)
+                along += work.p[p] * work.Ap[p]
+            for k in range(plan.num_pairs):
+                p = pairs.acting[k]
+                work.q[p] += rz / along * work.p[p]
+                work.r[p] = work.r[p] - rz / along * work.Ap[p]
+                after += work.z[p] * work.r[p] * work.r[p]
+            for k in range(plan.num_pairs):
+                p = pairs.acting[k]
+                work.p[p] = work.z[p] * work.r[p] + after / rz * work.p[p]
+            rz, rounds = after, rounds + 1
+            failed = rounds > 50 + 4 * plan.num_pairs
+        for k in range(plan.num_pairs):
+            p = pairs.acting[k]
+            self.add_row(p, work.stiff[p] * work.q[p], work.step, work, plan)
+        return not failed
 
     @ti.func
     def balance(self, c, wall, pairs: A, state: A, work: A, plan: A):
@@ -335,8 +339,8 @@ class PartKernels(Pair):
         rounds, found, sure, share, along, square, before = 0, 0, 0, zero, zero, zero, zero
         for i in range(plan.num_nodes):
             state.xi[i], work.step[i] = self.vec4(0), self.vec4(0)
-        for p in range(plan.num_pairs):
-            work.change[p] = 0.0
+        for k in range(plan.num_pairs):
+            work.change[pairs.acting[k]] = 0.0
         while found == 0 and rounds < MOST_ROUNDS:
             pushed = self.push_all(share, c, wall, pairs, work, plan)
             if sure == 0 and along + share * square - pushed > 0.5 * before and share >= 1e-9:
@@ -346,12 +350,11 @@ class PartKernels(Pair):
                     state.xi[i] += share * work.step[i]
                     work.residual[i] = state.xi[i]
                 pressing = 0
-                for p in range(plan.num_pairs):
-                    if pairs.chosen[p] > 0:
-                        work.end[p] += share * work.change[p]
-                        if work.P[p] > 0:
-                            self.add_row(p, -1.0 * work.P[p], work.residual, work, plan)
-                            pressing = 1
+                for k in range(plan.num_pairs):
+                    p = pairs.acting[k]
+                    work.end[p] += share * work.change[p]
+                    self.add_row(p, -1.0 * work.P[p], work.residual, work, plan)
+                    pressing += ti.cast(work.P[p] > 0, ti.i32)
                 rounds += 1
                 if sure > 0 or (pressing == 0 and rounds == 1):
                     found = 1
@@ -359,11 +362,11 @@ class PartKernels(Pair):
                     rounds = MOST_ROUNDS
                 else:
                     sure, share, along, square, before = 1, one, zero, zero, zero
-                    for p in range(plan.num_pairs):
-                        if pairs.chosen[p] > 0:
-                            work.change[p] = self.across(p, work.step, work, plan)
-                            if not ti.abs(work.change[p]) <= SURE * (ti.abs(work.end[p]) + ti.abs(work.begin[p])):
-                                sure = 0
+                    for k in range(plan.num_pairs):
+                        p = pairs.acting[k]
+                        work.change[p] = self.across(p, work.step, work, plan)
+                        if not ti.abs(work.change[p]) <= SURE * (ti.abs(work.end[p]) + ti.abs(work.begin[p])):
+                            sure = 0
                     for i in range(plan.num_nodes):
                         before = before - work.residual[i].dot(work.step[i])
                         along += state.xi[i].dot(work.step[i])
@@ -377,24 +380,22 @@ class PartKernels(Pair):
         for i in range(plan.num_nodes):
             work.residual[i], work.sum[i], work.load[i] = self.vec4(0), self.vec4(0), 0.0
             work.step[i] = nodes.motion[i] / plan.alpha + state.b[i]
-        for p in range(plan.num_pairs):
-            if pairs.chosen[p] > 0 and work.P[p] > 0:
-                for k in range(p * plan.room, p * plan.room + work.filled[p]):
-                    work.residual[work.node[k]] += work.share[k] * work.P[p] * work.n[p]
-                    work.load[work.node[k]] += ti.abs(work.share[k]) * pairs.mu[p] * work.P[p]
-        if plan.rough > 0:
-            for p in range(plan.num_pairs):
-                if pairs.chosen[p] > 0 and work.P[p] > 0 and pairs.mu[p] > 0:
-                    v, bound = self.vec4(0), ti.cast(0, self.fp)
-                    for k in range(p * plan.room, p * plan.room + work.filled[p]):
-                        i = work.node[k]
-                        v += work.share[k] * work.step[i]
-                        bound += h * ti.abs(work.share[k]) * nodes.inverse[i] * work.load[i]
-                    t = v - work.n[p].dot(v) * work.n[p]
-                    kappa, _, _, _ = slip_in_kernels(ti.sqrt(t.norm_sqr()), bound, pairs.speed[p], tiny, KERNELS)
-                    impulse = (-1.0 * h * pairs.mu[p] * work.P[p] * kappa) * t
-                    for k in range(p * plan.room, p * plan.room + work.filled[p]):
-                        work.sum[work.node[k]] += work.share[k] * impulse
+        for k in range(plan.num_pairs):
+            p = pairs.acting[k]
+            for m in range(p * plan.room, p * plan.room + work.filled[p]):
+                work.residual[work.node[m]] += work.share[m] * work.P[p] * work.n[p]
+                work.load[work.node[m]] += ti.abs(work.share[m]) * pairs.mu[p] * work.P[p]
+        for k in range(plan.num_pairs * plan.rough):
+            p, v, bound = pairs.acting[k], self.vec4(0), ti.cast(0, self.fp)
+            for m in range(p * plan.room, p * plan.room + work.filled[p]):
+                i = work.node[m]
+                v += work.share[m] * work.step[i]
+                bound += h * ti.abs(work.share[m]) * nodes.inverse[i] * work.load[i]
+            t = v - work.n[p].dot(v) * work.n[p]
+            kappa, f, y, slip = slip_in_kernels(ti.sqrt(t.norm_sqr()), bound, pairs.speed[p], tiny, KERNELS)
+            impulse = (-1.0 * h * pairs.mu[p] * work.P[p] * kappa) * t
+            for m in range(p * plan.room, p * plan.room + work.filled[p]):
+                work.sum[work.node[m]] += work.share[m] * impulse
         for i in range(plan.num_nodes):
             delta = (h * nodes.inverse[i]) * self.freed(i, three(work.residual[i]), nodes)
             friction = nodes.inverse[i] * self.freed(i, three(work.sum[i]), nodes)
@@ -408,11 +409,10 @@ class PartKernels(Pair):
     def farthest_place(self, pairs: A, work: A, plan: A):
         """The largest coordinate of a corner at the end."""
         out = ti.cast(0, self.fp)
-        for p in range(plan.num_pairs):
-            if pairs.chosen[p] > 0:
-                for k in range(4 * p, 4 * p + 4):
-                    x = work.at_end[pairs.corners[k]]
-                    out = ti.max(out, ti.abs(x[0]), ti.abs(x[1]), ti.abs(x[2]))
+        for k in range(plan.num_pairs):
+            for m in ti.static(range(4)):
+                x = work.at_end[pairs.corners[4 * pairs.acting[k] + m]]
+                out = ti.max(out, ti.abs(x[0]), ti.abs(x[1]), ti.abs(x[2]))
         return out
 
     @ti.func
@@ -423,16 +423,16 @@ class PartKernels(Pair):
             square = self.place(c, pairs, nodes, state, work, plan)
             if square > LONGEST**2:
                 step = DONE
-            for p in range(plan.num_pairs):
-                work.open[p] = pairs.chosen[p]
+            for k in range(plan.num_pairs):
+                work.open[k] = 1
             while step < DONE:
                 left = 0  # pairs that are not fine
                 for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-                    for p in range(first_of(kind, plan), behind(kind, plan)):
-                        if work.open[p] > 0:
-                            fine = self.look(kind, p, step, c, room, pairs, nodes, work, plan)
+                    for k in range(first_of(kind, plan), behind(kind, plan)):
+                        if work.open[k] > 0:
+                            fine = self.look(kind, pairs.acting[k], step, c, room, pairs, nodes, work, plan)
                             if fine and step > LOOK:
-                                work.open[p] = 0
+                                work.open[k] = 0
                             left += ti.cast(not fine, ti.i32)
                 if step == LOOK and c < 1 and left > 0:
                     if square > RESOLVED**2:
