@@ -1,4 +1,5 @@
-"""Contact of near pairs in a part of an explicit pass, on the host in float64: what the contact stage of pairs repeats.
+"""Contact of near pairs in a part of an explicit pass, in float64: what the contact stage of pairs repeats. Forward it is
+done by part_kernels.py; here are the same formulas for NumPy's arrays, their tangents, by complex numbers, and adjoints.
 
 In a part of length h nodes of mass m would move by f = alpha v, points x = C X with them (curved_pairs.py; C = 1 where faces
 are flat). Pair p presses along its normal n_p with its weights w_p, B = w C, from a distance d_p to
