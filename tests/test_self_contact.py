@@ -396,7 +396,7 @@ def test_parts_of_the_stage_are_those_of_its_formulas(monkeypatch):
         act(self, at, *given)
         one = self.kept.get(at.end)
         for k, part in enumerate(one.parts if one else ()):
-            of, (e, b) = self._numbers(one, at.now), (part.e, part.b)
+            of = self._numbers(one, at.now)
             found = one.solver.look(part, of)
             after = one.solver.take(part, of, found)
             pushed = one.solver.jacobian(part, found).T @ found.P

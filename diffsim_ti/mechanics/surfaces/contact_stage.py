@@ -320,8 +320,8 @@ class PairContact(Stage):
         i, h = int(ways.argmax()), now.h
         inner.fresh = False
         error = Tunnelling(
-            f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep of "
-            f"{h:.3g} s, {ways[i] / h:.3g} m/s at vertex {surface[i]}: take substeps of {0.25 * h:.3g} s"
+            f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep "
+            f"of {h:.3g} s, {ways[i] / h:.3g} m/s at vertex {surface[i]}: take substeps of {0.25 * h:.3g} s"
         )
         error.stable_dt, error.stiffness = 0.25 * h, None
         raise error
