@@ -27,6 +27,7 @@ from diffsim_ti.runtime.slots import VertexRows
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 MOST_LISTS = 6  # made for one pass
+MOST_TRIES = 12  # at a pass with one list, each with the pairs that came near in the one before
 PASSES = 1.5, 15  # like this one, that a list made for it should hold for, at least and at most
 SHORTEST = 2.0**-14  # share of a pass
 
@@ -131,14 +132,15 @@ class PairContact(Stage):
         displacements where it begins, of the body where the record has none, and of obstacles."""
         inner, history, own = self.inner, at.history, slice(self.num_own)
         stale, lost, any_near = self._look(*self._fine(history.u, at.end))
-        now = at.now if stale or any_near else None
+        now, acts = at.now if stale or any_near else None, False
         if now and now.alpha > 0:
             start = self.rows.get(history.u, at.slot) if start is None else start
             u, v = self.rows.get(history.u, at.end), self.rows.get(history.v, at.end)
             if self.obstacles:
                 start, u = np.concatenate([start, corners]), np.concatenate([u, self.obstacles.displacements])
+            acts = bool(np.isfinite(u).all())  # else the guard of the run will say so
         one, needed = None, 0.0
-        for _ in range(MOST_LISTS if now and now.alpha > 0 else 0):
+        for _ in range(MOST_LISTS if acts else 0):
             if stale:
                 moved = runtime.fetch_row(*self._fine(history.u, at.end))[inner.mesh.surface_vertices]
                 needed = np.maximum(needed, 1.1 * inner.travel(moved - runtime.fetch(inner.before)))
@@ -157,7 +159,7 @@ class PairContact(Stage):
             if not lost:
                 break
         inner.age += 1
-        if lost:
+        if lost and acts:
             self._refuse(at, now)
         if at.stride:
             self.kept[at.end] = one
@@ -175,7 +177,7 @@ class PairContact(Stage):
         (what was done, whether pairs beyond the list may have crossed)."""
         near, recording = self.set, bool(at.stride or at.ws.impulses)
         one, parts, b, led_to = None, [], None, u
-        for tries in range(MOST_LISTS):
+        for tries in range(MOST_TRIES):
             flagged = np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
             if not near.holds(flagged):
                 self._extend(flagged, now)
@@ -193,6 +195,8 @@ class PairContact(Stage):
             self.rows.put(at.history.u, at.end, led_to[: self.num_own])
             self.rows.put(at.history.v, at.end, v_next)
             _, lost, _ = self._look(*self._fine(at.history.u, at.end))
+        else:
+            self._refuse(at, now)
         if b is not None and recording:
             one = self.whole.of(near.chosen > 0, start, u, v)
             one.parts, one.b = parts, b
