@@ -16,6 +16,7 @@ import numpy as np
 from exact_predicates import ExactJudge
 
 import diffsim_ti as ds
+from diffsim_ti.mesh.collision_surface import cuts_of
 
 SOLVERS = ds.VelocityVerletSolver, ds.SemiImplicitSolver
 NUMBER = r"([-+.\de]*\d)"
@@ -95,8 +96,7 @@ class Judge:
 def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
     """(what the runs said, the last one of all, which is empty if it came to its end; intersections that nothing said);
     looks: substeps from one look of the judge to the next."""
-    said, dt, contact, silent = [], None, dict(case["contact"]), 0
-    judge = Judge(case["mesh"])
+    said, dt, contact, silent, judges = [], None, dict(case["contact"]), 0, {}
     for _ in range(ROUNDS):
         try:
             scene = ds.Scene(
@@ -114,7 +114,9 @@ def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
             while left > 0:
                 simulator.run(min(looks, left))
                 left -= looks
-                silent += judge.count(simulator.positions, left <= 0)
+                cuts = 1 + cuts_of(case["mesh"], scene.term(ds.SelfContact), simulator.workspace.arrays.bend)
+                judges[cuts] = judges.get(cuts) or Judge(case["mesh"], cuts)
+                silent += judges[cuts].count(simulator.positions, left <= 0)
             return [*said, ""], silent
         except (FloatingPointError, ValueError) as error:
             said.append(str(error))

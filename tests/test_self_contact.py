@@ -11,6 +11,8 @@ from scipy.optimize import brentq
 
 import diffsim_ti as ds
 from diffsim_ti import verify
+from diffsim_ti.mechanics.surfaces import contact_stage
+from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs
 
 MATERIAL = ds.StableNeoHookean(5e4, 0.3)
@@ -382,6 +384,39 @@ def test_the_stage_keeps_surfaces_apart_whatever_the_stiffness(stiffness, dt):
     lower = mesh.vertex_sets["body_0"]
     assert np.linalg.norm(simulator.velocities[lower].mean(0)) > 0.1  # they met
     assert simulator.compute_energy() <= 1.02 * energy
+
+
+def test_parts_of_the_stage_are_those_of_its_formulas(monkeypatch):
+    """What kernels find balances the pushes, and leads where the formulas lead that tangents and adjoints follow; the list
+    and its length leave no trace."""
+    act, seen, scene = PairContact._act, [], two_blocks().scene
+    scene = scene.replace(terms=[ds.SelfContact(STIFFNESS, WIDTH, friction=0.4, stage=True)])
+
+    def spy(self, at, *given):
+        act(self, at, *given)
+        one = self.kept.get(at.end)
+        for k, part in enumerate(one.parts if one else ()):
+            of = self._numbers(one, at.now)
+            found = one.solver.look(part, of)
+            after = one.solver.take(part, of, found)
+            pushed = one.solver.jacobian(part, found).T @ found.P
+            np.testing.assert_allclose(part.xi, pushed, rtol=0, atol=1e-12 * np.abs(pushed).max(initial=1e-300))
+            known = (one.parts[k + 1].e, one.parts[k + 1].b) if k + 1 < len(one.parts) else (None, one.b)
+            for x, y in zip(after, known):
+                assert y is None or np.abs(x - y).max() <= 1e-11 * max(np.abs(y).max(), 1e-300)
+            seen.append(np.abs(part.xi).max() > 0)
+
+    def frames():
+        rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=4e-4, substeps=1), 24, gradients="all")
+        out = rollout.forward()
+        rollout.vjp(out, np.ones_like(out.positions))  # for which passes are recorded
+        return out.positions
+
+    monkeypatch.setattr(PairContact, "_act", spy)
+    first = frames()
+    assert sum(seen) > 10
+    monkeypatch.setattr(contact_stage, "PASSES", (1.0, 1.0))
+    np.testing.assert_array_equal(first, frames())
 
 
 def test_a_stage_where_there_is_none_is_refused():

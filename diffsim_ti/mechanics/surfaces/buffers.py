@@ -111,11 +111,13 @@ class Buffers:
     def __init__(self, launch: Launches, parallel: bool):
         self._arrays, self._launch, self._scan = {}, launch, kernels_of(Scan, parallel).kernel
 
-    def take(self, name: str, dtype, count: int):
+    def take(self, name: str, dtype, count: int, least: int = 16):
         """The array of that name, made anew, half as long again, if it is too short; then nothing stays bound."""
         have = self._arrays.get(name)
         if have is None or have.shape[0] < count:
-            self._arrays[name] = have = runtime.array(dtype, max(16, count + count // 2 if have is not None else count))
+            self._arrays[name] = have = runtime.array(
+                dtype, max(least, count + count // 2 if have is not None else count)
+            )
             self._launch.clear()
         return have
 

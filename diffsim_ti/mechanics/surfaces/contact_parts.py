@@ -1,4 +1,5 @@
-"""Contact of near pairs in a part of an explicit pass, on the host in float64: what the contact stage of pairs repeats.
+"""Contact of near pairs in a part of an explicit pass, in float64: what the contact stage of pairs repeats. Forward it is
+done by part_kernels.py; here are the same formulas for NumPy's arrays, their tangents, by complex numbers, and adjoints.
 
 In a part of length h nodes of mass m would move by f = alpha v, points x = C X with them (curved_pairs.py; C = 1 where faces
 are flat). Pair p presses along its normal n_p with its weights w_p, B = w C, from a distance d_p to
@@ -23,13 +24,10 @@ import numpy as np
 
 from diffsim_ti.mechanics.surfaces import host_geometry as geometry
 from diffsim_ti.mechanics.surfaces.host_geometry import TINY, dot
-from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE
+from diffsim_ti.mechanics.surfaces.part_kernels import WALL
 from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
 
-WALL = 1e-3  # share of the width
-MOST_ROUNDS = 60
 DENSE = 1000  # unknowns up to which a dense matrix is factored
-SURE = 1e-9  # relative change of distances at which Newton's method takes its last step
 
 
 @dataclass
@@ -72,15 +70,11 @@ class NearPairs:
         out = csr_matrix((w.ravel(), self.corners.ravel(), 4 * np.arange(count + 1)), (count, self.num_points))
         return out if self.C is None else (out @ self.C).tocsr()
 
-    def parted(self, normals: np.ndarray, *places: np.ndarray) -> np.ndarray:
-        """The smallest distance along the normals of corners of different primitives, at the worst of some places."""
-        out = np.full(len(normals), np.inf)
-        for x in places:
-            for kind, pairs in enumerate((~self.edges, self.edges)):
-                heights = dot(normals[pairs, None], x[self.corners[pairs]])
-                for a, b in OPPOSITE[kind]:
-                    out[pairs] = np.minimum(out[pairs], heights[:, a] - heights[:, b])
-        return out
+    @property
+    def rows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """C by rows: where each begins, columns, entries."""
+        n, C = self.num_points, self.C
+        return (np.arange(n + 1), np.arange(n), np.ones(n)) if C is None else (C.indptr, C.indices, C.data)
 
 
 @dataclass
@@ -181,30 +175,6 @@ class PartSolver:
             return out
 
         return product
-
-    def solve(self, part: Part, of, at) -> np.ndarray | None:
-        """xi, z - f over the roots, where pushes balance it; None where they are not found."""
-        J = self.jacobian(part, at)
-        xi = np.zeros(J.shape[1])
-        y = at.free
-        P, _, by_y = self.pushes(part, of, at, y)[:3]
-        for _ in range(MOST_ROUNDS):
-            r = xi - J.T @ P
-            if not r.any():
-                return xi
-            step = -self.inverse(J, -by_y)(r)
-            change, before, share = J @ step, -r @ step, 1.0
-            if np.all(np.abs(change) <= SURE * (np.abs(y) + np.abs(at.begin))):
-                return xi + step
-            change_xi = xi @ step, step @ step
-            while True:
-                y_next = y + share * change
-                P, _, by_y = self.pushes(part, of, at, y_next)[:3]
-                if change_xi[0] + share * change_xi[1] - P @ change <= 0.5 * before or share < 1e-9:
-                    break
-                share *= 0.5
-            xi, y = xi + share * step, y_next
-        return None
 
     def take(self, part: Part, of, at) -> tuple[np.ndarray, np.ndarray]:
         """(e, b) after the part, for its xi: at.P and others are noted. Of complex numbers xi follows what it is of."""

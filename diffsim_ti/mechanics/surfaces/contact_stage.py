@@ -7,7 +7,7 @@ surfaces apart. Vertices of no near pair keep what they had, bit by bit.
 """
 
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,17 +18,17 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSolver
-from diffsim_ti.mechanics.surfaces.host_geometry import dot, nearest
+from diffsim_ti.mechanics.surfaces.near_set import NearSet
 from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
+from diffsim_ti.mechanics.surfaces.part_kernels import TAKEN
 from diffsim_ti.mechanics.surfaces.stages import moment_of
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.runtime.slots import VertexRows
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
-LONGEST, RESOLVED = 0.2, 0.02  # of the width that near surfaces move in a part; and where it need not be resolved
-HALF = 0.5  # share of a distance by which a resolved part may close it before normals are taken
 MOST_LISTS = 6  # made for one pass
-MOST_LOOKS = 200  # at the pairs of a pass
+MOST_TRIES = 12  # at a pass with one list, each with the pairs that came near in the one before
+PASSES = 1.5, 15  # like this one, that a list made for it should hold for, at least and at most
 SHORTEST = 2.0**-14  # share of a pass
 
 
@@ -36,15 +36,28 @@ SHORTEST = 2.0**-14  # share of a pass
 class ContactPass:
     """What was done in a recorded pass: to which nodes, from where, and the state that the drift had led to."""
 
-    solver: PartSolver
+    near: NearPairs
+    numbers: np.ndarray  # of the pairs in the list
     nodes: np.ndarray
     pairs: np.ndarray
-    start: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    parts: list[Part]
-    b: np.ndarray  # what velocities gained
     rest: tuple  # of pairs: plane and weights at rest, which coefficient of friction
+    start: np.ndarray
+    u: np.ndarray | None = None
+    v: np.ndarray | None = None
+    parts: list[Part] = field(default_factory=list)
+    b: np.ndarray | None = None  # what velocities gained
+
+    @property
+    def solver(self) -> PartSolver:
+        return PartSolver(self.near)
+
+    def of(self, chosen: np.ndarray, start, u, v) -> "ContactPass":
+        """Of some of the pairs, in a pass between these states of all nodes."""
+        near = replace(self.near, **{x: getattr(self.near, x)[chosen] for x in ("corners", "edges", "scale")})
+        plane, weights, own = self.rest
+        own = SimpleNamespace(**{name: x[chosen] for name, x in vars(own).items()})
+        rest = plane[chosen], weights[chosen], own
+        return ContactPass(near, self.numbers[chosen], self.nodes, self.pairs[chosen], rest, start[self.nodes], u, v)
 
 
 class PairContact(Stage):
@@ -72,6 +85,7 @@ class PairContact(Stage):
         corners = self.inner.a.first_contact_corner + self.inner.list.num_surface
         self.scratch = runtime.array(self.inner.kernels.vec4, corners)  # for forces, which are not looked at
         self.begin = runtime.array(a.vector, 1, a.num_vertices)
+        self.set, self.whole = NearSet(self.inner), None  # pairs that have been near, and what there is to know of them
         runtime.fill(self.begin, 0)
         self.clear()
 
@@ -79,21 +93,20 @@ class PairContact(Stage):
 
     @contextmanager
     def do(self, at: Passes):
-        pairs, inner, u, now = self.pairs, self.inner, at.history.u, at.now
+        pairs, inner, u = self.pairs, self.inner, at.history.u
         self._follow(at, AT_BEGIN)
         if at.launch is None:
             pairs.ensure(u, at.slot)
         fine = self._fine(u, at.slot)
         inner.forces(*fine, self.scratch)
-        start = self._places(u, at.slot)
+        corners = self.obstacles.displacements if self.obstacles else None
+        start = None if at.stride else self.rows.get(u, at.slot)  # which the drift replaces
         yield
         self._follow(at, AT_STAGE)
         if at.stride:
             self.kept[at.end] = None
         try:
-            if now.alpha > 0:
-                self._act(at, start)
-            inner.check_pass(*self._fine(u, at.end), now.h)
+            self._act(at, start, corners)
         except Tunnelling as error:
             raise at.ws.dated(error, at.j, at.num_passes) from None
 
@@ -102,75 +115,109 @@ class PairContact(Stage):
         if self.obstacles:
             self.pairs.follow(self.a.poses.value(self.a.rows["path"], moment_of(at)), m)
 
-    def _places(self, u, slot: int) -> np.ndarray:
-        """Displacements of the nodes in a slot, and of corners of obstacles."""
-        own = self.rows.get(u, slot)
-        return np.concatenate([own, self.obstacles.displacements]) if self.obstacles else own
-
     def _fine(self, u, slot: int) -> tuple:
         return (u, slot) if self.matrix is None else (self.pairs.fine(u, slot), 0)
 
-    def _look(self, u, slot: int) -> tuple[bool, bool]:
-        """(whether the list does not hold where the pass led, whether pairs of it may be near)"""
+    def _look(self, u, slot: int) -> tuple[bool, bool, bool]:
+        """Whether the list does not hold where the pass led, whether pairs beyond it may have crossed, and whether pairs of
+        it may be near."""
         inner = self.inner
         inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
-        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, lost=0.0, **inner.sizes_of_sums)
-        inner.run(inner.motion.find, dict(u=u), slot=slot, **bodies)
-        flags = runtime.view(inner.flags)
-        stale, _, near = runtime.fetch(inner.flags) if flags is None else flags
-        return bool(stale), bool(near)
+        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, **inner.sizes_of_sums)
+        inner.run(inner.motion.find, dict(u=u), slot=slot, lost=0.5 * inner.least_width, **bodies)
+        return tuple(bool(x) for x in whole(inner.flags))
 
-    def _act(self, at: Passes, start: np.ndarray) -> None:
-        """What contact does to a pass from `start`; anew with a longer list where one does not hold to the end."""
-        inner, history, surface = self.inner, at.history, self.inner.mesh.surface_vertices
-        u, v = self._places(history.u, at.end), self.rows.get(history.v, at.end)
-        stale, any_near = self._look(*self._fine(history.u, at.end))
-        one, wanted, lists = None, 0.0, MOST_LISTS if stale or any_near else 0
-        for _ in range(lists):
+    def _act(self, at: Passes, start: np.ndarray | None, corners: np.ndarray | None) -> None:
+        """What contact does to a pass, anew with a longer list where one does not hold to the end. start, corners:
+        displacements where it begins, of the body where the record has none, and of obstacles."""
+        inner, history, own = self.inner, at.history, slice(self.num_own)
+        stale, lost, any_near = self._look(*self._fine(history.u, at.end))
+        now, acts = at.now if stale or any_near else None, False
+        if now and now.alpha > 0:
+            start = self.rows.get(history.u, at.slot) if start is None else start
+            u, v = self.rows.get(history.u, at.end), self.rows.get(history.v, at.end)
+            if self.obstacles:
+                start, u = np.concatenate([start, corners]), np.concatenate([u, self.obstacles.displacements])
+            acts = bool(np.isfinite(u).all())  # else the guard of the run will say so
+        one, needed = None, 0.0
+        for _ in range(MOST_LISTS if acts else 0):
             if stale:
-                moved = runtime.fetch_row(*self._fine(history.u, at.end))[surface] - runtime.fetch(inner.before)
-                wanted = np.maximum(wanted, 1.1 * inner.travel(moved))
-                self.rows.put(history.u, at.end, u[: self.num_own])
+                moved = runtime.fetch_row(*self._fine(history.u, at.end))[inner.mesh.surface_vertices]
+                needed = np.maximum(needed, 1.1 * inner.travel(moved - runtime.fetch(inner.before)))
+                self.rows.put(history.u, at.end, u[own])
                 self.rows.put(history.v, at.end, v)
-                self.rows.put(self.begin, 0, start[: self.num_own])
+                self.rows.put(self.begin, 0, start[own])
                 self._follow(at, AT_BEGIN)
                 begin = self._fine(self.begin, 0)
-                inner.age = 0  # the slacks are those wanted, whatever the pace before
-                inner.build(*begin, wanted=wanted)
+                inner.build(*begin, wanted=self._passes(needed) * needed, needed=needed)
                 inner.forces(*begin, self.scratch)
                 self._follow(at, AT_STAGE)
-                _, any_near = self._look(*self._fine(history.u, at.end))
-            one = self._contact(at, start, u, v) if any_near else None
-            if at.stride:
-                self.kept[at.end] = one
-            _, stale, _ = inner.check(*self._fine(history.u, at.end), 0, 0)
-            if not stale:
+                _, lost, any_near = self._look(*self._fine(history.u, at.end))
+            if any_near:
+                one, lost = self._contact(at, now, start, u, v, lost)
+            stale = lost
+            if not lost:
                 break
+        inner.age += 1
+        if lost and acts:
+            self._refuse(at, now)
+        if at.stride:
+            self.kept[at.end] = one
         if one and at.ws.impulses:
-            of = self._numbers(one, at.now)
+            of = self._numbers(one, now)
             self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
 
-    def _contact(self, at: Passes, start, u, v) -> ContactPass | None:
-        """The stage, with the list as it is: of the pairs that would come near, and of those that do by what it does."""
-        one, u_next, flagged = None, u, self._flagged()
-        chosen, seen = np.zeros(self.inner.list.count, bool), flagged
-        for _ in range(MOST_LISTS):
-            more = flagged[self._comes_near(self._pass(flagged, start, u_next, v), at.now)]
-            if np.all(chosen[more]):
+    def _passes(self, travel: np.ndarray) -> float:
+        """How many passes of such lengths of vertices' ways a list should hold for."""
+        share = self.inner.typical_slack * self.inner.width
+        return float(np.clip(share / max(float(np.median(travel.max(1))), 1e-300), *PASSES))
+
+    def _contact(self, at: Passes, now, start, u, v, lost: bool) -> tuple[ContactPass | None, bool]:
+        """The stage, with the list as it is, of the pairs that would come near, and of those that do by what it does;
+        (what was done, whether pairs beyond the list may have crossed)."""
+        near, recording = self.set, bool(at.stride or at.ws.impulses)
+        one, parts, b, led_to = None, [], None, u
+        for tries in range(MOST_TRIES):
+            flagged = np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
+            if not near.holds(flagged):
+                self._extend(flagged, now)
+            place = self.whole.nodes
+            motion, own = u[place] - start[place], place < self.num_own
+            near.begin(self.rest + start[place], anew=tries == 0)
+            if not near.choose(led_to[place] - start[place]):
                 break
-            chosen[more] = True
-            one = self._pass(np.flatnonzero(chosen), start, u, v)
-            e, one.b = self._go(one, self._numbers(one, at.now))
-            u_next, v_next, own = u.copy(), v.copy(), one.nodes < self.num_own
-            u_next[one.nodes[own]] += e[own]
-            v_next[one.nodes[own]] += at.now.decay * one.b[own]
-            self.rows.put(at.history.u, at.end, u_next[: self.num_own])
+            near.start(motion)
+            parts = self._go(at, now, recording)
+            e, b = near.moved
+            led_to, v_next = u.copy(), v.copy()
+            led_to[place[own]] += e[own]
+            v_next[place[own]] += now.decay * b[own]
+            self.rows.put(at.history.u, at.end, led_to[: self.num_own])
             self.rows.put(at.history.v, at.end, v_next)
-            self._look(*self._fine(at.history.u, at.end))
-            flagged = self._flagged()
-            seen = np.union1d(seen, flagged)
-        self._mark_done(seen)
-        return one
+            _, lost, _ = self._look(*self._fine(at.history.u, at.end))
+        else:
+            self._refuse(at, now)
+        if b is not None and recording:
+            one = self.whole.of(near.chosen > 0, start, u, v)
+            one.parts, one.b = parts, b
+        return one, lost
+
+    def _extend(self, numbers: np.ndarray, now) -> None:
+        """Take more pairs of the list into the set of those that have been near since it was made."""
+        inner = self.inner
+        close = whole(inner.plane)[: inner.list.count, 3] < 2 * inner.width  # so that it is seldom extended
+        close[numbers] = True
+        if self.set.builds == inner.builds:
+            close[self.set.numbers] = True
+        numbers = np.flatnonzero(close)
+        self.whole, a = self._pass(numbers), self.a
+        rest = a.values.rest - a.origin
+        if self.obstacles:
+            rest = np.concatenate([rest, self.obstacles.corners.made(a.values.parameters.astype(float))])
+        self.rest = rest[self.nodes[self.whole.nodes]]
+        self.whole.u = np.zeros((len(self.nodes), 3))
+        self.whole.start = self.whole.u[self.whole.nodes]
+        self.set.fill(self.whole, self._numbers(self.whole, now))
 
     def _of_obstacles(self, impulses, at: Passes, one: ContactPass):
         """(frame, place among the obstacles by pairs, which pairs are its) of each that is noted."""
@@ -200,39 +247,13 @@ class PairContact(Stage):
             out.append((own, *seeds))
         return out
 
-    def _flagged(self) -> np.ndarray:
-        """Numbers of the pairs that may come near, as `_look` found them."""
-        return np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
-
-    def _comes_near(self, one: ContactPass, now) -> np.ndarray:
-        """Which pairs come nearer than their width from `start` to `u`, by looks so often that none misses a crossing: of
-        the state alone, however old the list is."""
-        near, of = one.solver.near, self._numbers(one, now)
-        begin, motion = near.relative(near.points(of.x)), near.relative(near.points(of.motion))
-        looks = 1 + np.minimum(MOST_LOOKS, 2 * np.sqrt((motion**2).sum(-1)).max(1, initial=0) / of.width).astype(int)
-        out, left = np.zeros(len(one.pairs), bool), np.arange(len(one.pairs))
-        for k in range(int(looks.max(initial=0)) + 1):
-            left = left[(looks[left] >= k) & ~out[left]]
-            if not left.size:
-                break
-            y = begin[left] + (k / looks[left])[:, None, None] * motion[left]
-            _, r, _ = nearest(y, near.edges[left])
-            out[left] = dot(r, r) < (of.width + of.radius)[left] ** 2
-        return out
-
-    def _mark_done(self, near: np.ndarray) -> None:
-        """The stage has checked these pairs: `check_pass` need not."""
-        plane = whole(self.inner.plane)
-        plane[near, 3] = 1e30
-        if runtime.view(self.inner.plane) is None:
-            runtime.fill(self.inner.plane, plane)
-
-    def _pass(self, near: np.ndarray, start, u, v) -> ContactPass:
+    def _pass(self, numbers: np.ndarray) -> ContactPass:
+        """Pairs of the list, without a state."""
         inner = self.inner
-        corners = runtime.fetch(inner.list.pairs)[: 4 * inner.list.count].reshape(-1, 4)[near]
-        edges = near >= inner.list.num_vt
-        scale = np.zeros(len(near))
-        scale[edges] = whole(inner.list.scale)[near[edges] - inner.list.num_vt]
+        corners = runtime.fetch(inner.list.pairs)[: 4 * inner.list.count].reshape(-1, 4)[numbers]
+        edges = numbers >= inner.list.num_vt
+        scale = np.zeros(len(numbers))
+        scale[edges] = whole(inner.list.scale)[numbers[edges] - inner.list.num_vt]
         points, local = np.unique(corners, return_inverse=True)
         C, nodes = None, points
         if self.matrix is not None:
@@ -240,10 +261,10 @@ class PairContact(Stage):
             nodes = np.unique(C.indices)
             C = C[:, nodes].tocsr()
         free = None if self.free is None else self.free[nodes]
-        own = NearPairs(local.reshape(-1, 4), edges, scale, len(points), C, free)
-        rest = whole(inner.rest_plane)[near].astype(float), whole(inner.rest_weights)[near].astype(float)
-        place, numbers = self.node_place[nodes], self.numbers.of(near, corners)
-        return ContactPass(PartSolver(own), place, corners, start[place], u, v, [], None, (*rest, numbers))
+        near = NearPairs(local.reshape(-1, 4), edges, scale, len(points), C, free)
+        rest = whole(inner.rest_plane)[numbers].astype(float), whole(inner.rest_weights)[numbers].astype(float)
+        place = self.node_place[nodes]
+        return ContactPass(near, numbers, place, corners, (*rest, self.numbers.of(numbers, corners)), None)
 
     def _numbers(self, one: ContactPass, now, changes=None) -> SimpleNamespace:
         """What parts read; changes: of it, as imaginary parts of the size `TINY`."""
@@ -278,75 +299,35 @@ class PairContact(Stage):
     def inverse(self) -> np.ndarray:
         return self.a.inverse_of(self.a.values.mass)
 
-    def _go(self, one: ContactPass, of) -> tuple[np.ndarray, np.ndarray]:
-        """(e, b) of the pass, whose parts are noted."""
-        solver, e = one.solver, np.zeros_like(of.motion)
-        b, begin, share, shortened = e.copy(), 0.0, 1.0, False
+    def _go(self, at: Passes, now, recording: bool) -> list[Part]:
+        """The parts of a pass, which are noted if it is recorded."""
+        parts, begin, share, shortened = [], 0.0, 1.0, False
+        numbers = dict(h=now.h, alpha=now.alpha, damping=self.damping, rounding=self.rounding)
         while begin < 1:
             share = min(share, 1 - begin)
-            tried = self._try(solver, of, begin, share, e, b)
-            if tried is None:
+            before = self.set.moved if recording else None
+            came_of, damping = self.set.take(begin=begin, share=share, **numbers)
+            if came_of != TAKEN:
                 share, shortened = 0.5 * share, True
                 if share < SHORTEST:
-                    self._refuse(one, of)
+                    self._refuse(at, now)
                 continue
-            part, e, b = tried
-            one.parts.append(part)
+            if recording:
+                parts.append(Part(begin, share, damping, *before, self.set.solution))
             begin, share, shortened = begin + share, share if shortened else 2 * share, False
-        return e, b
+        return parts
 
-    def _try(self, solver: PartSolver, of, begin, share, e, b):
-        """(the part, e, b after it), or None where it is too long."""
-        part, near = Part(begin, share, self.damping, e, b), solver.near
-        move = near.relative(near.points(share * (of.motion + of.alpha * b)))
-        farthest = np.sqrt((move**2).sum(-1).max(1) / of.width**2).max()
-        if farthest > LONGEST:
-            return None
-        X = near.points(of.x + begin * of.motion + e)
-        at = solver.look(part, of)
-        if self.damping < 1:
-            before = near.parted(at.n, X) - of.radius
-            if not np.all((before > 0) & (at.d - of.radius > HALF * before)):
-                if farthest > RESOLVED:
-                    return None
-                part.c = 1.0
-                at = solver.look(part, of)
-        part.xi = solver.solve(part, of, at)
-        if part.xi is None:
-            return None
-        e_next, b_next = solver.take(part, of, at)
-        end = near.points(of.x + (begin + share) * of.motion + e_next)
-        if not self._stays_apart(near, at, X, end, of.radius):
-            return None
-        return part, e_next, b_next
-
-    def _stays_apart(self, near: NearPairs, at, X: np.ndarray, end: np.ndarray, radius) -> bool:
-        """Whether a plane parts each pair where a part begins and where it ends, and so all the way."""
-        room = self.rounding * (1 + np.abs(end).max()) + np.broadcast_to(radius, len(near.corners))
-        doubtful = np.flatnonzero(~(near.parted(at.n, X, end) > room))
-        if not doubtful.size:
-            return True
-        some = NearPairs(
-            near.corners[doubtful], near.edges[doubtful], near.scale[doubtful], near.num_points, None, None
-        )
-        best = np.full(doubtful.size, -np.inf)
-        for x in (X, end):
-            _, r, _ = nearest(some.relative(x), some.edges)
-            d = np.sqrt((r * r).sum(1))
-            best = np.maximum(best, some.parted(r / np.maximum(d, 1e-300)[:, None], X, end))
-        return bool(np.all(best > room[doubtful]))
-
-    def _refuse(self, one: ContactPass, of) -> None:
-        near = one.solver.near
-        move = near.relative(near.points(of.motion))
-        speed = float(np.sqrt((move**2).sum(-1)).max()) / of.h
-        corners = one.pairs[int((move**2).sum(-1).max(1).argmax())]
-        self.inner.fresh = False
+    def _refuse(self, at: Passes, now) -> None:
+        inner, surface = self.inner, self.inner.mesh.surface_vertices
+        moved = runtime.fetch_row(*self._fine(at.history.u, at.end))[surface] - runtime.fetch(inner.before)
+        ways = np.linalg.norm(moved - moved.mean(0), axis=1)
+        i, h = int(ways.argmax()), now.h
+        inner.fresh = False
         error = Tunnelling(
-            f"contact of width {np.min(of.W):.3g} m does not keep surfaces apart near vertices {corners.tolist()}, which "
-            f"meet at {speed:.3g} m/s: take substeps of {0.25 * of.h:.3g} s"
+            f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep "
+            f"of {h:.3g} s, {ways[i] / h:.3g} m/s at vertex {surface[i]}: take substeps of {0.25 * h:.3g} s"
         )
-        error.stable_dt, error.stiffness = 0.25 * of.h, None
+        error.stable_dt, error.stiffness = 0.25 * h, None
         raise error
 
     @property

@@ -180,12 +180,13 @@ class SurfacePairs:
 
     # ---- the list ---------------------------------------------------------------------------------------------------
 
-    def build(self, u, slot: int, wanted=0.0) -> None:
-        """The list at u[slot]; slacks follow the motion, or cover `wanted`, shape (n, 2) [m]."""
+    def build(self, u, slot: int, wanted=0.0, needed=0.0) -> None:
+        """The list at u[slot]; slacks follow the motion, or cover `wanted` unless that is long, and `needed`, of shape
+        (n, 2) [m]."""
         x = runtime.fetch(u, slot)[self.mesh.surface_vertices]
         if not np.all(np.isfinite(x)):  # the guard of the run will say so
             return
-        runtime.fill(self.list.slack, self._slacks(x, wanted))
+        runtime.fill(self.list.slack, self._slacks(x, wanted, needed))
         self.list.build(self.a.rest, u, slot, self.width)
         count, take = self.list.count, self.list.buffers.take
         vector, fp = self.kernels.vec4, self.kernels.fp
@@ -198,7 +199,7 @@ class SurfacePairs:
         self.fresh, self.age = True, 0
         self.builds += 1
 
-    def _slacks(self, x: np.ndarray, wanted) -> np.ndarray:
+    def _slacks(self, x: np.ndarray, wanted, needed=0.0) -> np.ndarray:
         """Slacks [m] of the surface vertices towards their own body and others, shape (n, 4), for displacements x."""
         slack, least = np.zeros((len(x), 4)), self.least_slack * self.width
         slack[:, :2] = wanted
@@ -210,11 +211,12 @@ class SurfacePairs:
             pace = np.maximum(overall / self.age, last)
             pace += pace.mean(0)  # the mean, for what will be hit
             passes = self.typical_slack * self.width / max(float(np.median(pace.max(1))), 1e-300)
-            slack[:, :2] = np.clip(passes, self.fewest_passes, self.most_passes) * pace
+            slack[:, :2] = np.maximum(np.clip(passes, self.fewest_passes, self.most_passes) * pace, wanted)
             # the slack before, for what shakes
             slack[:, :2] = np.maximum(slack, 0.9 * whole(self.list.slack))[:, :2]
         for k, largest in enumerate(self.largest_reach):
             slack[:, k] = slack[:, k].clip(least, max(least, 0.5 * (largest * self.list.typical - self.width)))
+        slack[:, :2] = np.maximum(slack[:, :2], needed)
         return slack
 
     def travel(self, move: np.ndarray) -> np.ndarray:
