@@ -37,6 +37,33 @@ class CGKernels:
         return out
 
     @ti.func
+    def to(self, fp: A, v):
+        """A vector in another precision, number by number: Taichi has no vector code for this."""
+        return ti.Vector([ti.cast(v[0], fp), ti.cast(v[1], fp), ti.cast(v[2], fp), ti.cast(0, fp)])
+
+    @ti.func
+    def is_wanted(self, cg: A, plan: A):
+        return cg.state[STOPPED] == 0
+
+    @cached_property
+    def wanted(self) -> Kernel:
+        """Whether the solve goes on, for `Repeated`."""
+        return Kernel("wanted", self.is_wanted, self.vectors, dict(cg=dict(state="scalars")), {})
+
+    @ti.func
+    def divide(self, cg: A, blocks: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.nodes):
+            r = cg.r[0, i]
+            cg.z[0, i] = blocks.inverse[0, i] * r[0] + blocks.inverse[1, i] * r[1] + blocks.inverse[2, i] * r[2]
+
+    @cached_property
+    def scale(self) -> Kernel:
+        """z = D^-1 r; inverse: the columns of each block of D^-1."""
+        arrays = dict(cg=dict.fromkeys(("r", "z"), "vectors2"), blocks=dict(inverse="vectors2"))
+        return Kernel("scale", self.divide, self.vectors, arrays, dict(nodes="int"))
+
+    @ti.func
     def first(self, cg: A, at: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
@@ -59,7 +86,7 @@ class CGKernels:
             if cg.state[STOPPED] == 0:
                 p = cg.z[0, i] + cg.p[0, i] * cg.state[BETA]
                 cg.p[0, i] = p
-                at.w[0, i] = ti.cast(p, PRECISIONS[self.scene])
+                at.w[0, i] = self.to(PRECISIONS[self.scene], p)
 
     @cached_property
     def turn(self) -> Kernel:
@@ -74,7 +101,7 @@ class CGKernels:
         curvature, pp, qq = ti.cast(0, self.fp), ti.cast(0, self.fp), ti.cast(0, self.fp)
         for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
             p = cg.p[0, i]
-            q = p * cg.mass[i] + ti.cast(at.y[0, i], self.fp) * ti.cast(-1, self.fp)
+            q = p * cg.mass[i] + self.to(self.fp, at.y[0, i]) * ti.cast(-1, self.fp)
             q = q * cg.free[i]
             cg.q[0, i] = q
             curvature += self.dot(p, q)
