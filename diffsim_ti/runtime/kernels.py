@@ -133,8 +133,11 @@ class Repeated:
         self._names = [kernel.numbers for kernel in kernels]
         self._loop = "serial" if not parallel and runs_on_cpu() else "tasks" if can_repeat() else "launches"
         made = _repeated_kernel(name, tuple(kernels), tuple(names), self._loop)
-        loops = dict(loops=-1) if self._loop == "tasks" else {}
-        self._launch = Launch(made, *arrays, vectorized=vectorized, title=f"the kernel {name}", **loops)
+        of = next((found for k in kernels if (found := k.options["title"].partition(" of ")[2])), "")
+        options = dict(
+            title=f"the kernel {name}" + (f" of {of}" if of else ""), loops=-1 if self._loop == "tasks" else 0
+        )
+        self._launch = Launch(made, *arrays, vectorized=vectorized, **options)
 
     def __call__(self, times: int, *numbers: dict) -> None:
         values = [own[n] for names, own in zip(self._names, numbers, strict=True) for n in names]

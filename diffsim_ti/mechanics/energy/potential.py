@@ -183,8 +183,8 @@ class Potential:
 
     @property
     def stays_on_device(self) -> bool:
-        """Whether `multiply` does all of `product`."""
-        return not (self.faces or self.hosts)
+        """Whether `multiply` does all of `product` but host forces."""
+        return not self.faces
 
     @property
     def is_one_kernel(self) -> bool:

@@ -52,7 +52,7 @@ class Multigrid(Preconditioner):
         self.frames.allowed = upload_rows(projectors_of(free), 3)
         matrices, ways = [as_blocks(M) for M in matrices], [as_blocks(P) for P in ways]
         self.cycle = Cycle(matrices, ways, self.frames, parallel)
-        self.solver = DeviceCG(potential, self.cycle, parallel)
+        self.solver = DeviceCG(potential, self.cycle, free, parallel)
         self._contact = None
 
     def update(self, u: np.ndarray) -> None:

@@ -5,7 +5,7 @@ Both are functions of the present state alone, so that a run that is started aga
 
 import numpy as np
 
-from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of
+from diffsim_ti.mechanics.supports.free import Free, FreeBodies, FreeDirections, mask_of
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 from diffsim_ti.solvers.implicit.factorised import Effort
 
@@ -42,7 +42,7 @@ class BlockJacobi(Preconditioner):
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray | float, parallel: bool = True):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
-        self.solver = DeviceCG(potential, None, parallel) if type(self) is BlockJacobi else None
+        self.solver = None if isinstance(free, FreeBodies) else DeviceCG(potential, None, free, parallel)
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
