@@ -86,7 +86,9 @@ class CGKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             if cg.state[STOPPED] == 0:
-                p = cg.z[0, i] + cg.p[0, i] * cg.state[BETA]
+                p = cg.z[0, i]
+                if cg.state[BETA] != 0:  # else p is of another solve
+                    p += cg.p[0, i] * cg.state[BETA]
                 cg.p[0, i] = p
                 at.w[0, i] = self.to(PRECISIONS[self.scene], p)
 
@@ -156,7 +158,10 @@ class CGKernels:
             square, alpha = ti.cast(0, self.fp), cg.state[ALPHA]
             for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
                 if alpha != 0:
-                    cg.x[0, i] = cg.x[0, i] + cg.p[0, i] * alpha
+                    x = cg.p[0, i] * alpha
+                    if cg.state[COUNT] > 1:  # else x is of another solve
+                        x += cg.x[0, i]
+                    cg.x[0, i] = x
                     cg.r[0, i] = cg.r[0, i] + cg.q[0, i] * -alpha
                 square += self.dot(cg.r[0, i], cg.r[0, i])
             cg.part[0, c] = square

@@ -42,11 +42,11 @@ class DeviceCG:
             self.inverse = runtime.array(self._vector, 3, n)
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
         whole = runs_on_cpu() and not parallel and potential.is_one_kernel
-        self._look = self.many if whole else 1 if runs_on_cpu() else 10  # iterations between looks at the state
-        self._iterations, self._room = (
-            {},
-            0,
-        )  # (with a matrix, convex) -> times, rounding -> None; blocks of that matrix
+        # iterations between looks at the state; on a card so many as the solve before took
+        self._look, self._last = self.many if whole else 1 if runs_on_cpu() else 0, 10
+        self._iterations = {}  # (with a matrix, convex) -> iterate(times, rounding)
+        self._room = 0  # blocks of that matrix
+        self._filled: np.ndarray | None = None  # what `mass` holds
 
     def _columns(self, blocks: np.ndarray, room: int = 0):
         """Blocks, shape (k, 3, 3), by columns on the device, with room for more."""
@@ -117,16 +117,16 @@ class DeviceCG:
         kind = more is not None, convex
         if kind not in self._iterations:
             self._iterations[kind] = self._iteration(*kind)
-        runtime.fill(self.mass, mass[:, 0])
+        if mass is not self._filled:
+            runtime.fill(self.mass, mass[:, 0])
+            self._filled = mass
         runtime.fill(self.r, (b / size)[None])
-        runtime.fill(self.x, 0)
-        runtime.fill(self.p, 0)
         state = np.zeros(8)
         state[LEAST] = tolerance**2
         runtime.fill(self.state, state)
         done = 0
         while done < max_iterations:
-            times = min(self._look, max_iterations - done)
+            times = min(self._look or max(2, self._last - done, done), max_iterations - done)
             self._iterations[kind](times, 10 * eps)
             done, state = done + times, runtime.fetch(self.state)
             if state[STOPPED] or not np.isfinite(state[SQUARE]):
@@ -135,7 +135,8 @@ class DeviceCG:
             return np.zeros_like(b), np.inf, int(state[COUNT]), None
         if not np.isfinite(state[SQUARE]):
             raise FloatingPointError("the stiffness of this state is not finite")
-        count, negative = int(state[COUNT]), None
+        count = self._last = int(state[COUNT])
+        negative = None
         if state[STOPPED] == 2:
             negative = runtime.fetch_row(self.p, 0)
         x = runtime.fetch_row(self.x, 0) if count > 1 or negative is None else negative
