@@ -31,6 +31,7 @@ from diffsim_ti import (
     Traction,
     VelocityVerletSolver,
 )
+from diffsim_ti.solvers.implicit.multigrid import Multigrid
 
 pytestmark = pytest.mark.backends
 SUBSTEPS = 10
@@ -51,13 +52,16 @@ NEW_LIST = NO_TRAFFIC | dict(launches=55, copies_to_device=16, copies_to_host=11
 FACES_FORWARD = NO_TRAFFIC | dict(launches=16, copies_to_device=6, copies_to_host=5)
 FACES_REVERSE = NO_TRAFFIC | dict(launches=29, copies_to_device=16, copies_to_host=2, fills=2)
 # ... for each implicit step of this scene, whose linear solver's vectors live on the host, and of it for each product
-IMPLICIT_FORWARD = NO_TRAFFIC | dict(launches=152, copies_to_device=109, copies_to_host=104, fills=8)
-IMPLICIT_REVERSE = NO_TRAFFIC | dict(launches=21, copies_to_device=15, copies_to_host=12, fills=2)
+IMPLICIT_FORWARD = NO_TRAFFIC | dict(launches=250, copies_to_device=95, copies_to_host=95, fills=8)
+IMPLICIT_REVERSE = NO_TRAFFIC | dict(launches=60, copies_to_device=11, copies_to_host=10, fills=2)
 PRODUCT = NO_TRAFFIC | dict(launches=3, copies_to_device=2, copies_to_host=1)
 # ... for a whole explicit run, besides its substeps: arrays go each way once, zeroing is a memset
 ONCE_FORWARD = dict(synchronisations=0, copies_to_device=17, copies_to_host=8, fills=4)
 ONCE_REVERSE = dict(synchronisations=0, copies_to_device=6, copies_to_host=5, fills=14)
-DOUBLE_IN_SINGLE = {"_find_bad": "ti.math.isinf compares with a double"}
+DOUBLE_IN_SINGLE = {
+    "_find_bad": "ti.math.isinf compares with a double",
+    "cg": "vectors of conjugate gradients, beside products in float32: a stiff body takes more digits than these have",
+}
 
 
 @pytest.fixture
@@ -168,8 +172,9 @@ def test_implicit_steps_stay_below_their_ceilings(driver, cube):
     check_counts(driver.counts(), PRODUCT)
 
 
-def test_ten_iterations_on_the_device_bring_eight_numbers_to_the_host(driver):
+def test_ten_iterations_on_the_device_bring_eight_numbers_to_the_host(driver, monkeypatch):
     """Besides arguments of launches nothing goes to the card."""
+    monkeypatch.setattr(Multigrid, "direct", 0)
     mesh = TetrahedralMesh.create_box((9, 4, 4), (0.8, 0.3, 0.3))
     held = Scene(mesh, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity()], fixed="xmin", precision="f64")
     solver = StaticSolver(held, preconditioner="multigrid")
@@ -180,7 +185,7 @@ def test_ten_iterations_on_the_device_bring_eight_numbers_to_the_host(driver):
     multigrid.update(0 * b)
     for iterations in (10, 10, 20):
         driver.restart()
-        _, _, count, _ = multigrid.solver(none, workspace.free, b * workspace.free, 1e-30, iterations, 1e-16)
+        _, _, count, _ = multigrid.solver(none, None, False, b * workspace.free, 1e-30, iterations, 1e-16)
         assert count == iterations
         found[iterations] = driver.counts()
     more = {name: found[20][name] - found[10][name] for name in found[10]}

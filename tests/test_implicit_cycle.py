@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.mechanics.stress.projection import Projection
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
 
 
@@ -53,6 +54,50 @@ def test_gmres_says_what_it_cannot():
     with pytest.raises(FloatingPointError, match="not finite"):
         gmres(lambda w: np.nan * w, b, lambda r: r, 1e-6, 50)
     assert gmres(lambda w: w, 0 * b, lambda r: r, 1e-6, 50)[2] == 0
+
+
+def operators(precision: str):
+    """(name, operator, preconditioner) at a state that is pulled about, for each thing that joins products on the device."""
+    box, law = ds.TetrahedralMesh.create_box((5, 3, 3), (0.4, 0.2, 0.2)), ds.StableNeoHookean(1e5, 0.4)
+    slides = {"xmin": "x", "ymin": [0.0, 1.0, 1.0]}
+    foundation = ds.ElasticFoundation(1e6, 1e5, "ymax")
+    cases = {  # much: supports in some directions, a consistent mass, a host force
+        "nothing else": dict(mesh=box, fixed="xmin"),
+        "much": dict(mesh=box.quadratic(), fixed=slides, terms=[foundation]),
+        "self-contact": dict(mesh=box, fixed="xmin", terms=[ds.SelfContact()]),
+        "a correction": dict(mesh=box, fixed="xmin"),
+    }
+    for name in cases if precision == "f64" else ["much"]:
+        own = cases[name]
+        mesh, fixed, terms = own["mesh"], own["fixed"], own.get("terms", [])
+        solver = ds.ImplicitEulerSolver(ds.Scene(mesh, law, 1000.0, terms, fixed, precision=precision), dt=0.01)
+        workspace = solver.workspace(solver.start_values())
+        workspace.advance(0, 1, 1)
+        stretch = np.array([0.5, -0.4, -0.4] if name == "a correction" else [0.2, -0.1, 0.05])
+        workspace.potential.place(mesh.vertices * stretch * (mesh.vertices[:, :1] / 0.4))
+        mass = 1e4 * workspace.mass
+        preconditioner, _ = workspace.preconditioner(mass)
+        preconditioner.update(workspace.potential.held_at)
+        A = Operator(workspace.potential, mass, workspace.free)
+        if name == "a correction":
+            A.correction = Projection(workspace.potential)
+            assert len(A.correction.C)
+        yield name, A, preconditioner, workspace
+
+
+@pytest.mark.parametrize("precision, most", [("f64", 1e-10), ("f32", 2e-4)])
+def test_what_joins_products_on_the_device_is_what_joins_them_on_the_host(precision, most):
+    """To a residual of 1e-11 or, with products in float32, 1e-5, of systems whose condition is some 1e2."""
+    for name, A, preconditioner, workspace in operators(precision):
+        b = np.random.default_rng(0).standard_normal((len(workspace.potential.held_at), 3)) * workspace.free
+        assert A.on_device(), name
+        how = dict(tolerance=1e-11 if precision == "f64" else 1e-5, max_iterations=500, eps=1e-16)
+        x, residual, _, negative = conjugate_gradients(A, b, preconditioner, **how)
+        A.on_device = lambda: None
+        y, *_ = conjugate_gradients(A, b, preconditioner, **how)
+        assert negative is None and residual <= how["tolerance"], name
+        assert np.abs(x - y).max() < most * np.abs(y).max(), name
+        np.testing.assert_allclose(A(x), b, rtol=0, atol=1e-4 * np.abs(b).max() if precision == "f32" else 1e-9)
 
 
 def test_a_cycle_is_symmetric_and_positive_definite(static):

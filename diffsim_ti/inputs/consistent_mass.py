@@ -91,6 +91,14 @@ class ConsistentMass:
         """M 1 of the matrix without its factor, shape (n, 1): the masses that weight acts on; negative at corners."""
         return np.asarray(self.matrix.sum(1)).reshape(-1, 1)
 
+    def blocks(self):
+        """The matrix of all unknowns, M times the identity, as a SciPy matrix of 3x3 blocks."""
+        from scipy.sparse import bsr_matrix
+
+        M = self.matrix
+        data = (self.factor * M.data)[:, None, None] * np.eye(3)
+        return bsr_matrix((data, M.indices, M.indptr), shape=(3 * M.shape[0], 3 * M.shape[1]))
+
     @property
     def diagonal(self) -> np.ndarray:
         """Its diagonal, shape (n, 1)."""

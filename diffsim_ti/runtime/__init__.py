@@ -42,7 +42,7 @@ from diffsim_ti.runtime.arrays import (
 )
 from diffsim_ti.runtime.device import device_name, use_device
 from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
-from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, array_types, kernel, kernels_of
+from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, Repeated, array_types, kernel, kernels_of
 from diffsim_ti.runtime.language import Bundle, Expr, assign, at, each_lane, let, spread, traced, variable
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
 from diffsim_ti.runtime.repeated_loops import can_repeat

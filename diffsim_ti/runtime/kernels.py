@@ -10,6 +10,7 @@ import taichi as ti
 from diffsim_ti.runtime.language import Bundle
 from diffsim_ti.runtime.launch import Launch
 from diffsim_ti.runtime.quadrants import QUADRANTS
+from diffsim_ti.runtime.repeated_loops import can_repeat
 from diffsim_ti.runtime.start import PRECISIONS, runs_on_cpu
 
 if QUADRANTS:  # has a tracer of its own
@@ -71,21 +72,24 @@ class Kernel:
         owner = getattr(body, "__self__", None)
         law = getattr(owner, "law", None) or getattr(getattr(owner, "element", None), "law", None)
         self.options["title"] = f"the kernel {name}" + (f" of {law.title}" if hasattr(law, "title") else "")
-        types = array_types(precision)
-        arguments = [(f"{b}_{a}", types[kind]) for b, own in arrays.items() for a, kind in own.items()]
-        arguments += [(n, types[kind]) for n, kind in numbers.items()]
-        bundles = [f"Bundle({', '.join(f'{a}={b}_{a}' for a in own)})" for b, own in arrays.items()]
+        self.body, self._types, self._kinds = body, array_types(precision), numbers
+        first, call, arguments = self.call("body", {})
+        self.kernel = _compiled(name, arguments, [*first, call], dict(body=body))
+
+    def call(self, body: str, names: dict, prefix: str = "") -> tuple[list, str, dict]:
+        """(lines before all loops, the line that calls the body, {argument: type}) in the source of a kernel; names: of the
+        arguments that have others there, {(bundle, array): argument}."""
+        types, arguments, bundles = self._types, {}, []
+        for bundle, own in self.arrays.items():
+            mine = {a: names.get((bundle, a), f"{prefix}{bundle}_{a}") for a in own}
+            arguments |= {mine[a]: types[kind] for a, kind in own.items()}
+            bundles.append(f"Bundle({', '.join(f'{a}={argument}' for a, argument in mine.items())})")
+        arguments |= {prefix + n: types[kind] for n, kind in self._kinds.items()}
         # a GPU takes one task more, of one thread, for the bounds of each loop, but one for all that are read before them
-        first = [] if runs_on_cpu() else [n for n, kind in numbers.items() if kind == "int"]
-        bundles.append(f"Bundle({', '.join(f'{n}={n}_' if n in first else f'{n}={n}' for n in numbers)})")
-        signature = ", ".join(f"{argument}: types[{k}]" for k, (argument, _) in enumerate(arguments))
-        lines = [*(f"{n}_ = {n}" for n in first), f"body({', '.join(bundles)})"]
-        source = f"def {name}({signature}):\n" + "".join(f"    {line}\n" for line in lines)
-        file = f"<{name} {next(_serial)}>"
-        linecache.cache[file] = (len(source), None, source.splitlines(True), file)  # Taichi reads a kernel's source
-        scope = dict(body=body, Bundle=Bundle, types=[kind for _, kind in arguments])
-        exec(compile(source, file, "exec"), scope)
-        self.kernel = kernel(scope[name])
+        first = [] if runs_on_cpu() else [n for n, kind in self._kinds.items() if kind == "int"]
+        numbers = ", ".join(f"{n}={prefix}{n}_" if n in first else f"{n}={prefix}{n}" for n in self._kinds)
+        lines = [f"{prefix}{n}_ = {prefix}{n}" for n in first]
+        return lines, f"{body}({', '.join([*bundles, f'Bundle({numbers})'])})", arguments
 
     def bind(self, vectorized: bool = False, **records) -> Callable:
         """The kernel with its arrays bound; call it with the numbers, by name.
@@ -95,6 +99,72 @@ class Kernel:
         arrays = [_found(records[bundle], name) for bundle, own in self.arrays.items() for name in own]
         launch, names = Launch(self.kernel, *arrays, vectorized=vectorized, **self.options), self.numbers
         return lambda **numbers: launch(*map(numbers.__getitem__, names))
+
+
+def _compiled(name: str, arguments: dict, lines: list, scope: dict):
+    """The kernel of such a source; scope: what its names are."""
+    signature = ", ".join(f"{argument}: types[{k}]" for k, argument in enumerate(arguments))
+    source = f"def {name}({signature}):\n" + "".join(f"    {line}\n" for line in lines)
+    file = f"<{name} {next(_serial)}>"
+    linecache.cache[file] = (len(source), None, source.splitlines(True), file)  # Taichi reads a kernel's source
+    scope = dict(scope, Bundle=Bundle, ti=ti, types=list(arguments.values()))
+    exec(compile(source, file, "exec"), scope)
+    return kernel(scope[name])
+
+
+class Repeated:
+    """Kernels one after the other, again and again in one launch: `launch(times, numbers of each kernel)`.
+
+    parts: [(kernel, records)], as of `Kernel.bind`; an array that several of them take is one argument. The body of the
+    first says whether the others are still wanted. On one thread of the processor it is asked each time; elsewhere the
+    others themselves do nothing once they are not wanted, in a list of tasks that names them so often
+    (repeated_loops.py) or, where there is none, in a launch each time.
+    """
+
+    def __init__(self, name: str, parts: list, parallel: bool, vectorized: bool = False):
+        kernels, known, arrays, names = [kernel for kernel, _ in parts], {}, [], []
+        for k, (kernel, records) in enumerate(parts):
+            own = {(b, a): _found(records[b], a) for b, of in kernel.arrays.items() for a in of}
+            for (b, a), array in own.items():
+                if id(array) not in known:
+                    known[id(array)] = f"k{k}_{b}_{a}"
+                    arrays.append(array)
+            names.append(tuple((place, known[id(array)]) for place, array in own.items()))
+        self._names = [kernel.numbers for kernel in kernels]
+        self._loop = "serial" if not parallel and runs_on_cpu() else "tasks" if can_repeat() else "launches"
+        made = _repeated_kernel(name, tuple(kernels), tuple(names), self._loop)
+        of = next((found for k in kernels if (found := k.options["title"].partition(" of ")[2])), "")
+        options = dict(
+            title=f"the kernel {name}" + (f" of {of}" if of else ""), loops=-1 if self._loop == "tasks" else 0
+        )
+        self._launch = Launch(made, *arrays, vectorized=vectorized, **options)
+
+    def __call__(self, times: int, *numbers: dict) -> None:
+        values = [own[n] for names, own in zip(self._names, numbers, strict=True) for n in names]
+        if self._loop == "launches":
+            for _ in range(times):
+                self._launch(*values, 1)
+        else:
+            self._launch(*values, times)
+
+
+@lru_cache(maxsize=None)
+def _repeated_kernel(name: str, kernels: tuple, names: tuple, loop: str):
+    """The first of the kernels says whether it goes on."""
+    lines, calls, arrays, numbers, scope = [], [], {}, {}, {}
+    for k, (kernel, own) in enumerate(zip(kernels, names)):
+        first, call, arguments = kernel.call(f"body{k}", dict(own), f"k{k}_")
+        of_numbers = {f"k{k}_{n}" for n in kernel.numbers}
+        arrays |= {a: kind for a, kind in arguments.items() if a not in of_numbers and a not in arrays}
+        numbers |= {a: kind for a, kind in arguments.items() if a in of_numbers}
+        scope[f"body{k}"] = kernel.body
+        lines, calls = lines + first, [*calls, call]
+    if loop == "serial":
+        inner = [f"    if {calls[0]}:", *(f"        {call}" for call in calls[1:])]
+        lines += ["ti.loop_config(serialize=True)", "for _ in range(times):", *inner]
+    else:
+        lines += calls[1:]
+    return _compiled(name, arrays | numbers | dict(times=ti.i32), lines, scope)
 
 
 @lru_cache(maxsize=None)

@@ -31,7 +31,8 @@ class Launch:
     polished: also by Taichi's own passes, whose time grows with the square of a kernel's length. LLVM repeats most of what
     they do: without them the same bits, and a third of the compile time for scenes with many terms; but short kernels that
     run all the time are a tenth faster with them.
-    loops: so many of its first loops are gone through as often as the last number says (repeated_loops.py); 0: once.
+    loops: so many of its first loops are gone through as often as the last number says (repeated_loops.py); 0: once; -1: all
+    its tasks are.
     title: what it is, for who waits until it is compiled.
     """
 

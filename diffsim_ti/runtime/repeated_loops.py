@@ -32,7 +32,8 @@ def can_repeat() -> bool:
 
 
 class RepeatedLoops:
-    """A compiled kernel, code, whose first `loops` loops are gone through n times before what follows them.
+    """A compiled kernel, code, whose first `loops` loops are gone through n times before what follows them; -1: all its
+    tasks.
 
     Taichi has no door for this. Its object holds a list of tasks, and the number under which the launcher knows the kernel,
     given at its first launch with a copy of that list. Both are others while a launch takes place here, and then again what
@@ -57,7 +58,9 @@ class RepeatedLoops:
     def _check(self) -> None:
         expected = ["serial", *["range_for"] * self._loops]
         found = [name.split("_kernel_")[-1].partition("_")[2] for name in self._names()]
-        if found[: len(expected)] != expected:
+        if self._loops < 0:
+            expected = [task for task in found if task in ("serial", "range_for")] or ["serial"]
+        if found[: len(expected)] != expected or self._loops < 0 and found != expected:
             raise RuntimeError(
                 f"this build of Taichi compiled a kernel to tasks {found or 'of an unknown layout'}, where version 1.7.4 "
                 f"has {expected}: install taichi==1.7.4"
@@ -77,7 +80,7 @@ class RepeatedLoops:
         """The list of tasks with its loops n times; texts of names stay where they are."""
         first, behind, _ = self._tasks
         text, end = ctypes.string_at(first, behind - first), _TASK * (1 + self._loops)
-        text = text[:_TASK] + n * text[_TASK:end] + text[end:]
+        text = n * text if self._loops < 0 else text[:_TASK] + n * text[_TASK:end] + text[end:]
         return ctypes.create_string_buffer(text, len(text))
 
     @contextlib.contextmanager

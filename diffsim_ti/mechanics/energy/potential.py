@@ -55,12 +55,15 @@ class Potential:
         """What acts on vertices from the host: host forces with an energy, and friction of surfaces."""
         return [part for part in (self.hosts, self.surface_friction) if part]
 
+    @property
+    def _records(self) -> dict:
+        return dict(scene=self.arrays, pass_=self, at=self, out=self)
+
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""
-        a = self.arrays
         if name not in self._launches:
-            own = dict(scene=a, pass_=self, at=self, out=self) | records
-            self._launches[name] = getattr(self.kernels, name).bind(lanes and a.in_vectors, **own)
+            own = self._records | records
+            self._launches[name] = getattr(self.kernels, name).bind(lanes and self.arrays.in_vectors, **own)
         self._launches[name](**self.sizes())
 
     def sizes(self) -> dict:
@@ -180,8 +183,18 @@ class Potential:
 
     @property
     def stays_on_device(self) -> bool:
-        """Whether `multiply` does all of `product`."""
-        return not (self.faces or self.hosts)
+        """Whether `multiply` does all of `product` but host forces."""
+        return not self.faces
+
+    @property
+    def is_one_kernel(self) -> bool:
+        """Whether `multiplying` does all of `multiply`."""
+        return not self.pairs
+
+    @property
+    def multiplying(self) -> tuple:
+        """(kernel, records) of y = -d2E/du2 w, which takes `sizes`."""
+        return self.kernels.product, self._records
 
     def blocks(self) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""

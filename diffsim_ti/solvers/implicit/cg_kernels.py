@@ -14,11 +14,14 @@ RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST = range(7)
 
 @dataclass(frozen=True)
 class CGKernels:
-    """scene: precision of the products; vectors: that of all else."""
+    """scene: precision of the products; vectors: that of all else; guided: whether vertices are fixed in some directions
+    only; more: whether a matrix of blocks joins the potential's Hessian."""
 
     scene: str
     vectors: str
     parallel: bool
+    guided: bool
+    more: bool
 
     @property
     def fp(self):
@@ -35,6 +38,32 @@ class CGKernels:
         for c in range(chunks):
             out += part[k, c]
         return out
+
+    @ti.func
+    def to(self, fp: A, v):
+        """A vector in another precision, number by number: Taichi has no vector code for this."""
+        return ti.Vector([ti.cast(v[0], fp), ti.cast(v[1], fp), ti.cast(v[2], fp), ti.cast(0, fp)])
+
+    @ti.func
+    def is_wanted(self, cg: A, plan: A):
+        return cg.state[STOPPED] == 0
+
+    @cached_property
+    def wanted(self) -> Kernel:
+        """Whether the solve goes on, for `Repeated`."""
+        return Kernel("wanted", self.is_wanted, self.vectors, dict(cg=dict(state="scalars")), {})
+
+    @ti.func
+    def divide(self, cg: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.nodes):
+            cg.z[0, i] = self.block(cg.inverse, i, cg.r[0, i])
+
+    @cached_property
+    def scale(self) -> Kernel:
+        """z = D^-1 r; inverse: the columns of each block of D^-1."""
+        arrays = dict(cg=dict.fromkeys(("r", "z", "inverse"), "vectors2"))
+        return Kernel("scale", self.divide, self.vectors, arrays, dict(nodes="int"))
 
     @ti.func
     def first(self, cg: A, at: A, plan: A):
@@ -57,9 +86,11 @@ class CGKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             if cg.state[STOPPED] == 0:
-                p = cg.z[0, i] + cg.p[0, i] * cg.state[BETA]
+                p = cg.z[0, i]
+                if cg.state[BETA] != 0:  # else p is of another solve
+                    p += cg.p[0, i] * cg.state[BETA]
                 cg.p[0, i] = p
-                at.w[0, i] = ti.cast(p, PRECISIONS[self.scene])
+                at.w[0, i] = self.to(PRECISIONS[self.scene], p)
 
     @cached_property
     def turn(self) -> Kernel:
@@ -69,13 +100,32 @@ class CGKernels:
         return Kernel("turn", self.first, self.vectors, arrays, dict(chunks="int", length="int", nodes="int"))
 
     @ti.func
+    def block(self, columns: A, k, v):
+        """Block k, whose columns are given, times v."""
+        return columns[0, k] * v[0] + columns[1, k] * v[1] + columns[2, k] * v[2]
+
+    @ti.func
+    def allowed(self, i, cg: A, q):
+        """What vertex i may do of q; where next to nothing is free, once leaves as much rounding of what is held."""
+        out = q * cg.free[i]
+        if ti.static(self.guided):
+            k = cg.guide[i]
+            if k >= 0:
+                for _ in ti.static(range(2)):
+                    out += self.block(cg.held, k, out) * ti.cast(-1, self.fp)
+        return out
+
+    @ti.func
     def multiply(self, c, cg: A, at: A, plan: A):
         """A p, and p . A p, p . p, A p . A p of a chunk."""
         curvature, pp, qq = ti.cast(0, self.fp), ti.cast(0, self.fp), ti.cast(0, self.fp)
         for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
             p = cg.p[0, i]
-            q = p * cg.mass[i] + ti.cast(at.y[0, i], self.fp) * ti.cast(-1, self.fp)
-            q = q * cg.free[i]
+            q = p * cg.mass[i] + self.to(self.fp, at.y[0, i]) * ti.cast(-1, self.fp)
+            if ti.static(self.more):
+                for k in range(cg.start[i], cg.start[i + 1]):
+                    q += self.block(cg.blocks, k, cg.p[0, cg.column[k]])
+            q = self.allowed(i, cg, q)
             cg.q[0, i] = q
             curvature += self.dot(p, q)
             pp += self.dot(p, p)
@@ -108,7 +158,10 @@ class CGKernels:
             square, alpha = ti.cast(0, self.fp), cg.state[ALPHA]
             for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
                 if alpha != 0:
-                    cg.x[0, i] = cg.x[0, i] + cg.p[0, i] * alpha
+                    x = cg.p[0, i] * alpha
+                    if cg.state[COUNT] > 1:  # else x is of another solve
+                        x += cg.x[0, i]
+                    cg.x[0, i] = x
                     cg.r[0, i] = cg.r[0, i] + cg.q[0, i] * -alpha
                 square += self.dot(cg.r[0, i], cg.r[0, i])
             cg.part[0, c] = square
@@ -123,6 +176,8 @@ class CGKernels:
         """x and r after a step along p, y being what the potential's product makes of it."""
         own = dict(part="scalars2", state="scalars", mass="scalars", free="scalars")
         own |= dict.fromkeys(("x", "r", "p", "q"), "vectors2")
+        own |= dict(guide="ints", held="vectors2") if self.guided else {}
+        own |= dict(start="ints", column="ints", blocks="vectors2") if self.more else {}
         arrays = dict(cg=own, at=dict(y=f"vectors2_{self.scene}"))
         numbers = dict(chunks="int", length="int", nodes="int", rounding="float")
         return Kernel("step", self.advance, self.vectors, arrays, numbers)

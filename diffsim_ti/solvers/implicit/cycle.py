@@ -46,9 +46,7 @@ class Level:
         self.kernels = kernels_of(LevelKernels, self.numbers, "f32", parallel)
         shape = self.nodes, self.numbers, self.inverse.element_shape[0]
         self._columns = [np.zeros(shape, np.float32) for _ in range(2)]  # of blocks, filled up with zeros
-        self.theta = 1.0
-        self.put(self.diagonal_blocks)
-        self.theta = THETA * MARGIN * self._largest()
+        self.theta = THETA * MARGIN * largest_eigenvalue(M, self.diagonal_blocks)
         self.put(self.diagonal_blocks)
 
     def put(self, diagonal: np.ndarray, nodes=slice(None)) -> None:
@@ -59,19 +57,16 @@ class Level:
             columns[nodes, :, : self.numbers] = np.swapaxes(blocks, 1, 2)
             runtime.fill(target, columns.reshape(-1, columns.shape[2]))
 
-    def _largest(self) -> float:
-        """The largest eigenvalue of D^-1 A, by power iteration."""
-        sweep, size = self.kernels.sweep.bind(runtime.runs_on_cpu(), level=self), 1.0
-        x = np.zeros((self.nodes, self.inverse.element_shape[0]))
-        x[:, : self.numbers] = np.random.default_rng(0).standard_normal((self.nodes, self.numbers))
-        runtime.fill(self.b, 0)
-        for _ in range(SWEEPS):
-            runtime.fill(self.x, x / (np.linalg.norm(x) or 1.0))
-            sweep(nodes=self.nodes)
-            x = runtime.view(self.y)
-            x = self.y.to_numpy() if x is None else x
-            size = float(np.linalg.norm(x))
-        return max(size, 1.0)
+
+def largest_eigenvalue(M, diagonal: np.ndarray) -> float:
+    """Of D^-1 M, D the diagonal blocks, by power iteration; at least 1."""
+    inverse, size = inverses(diagonal), 1.0
+    x = np.random.default_rng(0).standard_normal(diagonal.shape[:2])
+    for _ in range(SWEEPS):
+        x = x / (np.linalg.norm(x) or 1.0)
+        x = np.einsum("ijk,ik->ij", inverse, (M @ x.ravel()).reshape(x.shape))
+        size = float(np.linalg.norm(x))
+    return max(size, 1.0)
 
 
 def inverses(blocks: np.ndarray) -> np.ndarray:
@@ -132,18 +127,18 @@ class Cycle:
 
     def __init__(self, matrices: list, ways: list, frames, parallel: bool):
         self.frames = frames
-        lanes = runtime.runs_on_cpu()  # vectors stay vectors, which takes half the time
         self.levels = [Level(M, self._wide(M, parallel)) for M in matrices]
-        self._steps_down, self._steps_up = [], []
+        self._down, self._up = [], []  # (kernel, records, numbers)
         for level, below, P in zip(self.levels, self.levels[1:], ways):
             kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel))
-            down, up = block_matrix(P.T.tobsr(P.blocksize[::-1])), block_matrix(P)
-            step_down = kernels.down.bind(lanes, level=level, down=down, below=below)
-            self._steps_down.append((step_down, level, below))
-            self._steps_up.insert(0, (kernels.up.bind(lanes, level=level, up=up, below=below), level))
+            between = dict(
+                level=level, down=block_matrix(P.T.tobsr(P.blocksize[::-1])), up=block_matrix(P), below=below
+            )
+            self._down.append((kernels.down, between, dict(nodes=level.nodes, below=below.nodes)))
+            self._up.insert(0, (kernels.up, between, dict(nodes=level.nodes)))
         last = self.levels[-1]
-        inverse = block_matrix(inverse_matrix(matrices[-1]))
-        self._solve = last.kernels.solve.bind(lanes, level=last, inverse=inverse)
+        inverse = dict(level=last, inverse=block_matrix(inverse_matrix(matrices[-1])))
+        self._solve = last.kernels.solve, inverse, dict(nodes=last.nodes)
         vectors = "f32" if runtime.arch_name() == "vulkan" else "f64"
         self._ends = kernels_of(LevelKernels, 3, vectors, self._wide(matrices[0], parallel))
         self._bound = {}
@@ -156,17 +151,18 @@ class Cycle:
         if len(self.levels) > 1:
             self.levels[0].put(blocks, nodes)
 
-    def __call__(self, at, scale: float) -> None:
-        """at.z = Q V Q^T at.r; scale: a number that brings r to about one."""
+    def parts(self, at, scale: float = 1.0) -> list:
+        """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""
         finest = self.levels[0]
+        own, nodes = dict(at=at, level=finest, frames=self.frames), finest.nodes
+        enter = self._ends.enter, own, dict(nodes=nodes, scale=scale)
+        leave = self._ends.leave, own, dict(nodes=nodes, scale=1 / scale)
+        return [enter, *self._down, self._solve, *self._up, leave]
+
+    def __call__(self, at, scale: float) -> None:
+        parts = self.parts(at, scale)
         if id(at) not in self._bound:
-            own, lanes = dict(at=at, level=finest, frames=self.frames), runtime.runs_on_cpu()
-            self._bound[id(at)] = self._ends.enter.bind(lanes, **own), self._ends.leave.bind(lanes, **own), at
-        enter, leave, _ = self._bound[id(at)]
-        enter(nodes=finest.nodes, scale=scale)
-        for step, level, below in self._steps_down:
-            step(nodes=level.nodes, below=below.nodes)
-        self._solve(nodes=self.levels[-1].nodes)
-        for step, level in self._steps_up:
-            step(nodes=level.nodes)
-        leave(nodes=finest.nodes, scale=1 / scale)
+            lanes = runtime.runs_on_cpu()  # vectors stay vectors, which takes half the time
+            self._bound[id(at)] = [kernel.bind(lanes, **records) for kernel, records, _ in parts], at
+        for launch, (_, _, numbers) in zip(self._bound[id(at)][0], parts):
+            launch(**numbers)

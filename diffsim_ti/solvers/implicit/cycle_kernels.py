@@ -160,18 +160,6 @@ class LevelKernels:
         return Kernel("solve", self.multiply, "f32", arrays, dict(nodes="int"))
 
     @ti.func
-    def iterate(self, level: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.nodes):
-            Ax = self.between.left(i, level, level.x, self.numbers)
-            level.y[i] = self.between.block(level.inverse, i, Ax, self.numbers)
-
-    @cached_property
-    def sweep(self) -> Kernel:
-        """y = D^-1 (b - A x) / theta"""
-        return Kernel("sweep", self.iterate, "f32", dict(level=level_arrays(self.numbers)), dict(nodes="int"))
-
-    @ti.func
     def turn_back(self, at: A, level: A, frames: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):

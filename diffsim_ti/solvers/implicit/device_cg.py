@@ -1,65 +1,142 @@
 """Conjugate gradients on the device: of what crosses to the host, a few numbers every few iterations."""
 
 import numpy as np
+import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.runtime import PRECISIONS, arch_name, array_types, kernels_of, runs_on_cpu
+from diffsim_ti.inputs import Mass
+from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of
+from diffsim_ti.runtime import PRECISIONS, Repeated, arch_name, array_types, kernels_of, runs_on_cpu
 from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, SQUARE, STOPPED, CGKernels
 
 
 class DeviceCG:
-    """Solves A x = b for A = c M + d2E/du2 of a potential, with a cycle as preconditioner (cycle.py), as
-    `linear.conjugate_gradients` does. Vectors have float64 where the device has it.
+    """Solves A x = b for A = c M + d2E/du2 of a potential as `linear.conjugate_gradients` does. Vectors have float64 where
+    the device has it.
 
-    mass: c m; free: 1 where vertices move, else 0; both of shape (num_vertices, 1).
+    free: what vertices may do (free.py), not of sets that move by few numbers.
+    cycle: the preconditioner, z = cycle(r) (cycle.py); None: `put_inverse` sets its blocks, one for each vertex.
+    An iteration is one kernel, unless surfaces meet, and a launch makes many.
     """
 
     most_chunks, shortest = 256, 32
+    many = 50  # iterations in a launch on one thread, which stops by itself
 
-    def __init__(self, potential, cycle, parallel: bool):
-        a, n = potential.arrays, potential.arrays.num_vertices
-        self.potential, self.cycle, self.nodes = potential, cycle, n
-        precision = "f64" if arch_name() != "vulkan" else "f32"
-        vector, fp = array_types(precision)["vectors"].dtype, PRECISIONS[precision]
+    def __init__(self, potential, cycle, free: Free, parallel: bool):
+        n = potential.arrays.num_vertices
+        self.potential, self.cycle, self.nodes, self.parallel = potential, cycle, n, parallel
+        self.precision = "f64" if arch_name() != "vulkan" else "f32"
+        self._vector, fp = array_types(self.precision)["vectors"].dtype, PRECISIONS[self.precision]
         self.length = max(self.shortest, -(-n // self.most_chunks))
         self.chunks = -(-n // self.length)
-        self.x, self.r, self.z, self.p, self.q = (runtime.array(vector, 1, n) for _ in range(5))
+        self.x, self.r, self.z, self.p, self.q = (runtime.array(self._vector, 1, n) for _ in range(5))
         self.part, self.state = runtime.array(fp, 3, self.chunks), runtime.array(fp, 8)
         self.mass, self.free = runtime.array(fp, n), runtime.array(fp, n)
-        kernels = kernels_of(CGKernels, a.precision, precision, parallel)
-        lanes = runs_on_cpu() and a.precision == precision  # Taichi has no vector code for changes of precision
-        self._turn = kernels.turn.bind(lanes, cg=self, at=potential)
-        self._step = kernels.step.bind(lanes, cg=self, at=potential)
-        self._look = 1 if runs_on_cpu() else 10  # iterations between looks at the state
+        runtime.fill(self.free, mask_of(free)[:, 0])
+        self.guided = isinstance(free, FreeDirections)
+        if self.guided:
+            guide = np.full(n, -1)
+            guide[free.partly_fixed] = np.arange(len(free.partly_fixed))
+            self.guide, self.held = runtime.upload(guide, ti.i32), self._columns(free.sliding_supports)
+        if cycle is None:
+            self.inverse = runtime.array(self._vector, 3, n)
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
+        whole = runs_on_cpu() and not parallel and potential.is_one_kernel
+        # iterations between looks at the state; on a card so many as the solve before took
+        self._look, self._last = self.many if whole else 1 if runs_on_cpu() else 0, 10
+        self._iterations = {}  # (with a matrix, convex) -> iterate(times, rounding)
+        self._room = 0  # blocks of that matrix
+        self._filled: np.ndarray | None = None  # what `mass` holds
 
-    def __call__(self, mass, free, b: np.ndarray, tolerance: float, max_iterations: int, eps: float):
-        """(x, relative residual, iterations, p or None), as `linear.conjugate_gradients`."""
+    def _columns(self, blocks: np.ndarray, room: int = 0):
+        """Blocks, shape (k, 3, 3), by columns on the device, with room for more."""
+        out = runtime.array(self._vector, 3, max(len(blocks), room, 1))
+        self._fill(out, blocks)
+        return out
+
+    def _fill(self, columns, blocks: np.ndarray) -> None:
+        padded = np.zeros((3, columns.shape[1], 3))
+        padded[:, : len(blocks)] = np.moveaxis(blocks, 2, 0)
+        runtime.fill(columns, padded)
+
+    def put_inverse(self, blocks: np.ndarray) -> None:
+        """Set the preconditioner's blocks, shape (num_vertices, 3, 3)."""
+        self._fill(self.inverse, blocks)
+
+    def _put(self, more) -> None:
+        """A matrix of blocks that joins the Hessian."""
+        more = more.tobsr((3, 3))
+        if len(more.data) > self._room:
+            self._room, self._iterations = 2 * len(more.data), {}
+            self.start, self.column = runtime.array(ti.i32, self.nodes + 1), runtime.array(ti.i32, self._room)
+            self.blocks = self._columns(more.data, self._room)
+        self._fill(self.blocks, more.data)
+        runtime.fill(self.start, more.indptr)
+        runtime.fill(self.column, np.pad(more.indices, (0, self._room - len(more.indices))))
+
+    def _iteration(self, more: bool, convex: bool):
+        """(times, rounding) -> so many iterations."""
+        potential, sizes, lanes, own = self.potential, self._sizes, runs_on_cpu(), dict(cg=self, at=self.potential)
+        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
+        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
+        before = [*before, (kernels.turn, own, sizes)]
+        if potential.is_one_kernel:
+            parts = [(kernels.wanted, own, {}), *before, (*potential.multiplying, None), (kernels.step, own, None)]
+            repeated, sizes_before = (
+                Repeated("cg", [x[:2] for x in parts], self.parallel, lanes),
+                [x[2] for x in parts[:-2]],
+            )
+            return lambda times, rounding: repeated(
+                times, *sizes_before, potential.sizes(), sizes | dict(rounding=rounding)
+            )
+        launches = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in before]
+        step = kernels.step.bind(lanes, **own)
+
+        def iterate(times: int, rounding: float) -> None:
+            for _ in range(times):
+                for launch, numbers in launches:
+                    launch(**numbers)
+                potential.multiply(convex)
+                step(**sizes, rounding=rounding)
+
+        return iterate
+
+    def __call__(
+        self, mass: Mass, more, convex: bool, b: np.ndarray, tolerance: float, max_iterations: int, eps: float
+    ):
+        """(x, relative residual, iterations, p or None), as `linear.conjugate_gradients`.
+
+        mass: c m, shape (num_vertices, 1); more: a SciPy matrix that joins A, or None; convex: of contact between surfaces
+        only its convex part.
+        """
         size = np.linalg.norm(b)
         if size == 0:
             return np.zeros_like(b), 0.0, 0, None
-        runtime.fill(self.mass, mass[:, 0])
-        runtime.fill(self.free, free[:, 0])
+        if more is not None:
+            self._put(more)
+        kind = more is not None, convex
+        if kind not in self._iterations:
+            self._iterations[kind] = self._iteration(*kind)
+        if mass is not self._filled:
+            runtime.fill(self.mass, mass[:, 0])
+            self._filled = mass
         runtime.fill(self.r, (b / size)[None])
-        runtime.fill(self.x, 0)
-        runtime.fill(self.p, 0)
         state = np.zeros(8)
         state[LEAST] = tolerance**2
         runtime.fill(self.state, state)
-        for k in range(1, max_iterations + 1):
-            self.cycle(self, 1.0)
-            self._turn(**self._sizes)
-            self.potential.multiply()
-            self._step(**self._sizes, rounding=10 * eps)
-            if k % self._look == 0 or k == max_iterations:
-                state = runtime.fetch(self.state)
-                if state[STOPPED] or not np.isfinite(state[SQUARE]):
-                    break
+        done = 0
+        while done < max_iterations:
+            times = min(self._look or max(2, self._last - done, done), max_iterations - done)
+            self._iterations[kind](times, 10 * eps)
+            done, state = done + times, runtime.fetch(self.state)
+            if state[STOPPED] or not np.isfinite(state[SQUARE]):
+                break
         if state[STOPPED] == 3:  # the preconditioner is not positive definite
             return np.zeros_like(b), np.inf, int(state[COUNT]), None
         if not np.isfinite(state[SQUARE]):
             raise FloatingPointError("the stiffness of this state is not finite")
-        count, negative = int(state[COUNT]), None
+        count = self._last = int(state[COUNT])
+        negative = None
         if state[STOPPED] == 2:
             negative = runtime.fetch_row(self.p, 0)
         x = runtime.fetch_row(self.x, 0) if count > 1 or negative is None else negative

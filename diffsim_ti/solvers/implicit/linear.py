@@ -6,9 +6,9 @@ import numpy as np
 
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.common.warn import warn
-from diffsim_ti.inputs import diagonal_of
+from diffsim_ti.inputs import ConsistentMass, diagonal_of
 from diffsim_ti.mechanics.host_force import NONE, HostForces
-from diffsim_ti.mechanics.supports.free import Free, linear_of
+from diffsim_ti.mechanics.supports.free import Free, FreeDirections, linear_of
 from diffsim_ti.solvers.implicit.factorised import Factorised
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Preconditioner
 
@@ -32,11 +32,24 @@ class Operator:
     def symmetric(self) -> bool:
         return self.others.symmetric and (not self.rigid or self.rigid.symmetric)
 
-    @property
-    def stays_on_device(self) -> bool:
-        """Whether products need nothing of the host."""
-        plain = isinstance(self.mass, np.ndarray) and isinstance(self.free, np.ndarray)
-        return plain and self.correction is None and not self.others and self.potential.stays_on_device
+    def on_device(self) -> tuple | None:
+        """(diagonal mass, SciPy matrix or None, whether contact is convex): what joins the potential's Hessian there; None
+        where a product needs the host."""
+        potential, parts = self.potential, []
+        plain = isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections
+        if not plain or self.others or not potential.stays_on_device:
+            return None
+        if isinstance(self.mass, ConsistentMass):
+            parts.append(self.mass.blocks())
+        if self.correction is not None:
+            parts.append(self.correction.matrix())
+        if potential.hosts:
+            matrices = [] if self.correction is not None else potential.hosts.matrices(potential.held_at)
+            if len(matrices) < len(potential.hosts):
+                return None
+            parts += [matrix for matrix, _ in matrices]
+        mass = np.zeros((len(potential.held_at), 1)) if isinstance(self.mass, ConsistentMass) else self.mass
+        return mass, sum(parts[1:], parts[0]) if parts else None, self.correction is not None
 
     def factorised(self) -> Factorised | None:
         """What factorised.py makes of it, found once."""
@@ -130,8 +143,9 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
 def _conjugate_gradients(operator, b, preconditioner, tolerance: float, max_iterations: int, eps: float):
     """The same with one preconditioner; an infinite residual if that is not positive definite, r . z <= 0."""
     solver = getattr(preconditioner, "solver", None)
-    if solver is not None and operator.stays_on_device:
-        found = solver(operator.mass, operator.free, b, tolerance, max_iterations, eps)
+    on_device = operator.on_device() if solver is not None else None
+    if on_device:
+        found = solver(*on_device, b, tolerance, max_iterations, eps)
         operator.products += found[2]
         return found
     x, r = np.zeros_like(b), b.copy()

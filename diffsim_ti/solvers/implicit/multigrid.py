@@ -24,9 +24,9 @@ class Multigrid(Preconditioner):
     Manteuffel, McCormick, Olson 2005, Algebraic multigrid for higher-order finite elements, doi:10.1016/j.jcp.2004.09.021.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = False):
-        import pyamg
+    direct = 200  # nodes of which the inverse itself takes less time than levels below them
 
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = False):
         self.potential, self.free = potential, free
         mesh, rest = potential.arrays.mesh, potential.arrays.values.rest
         with potential.at_rest():
@@ -39,20 +39,12 @@ class Multigrid(Preconditioner):
         aggregated, allowed = matrix, free
         if mesh.order == 2:
             aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest)
-        state = np.random.get_state()
-        np.random.seed(0)  # pyamg estimates a spectral radius from a random vector
-        try:
-            levels = pyamg.smoothed_aggregation_solver(
-                aggregated,
-                B=_allowed(_rigid_motions(rest), allowed),
-                strength=("symmetric", {"theta": 0.08}),
-                improve_candidates=(("block_gauss_seidel", {"sweep": "symmetric", "iterations": 2}), None),
-                max_coarse=100,
-            ).levels
-        finally:
-            np.random.set_state(state)
-        matrices = [aggregated, *(level.A for level in levels[1:])]
-        ways = [level.P for level in levels[:-1]]
+        matrices, ways = [aggregated], []
+        changes = (
+            potential.arrays.contacts or potential.pairs or potential.hosts or potential.faces
+        )  # on the finest level
+        if changes or len(rest) > self.direct:
+            matrices, ways = _aggregated(aggregated, _allowed(_rigid_motions(rest), allowed))
         if mesh.order == 2:
             matrices, ways = [matrix, *matrices], [up, *ways]
         self._at_rest = matrix.data[diagonal]
@@ -60,7 +52,7 @@ class Multigrid(Preconditioner):
         self.frames.allowed = upload_rows(projectors_of(free), 3)
         matrices, ways = [as_blocks(M) for M in matrices], [as_blocks(P) for P in ways]
         self.cycle = Cycle(matrices, ways, self.frames, parallel)
-        self.solver = DeviceCG(potential, self.cycle, parallel)
+        self.solver = DeviceCG(potential, self.cycle, free, parallel)
         self._contact = None
 
     def update(self, u: np.ndarray) -> None:
@@ -84,6 +76,26 @@ class Multigrid(Preconditioner):
         runtime.fill(solver.r, r[None])
         self.cycle(solver, 1.0 / (np.linalg.norm(r) or 1.0))
         return runtime.fetch_row(solver.z, 0) * self.free
+
+
+def _aggregated(matrix, motions: np.ndarray) -> tuple[list, list]:
+    """(matrices of all levels, ways from each to the one before) by smoothed aggregation, which leaves rigid motions to the
+    coarse ones."""
+    import pyamg
+
+    state = np.random.get_state()
+    np.random.seed(0)  # pyamg estimates a spectral radius from a random vector
+    try:
+        levels = pyamg.smoothed_aggregation_solver(
+            matrix,
+            B=motions,
+            strength=("symmetric", {"theta": 0.08}),
+            improve_candidates=(("block_gauss_seidel", {"sweep": "symmetric", "iterations": 2}), None),
+            max_coarse=min(100, matrix.shape[0] // (4 * matrix.blocksize[0])),
+        ).levels
+    finally:
+        np.random.set_state(state)
+    return [matrix, *(level.A for level in levels[1:])], [level.P for level in levels[:-1]]
 
 
 def as_blocks(M):

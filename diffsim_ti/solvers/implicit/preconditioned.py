@@ -12,6 +12,8 @@ from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, BodyBlocks
 class Preconditioners:
     """Those of a workspace."""
 
+    small, stiff = 30, 30  # vertices, and stiffness over inertia c m, up to which blocks alone take less time
+
     def __init__(self, workspace):
         self.ws, self._kept = weakref.proxy(workspace), {}  # which holds this: no circle
 
@@ -45,5 +47,4 @@ class Preconditioners:
         if self.ws.solver.preconditioner != "auto":
             return self.ws.solver.preconditioner == "multigrid"
         ratio = np.max(size[mass > 0] / mass[mass > 0], initial=0.0) if mass.any() else np.inf
-        most = 1000 if self.ws.scene.mesh.order == 1 else 200  # vertices up to which blocks alone take less time
-        return len(size) > most and ratio > 1000
+        return len(size) > self.small and ratio > self.stiff

@@ -5,7 +5,8 @@ Both are functions of the present state alone, so that a run that is started aga
 
 import numpy as np
 
-from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of
+from diffsim_ti.mechanics.supports.free import Free, FreeBodies, FreeDirections, mask_of
+from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 from diffsim_ti.solvers.implicit.factorised import Effort
 
 
@@ -41,6 +42,7 @@ class BlockJacobi(Preconditioner):
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray | float, parallel: bool = True):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
+        self.solver = None if isinstance(free, FreeBodies) else DeviceCG(potential, None, free, parallel)
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
@@ -50,12 +52,22 @@ class BlockJacobi(Preconditioner):
             D[self.free.partly_fixed] += (
                 self.free.sliding_supports * (size_of(D[self.free.partly_fixed]) / 3)[:, None, None]
             )
-        values, vectors = np.linalg.eigh(0.5 * (D + np.swapaxes(D, 1, 2)))
-        values = np.maximum(np.abs(values), self.least)
-        inverse = np.divide(mask_of(self.free), values, out=np.zeros_like(values), where=values > 0)
-        self._inverse = np.matmul(vectors * inverse[:, None, :], np.swapaxes(vectors, 1, 2))
+        self._inverse = self._inverted(0.5 * (D + np.swapaxes(D, 1, 2)))
         if isinstance(self.free, FreeDirections):
             self._inverse = self.free.around(self._inverse)
+        if self.solver:
+            self.solver.put_inverse(self._inverse)
+
+    def _inverted(self, D: np.ndarray) -> np.ndarray:
+        least = np.broadcast_to(self.least, (len(D), 1))
+        try:
+            np.linalg.cholesky(D - least[:, :, None] * np.eye(3))
+            return np.linalg.inv(D) * mask_of(self.free)[:, :, None]
+        except np.linalg.LinAlgError:  # some are not positive definite
+            values, vectors = np.linalg.eigh(D)
+        values = np.maximum(np.abs(values), least)
+        inverse = np.divide(mask_of(self.free), values, out=np.zeros_like(values), where=values > 0)
+        return np.matmul(vectors * inverse[:, None, :], np.swapaxes(vectors, 1, 2))
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         return np.einsum("ijk,ik->ij", self._inverse, r)

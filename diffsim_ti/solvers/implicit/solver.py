@@ -33,7 +33,8 @@ class ImplicitSolver(Solver):
     max_iterations: Newton rounds per substep, after which NotConverged is raised and the state stays as it was. Rounds whose
         direction an obstacle, or the surface itself, cuts short do not count, up to five times as many, nor do those that
         come after while ten of them halve the residual.
-    preconditioner: of the linear solves: "block_jacobi", "multigrid" (smoothed aggregation), or "auto", by the body's size.
+    preconditioner: of the linear solves: "block_jacobi", "multigrid" (smoothed aggregation; of up to 200 vertices the
+        inverse at rest), or "auto": the first for up to 30 vertices and where inertia outweighs stiffness.
         Where they take more products than the time of a sparse factorisation allows (slender bodies), that takes its place,
         from 30 000 unknowns on with a warning.
 
