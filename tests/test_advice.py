@@ -335,7 +335,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("rollout/simulator.py", "for the same number from the start"): "test_step_limit.py",
     ("inputs/step_values.py", "is a tensor with a graph"): "test_step_inputs.py",
     ("solvers/solver.py", "the stable step of these values"): "test_step_limit.py",
-    ("monitor/guard.py", "was stiffer than the substep"): "test_contact.py, test_contact_faces.py",
+    ("monitor/guard.py", "was stiffer than the substep"): "test_contact.py",
     ("rollout/sweep.py", "gradients through contacts"): "test_contact_gradients.py",
     ("rollout/sweep.py", "the adjoint grew"): "test_gradient_faults.py; a chaotic run has no better gradient",
     ("rollout/taped.py", "already ran in this tape"): "test_tape.py",

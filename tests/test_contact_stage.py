@@ -298,7 +298,7 @@ def test_checkpoints_repeat_the_bits(solver):
     assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
-@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_faces.py
+@pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
 @solvers
 def test_single_precision_follows(solver):
     """Float32 against float64: what 24 bits of positions leave of gaps of 1e-2 of a 4 mm width."""
@@ -310,7 +310,7 @@ def test_single_precision_follows(solver):
 
 
 @pytest.mark.executed_ptx
-@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_gradients.py
+@pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
 @pytest.mark.parametrize("name", SHAPES)
 def test_every_shape(name):
     """Each obstacle's own numbers, moving and rough, through the stage."""

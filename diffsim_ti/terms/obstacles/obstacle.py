@@ -299,11 +299,11 @@ class Obstacle(Term):
     def variant(self) -> tuple:
         return self.has_friction, self.path is not None, self.per_area, self.turns
 
+    def kernel(self, precision: str) -> ObstacleForce:
+        return self.counterpart(precision, self.has_friction)
+
 
 def longest_edge(mesh) -> float:
     """The longest that an edge of the body's triangles may be [m]: that of the mesh, stretched."""
     x = mesh.vertices[mesh.surface_triangles]
     return STRETCH * float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0))
-
-    def kernel(self, precision: str) -> ObstacleForce:
-        return self.counterpart(precision, self.has_friction)
