@@ -7,6 +7,8 @@ from contact_scenes import EXPLICIT, FORCE, SHAPES, points, tetrahedron
 import diffsim_ti as ds
 from diffsim_ti.writers.adaptive_run import ForwardRun
 
+pytestmark = pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
+
 solvers = pytest.mark.parametrize("solver", FORCE)
 
 
