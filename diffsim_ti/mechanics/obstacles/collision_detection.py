@@ -23,7 +23,7 @@ class Met:
     def __str__(self) -> str:
         if len(self.vertices) == 1:
             return f"vertex {self.vertices[0]}"
-        return f"face ({', '.join(map(str, self.vertices))})"
+        return f"what is between vertices ({', '.join(map(str, self.vertices))})"
 
 
 class CollisionDetection:
