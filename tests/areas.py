@@ -21,8 +21,8 @@ AREAS = {
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
     "quadratic_answers curved_contact",
-    "obstacles and friction": "contact mesh_obstacle contact_area contact_faces contact_stage contact_rollers "
-    "contact_crossing contact_friction face_friction contact_gradients obstacle_pairs own_obstacle poses far_from_origin",
+    "obstacles and friction": "contact mesh_obstacle contact_area contact_stage contact_rollers "
+    "contact_crossing contact_friction contact_gradients obstacle_pairs own_obstacle poses far_from_origin",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction "
     "contact_corpus",
     "PyTorch, optimisations": "ensemble torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",
@@ -36,10 +36,10 @@ AREAS = {
 }
 # files of a minute or so, the longest first: in several processes they come before all others
 LONGEST = (
-    "curved_contact gradient_fuzz readme contact_force far_from_origin optimization torch_examples face_friction "
-    "quadratic_outputs term_order every_adjoint "
+    "curved_contact gradient_fuzz readme contact_force far_from_origin optimization torch_examples quadratic_outputs "
+    "term_order every_adjoint "
     "loads_together static_examples contact_examples examples implicit_contact swept hertz implicit "
-    "contact_gradients contact_stage contact_faces outputs locking chambers springs quadratic_solvers torch_physics "
+    "contact_gradients contact_stage outputs locking chambers springs quadratic_solvers torch_physics "
     "quadratic_loads self_contact_implicit contact_rollers unequal_steps open_laws laws_with_state quadratic "
     "contact_area seed_snippets quadratic_answers"
 ).split()

@@ -76,6 +76,5 @@ def pytest_terminal_summary(terminalreporter, config):
 
 @pytest.fixture
 def vertices_alone(monkeypatch):
-    """Explicit steps in which nothing but vertices feels obstacles, as for points that happen to have faces between them."""
-    kind = "diffsim_ti.solvers.explicit.solver.ExplicitWorkspace"
-    monkeypatch.setattr(f"{kind}.has_face_contact", staticmethod(lambda scene, bend: False))
+    """Scenes in which nothing but vertices feels obstacles, as for points that happen to have faces between them."""
+    monkeypatch.setattr("diffsim_ti.terms.obstacles.obstacle.longest_edge", lambda mesh: 0.0)

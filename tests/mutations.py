@@ -36,7 +36,7 @@ TESTS = """
     test_gradient_faults.py test_torch.py test_tape.py test_implicit_contact.py test_implicit_gradients.py
     test_self_contact_implicit.py test_gradients.py test_term_order.py test_self_contact.py test_locking.py
     test_scene.py test_contact_force.py test_reaction.py test_outputs.py test_tensor_outputs.py test_modes.py
-    test_contact_stage.py test_contact_faces.py test_face_friction.py test_poses.py test_self_contact_friction.py
+    test_contact_stage.py test_poses.py test_self_contact_friction.py
     test_batch.py test_batch_tape.py test_muscles.py test_growth.py test_viscosity.py test_laws_with_state.py
     test_open_laws.py test_viscous_stages.py test_unequal_steps.py test_quadratic.py test_quadratic_loads.py
     test_quadratic_outputs.py test_curved_contact.py test_mass_scaling.py

@@ -9,6 +9,8 @@ import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.terms.obstacles import barrier
 
+pytestmark = pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
+
 RNG = np.random.default_rng(3)
 BASE_MESH = tetrahedron()
 POINTS = np.vstack([RNG.uniform([-0.4, -0.3, -0.4], [0.9, 0.4, 0.7], (60, 3)), BASE + [0, 0.15, 0]])

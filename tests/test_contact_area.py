@@ -11,7 +11,6 @@ from test_swept import needle
 
 import diffsim_ti as ds
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
-from diffsim_ti.mechanics.obstacles import face_lattice
 
 SOFT = ds.StableNeoHookean(1e5, 0.3)
 CORNERS = 0.1 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])  # of a regular tetrahedron
@@ -138,13 +137,13 @@ def sliding_rollout(solver, precision="f64") -> ds.Rollout:
 ALL = [*EXPLICIT, FORCE[0], ds.ImplicitEulerSolver, ds.StaticSolver]
 
 
-@pytest.mark.usefixtures("vertices_alone")  # within faces, explicit steps: test_contact_faces.py
+@pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
 @pytest.mark.parametrize("solver", ALL, ids=lambda s: s.__name__)
 def test_tangents_and_adjoints_belong_together(solver):
     assert_transposed(sliding_rollout(solver), 1e-11 if solver.explicit else 1e-7)
 
 
-@pytest.mark.usefixtures("vertices_alone")  # within faces, explicit steps: test_contact_faces.py
+@pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
 @pytest.mark.parametrize("solver", ALL, ids=lambda s: s.__name__)
 def test_gradients_are_slopes(solver):
     """By the stiffnesses, and by the rest shape, which says how large the surface is."""
@@ -163,28 +162,11 @@ def on_a_needle(precision="f64", **options) -> ds.Rollout:
     return ds.Rollout(ds.ImplicitEulerSolver(scene, dt=2e-3, tolerance=tolerance), 2, 1, gradients="all")
 
 
-def test_points_within_faces_have_areas_too():
+def test_faces_have_areas_too():
     rollout = on_a_needle(stiffness_per_area=1e7)
     assert_transposed(rollout, 1e-7, ("capsule_start",))  # its other end is felt
     report = ds.check_gradients(rollout, inputs=["rest_positions", "barrier_stiffness_per_area", "barrier_width"])
     assert report.passed, report
-
-
-def test_points_within_faces_are_an_integral(monkeypatch):
-    """Four and nine times as many points hold the same energy, where what lies between them is given no margin."""
-    monkeypatch.setattr(face_lattice, "REACH", 0.0)
-    found = []
-    for per_width in (4, 8, 12):
-        monkeypatch.setattr(face_lattice, "PER_WIDTH", per_width)
-        ball = ds.Sphere((0.04, -0.02, 0.06), 0.015, width=0.01, stiffness_per_area=1e6)
-        scene = ds.Scene(ds.TetrahedralMesh.create_box(2, size=0.1), SOFT, terms=[ball], precision="f64")
-        solver = ds.ImplicitEulerSolver(scene)
-        workspace, u = solver.workspace(solver.start_values()), np.zeros((8, 3))
-        workspace.begin(0, solver.stage(0.0, True, 0), u, u)
-        workspace.potential.place(u)
-        found.append((workspace.potential.faces.energies().sum(), workspace.potential.faces.forces()[:, 1].sum()))
-    assert found[0][0] > 1e-3
-    np.testing.assert_allclose(found, np.broadcast_to(found[-1], (3, 2)), rtol=1e-4)
 
 
 # ---- what a scene says, and what it refuses -----------------------------------------------------------------------------

@@ -414,13 +414,6 @@ def test_what_does_not_fit_is_refused():
     ):
         with pytest.raises(ValueError, match='pass it contact="stage"'):
             make()
-    balls = [
-        ds.Sphere((x, -0.06, 0.05), 0.06, stiffness_per_area=3e5, width=0.01, name=f"ball{k}")
-        for k, x in enumerate((0.02, 0.08))
-    ]
-    several = ds.Rollout(ds.SemiImplicitSolver(pressed(terms=balls), dt=1e-4), 1, outputs=ds.ContactForce(balls[1]))
-    with pytest.raises(ValueError, match="Sphere and Sphere push on the faces around vertex . in one substep"):
-        several.forward()
 
 
 @pytest.mark.parametrize("kind", EXPLICIT)

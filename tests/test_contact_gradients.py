@@ -9,6 +9,8 @@ from contact_scenes import EXPLICIT, FORCE, KEEPING, SHAPES, points, tetrahedron
 
 import diffsim_ti as ds
 
+pytestmark = pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
+
 SOLVERS = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
 solvers = pytest.mark.parametrize("solver", SOLVERS)
 STEPS, SUBSTEPS = 24, 2
@@ -59,13 +61,11 @@ def test_tangent_and_mirror(name, solver):
     assert ds.dot_product_test(rollout_of(name, solver)) < 1e-12
 
 
-@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_faces.py
 @solvers
 def test_smooth_contact_without_friction(solver):
     assert ds.check_gradients(rollout_of("cylinder", solver, rough=False), verbose=False).passed
 
 
-@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_stage.py
 def test_several_rough_and_moving_obstacles():
     """Rows of sums, columns of paths and the order of frictions: two that move, two that are rough, one that is neither."""
     options = dict(stiffness=300.0, width=0.2)

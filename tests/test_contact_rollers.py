@@ -127,7 +127,7 @@ MOTION = {"xmin": lambda t: [-0.1 * t, 0.3 * t, 5 * t * t], "zmax": lambda t: [0
 
 @pytest.mark.parametrize("solver, alone", [(EXPLICIT[0], True), (EXPLICIT[1], True), (EXPLICIT[1], False)])
 def test_every_number(solver, alone, request):
-    """With supports that move; vertices alone, and with points within faces."""
+    """With supports that move; vertices alone, and by pairs."""
     if alone:
         request.getfixturevalue("vertices_alone")
     rollout = crowded(solver, MOTION)
@@ -137,7 +137,7 @@ def test_every_number(solver, alone, request):
 
 
 @pytest.mark.executed_ptx
-@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_force.py
+@pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
 def test_contact_forces_have_gradients():
     """Forces on obstacles as a loss names them, of vertices on rollers."""
     rollout = crowded(EXPLICIT[0], MOTION, outputs=[ds.ContactForce("floor"), ds.ContactForce("ball", name="on_ball")])

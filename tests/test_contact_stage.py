@@ -15,6 +15,8 @@ from diffsim_ti.mechanics.obstacles import contact_stage
 from diffsim_ti.solvers.explicit.kernels import explicit_kernels
 from diffsim_ti.terms.obstacles import barrier, secant
 
+pytestmark = pytest.mark.usefixtures("vertices_alone")  # by pairs: test_obstacle_pairs.py
+
 DAMPINGS = [0.0, 0.02, 0.4, 1.0]
 solvers = pytest.mark.parametrize("solver", EXPLICIT)
 dampings = pytest.mark.parametrize("damping", DAMPINGS)
@@ -150,7 +152,6 @@ def test_no_speed_is_too_large(solver, dt):
         assert frames.positions[:, :3, 1].min() > 0 and frames.contact_resolution.smallest_gap > 0
 
 
-@pytest.mark.usefixtures("vertices_alone")
 @solvers
 @dampings
 @pytest.mark.parametrize("name", THIN)
@@ -173,7 +174,6 @@ def test_a_fast_wall_pushes(solver):
     assert gap.min() > 0 and frames.velocities[-1, :, 0].min() > 29
 
 
-@pytest.mark.usefixtures("vertices_alone")
 @solvers
 def test_a_vertex_between_two_walls(solver):
     """Pressed from both sides by stiff walls, one of which moves, with other obstacles near: it stays between them."""
@@ -253,7 +253,6 @@ def check_rows(rollout, inputs=None) -> int:
     return sum(row.analytic != 0 for row in report.rows)
 
 
-@pytest.mark.usefixtures("vertices_alone")
 @solvers
 @dampings
 def test_every_input_in_a_crowd(solver, damping):
@@ -298,7 +297,6 @@ def test_checkpoints_repeat_the_bits(solver):
     assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
-@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_faces.py
 @solvers
 def test_single_precision_follows(solver):
     """Float32 against float64: what 24 bits of positions leave of gaps of 1e-2 of a 4 mm width."""
@@ -310,7 +308,6 @@ def test_single_precision_follows(solver):
 
 
 @pytest.mark.executed_ptx
-@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_gradients.py
 @pytest.mark.parametrize("name", SHAPES)
 def test_every_shape(name):
     """Each obstacle's own numbers, moving and rough, through the stage."""

@@ -118,7 +118,7 @@ def test_no_step_is_too_large_for_the_barrier(speed):
 
 def rubbing(solver, shape="ground", **options) -> ds.Rollout:
     """A body pressed on a moving, rough obstacle, sliding and sticking."""
-    # nearer to what points within faces feel, these push with 1e6 N at first, and rounding is as large
+    # nearer to what faces feel, these are pushed with 1e6 N at first, and rounding is as large
     height = 0.02 if shape in ("sphere", "box") else 0.006
     mesh, rng = tetrahedron(height), np.random.default_rng(0)
     obstacle = SHAPES[shape](

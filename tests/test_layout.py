@@ -134,11 +134,7 @@ CLASSES = {
     (path, node.name): node for path, tree in MODULES.items() for node in tree.body if isinstance(node, ast.ClassDef)
 }
 OF_BATCHES = "elements of a batch are those of one scene with other places of their numbers"
-WITHIN_FACES = "contact within faces goes on from contact at vertices by one formula at a time"
 DEEP = {  # classes that may stand more than three deep, and why
-    **dict.fromkeys(
-        "FaceRows FaceForces LimitedFaceContact FaceKernels FaceDerivatives FaceShares".split(), WITHIN_FACES
-    ),
     **dict.fromkeys(
         "TetrahedronOfEight PatchOfScenes PatchOfEight".split(), "elements of a batch read elements of one scene"
     ),

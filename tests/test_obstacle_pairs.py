@@ -12,6 +12,8 @@ from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.terms.obstacles.barrier import beta
 
 SIZE, WIDTH, PER_AREA, GAP = 0.1, 4e-3, 5e6, 1.5e-3
+CAPSULE = dict(kind="capsule", start=np.array([-0.4, -0.02, 0.01]), end=np.array([0.4, -0.02, 0.02]), radius=0.0098)
+BOX = dict(kind="box", center=np.array([0, -0.21, 0]), axes=np.eye(3), half=np.array([0.005, 0.2, 0.4]))
 BARRIER = dict(width=WIDTH, stiffness_per_area=PER_AREA)
 
 
@@ -20,6 +22,83 @@ def cube(*terms, lift=0.0, velocity=(0.2, -0.5, 0.1)) -> ds.Scene:
     mesh = ds.TetrahedralMesh.create_box(2, SIZE).translated([0, lift, 0])
     material = ds.StableNeoHookean(5e4, 0.3)
     return ds.Scene(mesh, material, 1000.0, list(terms), precision="f64", initial_velocities=velocity)
+
+
+NARROW = dict(
+    capsule=((lambda **o: ds.Capsule((-0.4, -0.02, 0.01), (0.4, -0.02, 0.02), 0.01, **o)), CAPSULE),
+    box=((lambda **o: ds.Box((0, -0.21, 0), (0.01, 0.4, 0.8), **o)), BOX),
+    cylinder=((lambda **o: ds.Cylinder((-0.4, -0.02, 0.01), (0.4, -0.02, 0.02), 0.01, **o)), CAPSULE),
+)
+
+
+@pytest.mark.parametrize("kind", NARROW)
+def test_what_is_narrow_acts_by_pairs_and_explicit_steps_stop_before_it(kind):
+    """A coarse cube falls on what no vertex of it meets."""
+    make, solid = NARROW[kind]
+    obstacle = make(stiffness_per_area=4e6, width=0.01)
+    mesh = ds.TetrahedralMesh.create_box(2, size=0.2).translated([-0.094, 0.003, -0.09])
+    terms, v = [obstacle, ds.Gravity()], (0.03, -0.6, 0.012)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=terms, initial_velocities=v, precision="f64")
+    assert [term.by_pairs for term in scene.obstacles] == [True] and obstacle.by_pairs is None
+    simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=2e-3))
+    judge = Judge(mesh.surface_triangles, solid, simulator.positions)
+    for _ in range(30):
+        simulator.step()
+        assert judge.after_step(simulator.positions, np.zeros(3)) is None
+    velocity = np.average(simulator.velocities, axis=0, weights=simulator.workspace.arrays.values.mass)
+    assert velocity[1] > -0.6 - 0.06 * 9.81 + 0.3  # far slower than a free fall
+
+
+def test_which_way_an_obstacle_acts_is_fixed_when_the_scene_is_built():
+    """Longest edges of the cube are 0.14 m: a ball whose radius is 60 of these squares per width is as good as flat."""
+    edge = 1.2 * np.sqrt(2) * SIZE
+    limit = edge**2 / (6 * 0.12 * WIDTH)
+    ball = lambda radius, **o: ds.Sphere((0, -1 - radius, 0), radius, **o, **BARRIER)  # noqa: E731
+    for obstacle, expected in (
+        (ball(0.99 * limit), True),
+        (ball(1.01 * limit), False),
+        (ball(1.01 * limit, by_pairs=True), True),
+        (ball(0.01, by_pairs=False), False),
+        (ds.Ground(-1, **BARRIER), False),
+        (ds.Sphere((0, 0, 0), 5.0, inside=True, **BARRIER), False),
+    ):
+        assert cube(obstacle).obstacles[0].by_pairs is expected, obstacle
+        assert (cube(obstacle).obstacles[0].primitives is not None) is expected
+
+
+def test_a_cylinder_is_a_prism_whose_edges_lie_on_it():
+    """At most 0.12 widths within it; derivatives by start, end and radius are exact."""
+    cylinder = cube(ds.Cylinder((0, -1, 0.02), (0.1, -1.1, 0.3), 0.05, **BARRIER)).obstacles[0]
+    prism, rng = cylinder.primitives, np.random.default_rng(0)
+    p = np.concatenate([np.ravel(cylinder.values[f"cylinder_{name}"]) for name in ("start", "end", "radius")])
+    x, _ = prism.at(p)
+    off = (1 - np.cos(np.pi / prism.sides)) * p[6]  # of the sides
+    assert 0.06 * WIDTH < off <= 0.12 * WIDTH and np.abs(cylinder.distance(x)).max() < 1e-15
+    dp, by = rng.standard_normal(7), rng.standard_normal(x.shape)
+    change = (prism.at(p + 1e-6 * dp)[0] - prism.at(p - 1e-6 * dp)[0]) / 2e-6
+    np.testing.assert_allclose(prism.jvp(p, dp)[0], change, atol=1e-8)
+    assert (prism.vjp(p, by, 0.0) * dp).sum() == pytest.approx((by * prism.jvp(p, dp)[0]).sum(), rel=1e-12)
+
+
+def test_a_block_slides_on_rails_that_no_vertex_meets():
+    """Cylinders lie between the rows of vertices: friction is mu N, and the block gathers speed as g (sin - mu cos)."""
+    mu, tangent, dt = 0.3, 0.5, 5e-3
+    rails = [
+        ds.Cylinder((-1, -0.016, z), (1, -0.016, z), 0.01, width=5e-3, friction=mu, name=name)
+        for name, z in (("left", 1 / 30), ("right", 2 / 30))
+    ]
+    down = 9.81 / np.hypot(1, tangent)
+    mesh, gravity = ds.TetrahedralMesh.create_box(4, size=0.1), ds.Gravity([tangent * down, -down, 0])
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), terms=[gravity, *rails], precision="f64")
+    parts = [ds.ContactForce(r, part, name=f"{r}_{part}") for r in ("left", "right") for part in ("normal", "friction")]
+    frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=dt), 25, save_every=1, outputs=parts).forward()
+    normal, friction = (frames[f"left_{part}"] + frames[f"right_{part}"] for part in ("normal", "friction"))
+    assert np.all(friction[-12:, 0] < 0)  # it falls by a millimetre first
+    # N is that where the step begins
+    np.testing.assert_allclose(-friction[-12:, 0], mu * normal[-13:-1, 1], rtol=2e-3)
+    speed = frames.velocities[:, :, 0].mean(1)
+    expected = tangent * down - mu * normal[-13:-1, 1].mean() / 1.0  # [m/s^2]; it weighs a kilogram and still bounces
+    assert (speed[-1] - speed[-13]) / (12 * dt) == pytest.approx(expected, rel=1e-2)
 
 
 def below(kind: str, gap: float = GAP):

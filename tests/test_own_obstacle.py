@@ -51,19 +51,22 @@ class Ring(Obstacle):
         return revolved(self.values["ring_center"], (0.0, 1.0, 0.0), -thickness * np.sin(angle), radius)
 
 
+def ring(**options):
+    return Ring((0.0, -0.055, 0.0), 0.1, 0.05, stiffness=200.0, width=0.01, friction=0.3, **options)
+
+
 @pytest.fixture(scope="module")
 def scene():
     """A cube that falls onto a ring, half a barrier's width above it."""
     cube = ds.TetrahedralMesh.create_cube(2, 0.2).translated((-0.11, 0.0, -0.09))
-    ring = Ring((0.0, -0.055, 0.0), 0.1, 0.05, stiffness=200.0, width=0.01, friction=0.3)
-    return ds.Scene(
-        cube,
-        ds.StableNeoHookean(1e5, 0.3),
-        1000.0,
-        [ds.Gravity(), ring],
-        initial_velocities=(0.1, -0.5, 0.05),
-        precision="f64",
-    )
+    law, terms = ds.StableNeoHookean(1e5, 0.3), [ds.Gravity(), ring(by_pairs=False)]
+    return ds.Scene(cube, law, 1000.0, terms, initial_velocities=(0.1, -0.5, 0.05), precision="f64")
+
+
+def test_that_nothing_is_felt_of_it_between_vertices_is_said(scene):
+    """Unless it was asked for, as in the scene."""
+    with pytest.warns(UserWarning, match="Ring.*acts at their vertices alone: .* or pass by_pairs=False"):
+        scene.replace(terms=[ring()])
 
 
 def test_its_gradients_are_those_of_the_run(scene):

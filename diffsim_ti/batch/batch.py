@@ -19,7 +19,6 @@ from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
-from diffsim_ti.mesh.collision_surface import BOWED
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, check_finite
@@ -27,6 +26,7 @@ from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.bending import FAR, FacesBend
 from diffsim_ti.state.schedule import UnequalSteps
 
 
@@ -146,9 +146,7 @@ class Batch(metaclass=Public):
     def _side_by_side(self, values: dict) -> BatchFrames:
         run, times = self.sweep.run(values), self.one.times
         u, v = self.sweep.states()
-        if self._bend(self._positions(values, u)):
-            self.lanes, self.why_not = False, "ten-node faces bend where they touch"
-            return self._by_turns(values)
+        self._warn_of_bent_faces(self._positions(values, u))
         last_good, crossed = np.full(self.num_scenes, self.num_frames - 1), self.sweep.crossed()
         for b in {*np.flatnonzero(~self._sound(u[:, -1], v[:, -1])), *crossed}:
             good = self._sound(u[b], v[b])
@@ -162,16 +160,19 @@ class Batch(metaclass=Public):
         frames = LazyFrames(self.num_scenes, lambda b: self._frames_of(values, b, states, times, resolution(b)))
         return BatchFrames(self, values, frames, last_good, run, states=states)
 
-    def _bend(self, positions: np.ndarray) -> bool:
-        """Whether faces are bent in some frame as scenes side by side do not take them (state/bending.py)."""
+    def _warn_of_bent_faces(self, positions: np.ndarray) -> None:
+        """Where faces of some frame lie farther from the triangles of their nodes than contact there may be taken for
+        (state/bending.py)."""
         mesh, widths = self.scene.mesh, [float(t.values["barrier_width"]) for t in self.scene.obstacles]
         if mesh.order == 1 or not widths:
-            return False
+            return
         off = max(bows(x[mesh.surface_faces]).max(initial=0) for x in positions.reshape(-1, mesh.num_vertices, 3))
-        if not off > BOWED * min(widths) + 2 * bow(mesh):
-            return False
-        resolution = self.sweep.resolutions()
-        return any(np.isfinite(resolution(b).smallest_gap) for b in range(self.num_scenes))
+        resolution = self.sweep.resolutions() if off > FAR * min(widths) + 2 * bow(mesh) else None
+        if resolution and any(np.isfinite(resolution(b).smallest_gap) for b in range(self.num_scenes)):
+            warn(
+                f"{FacesBend(off)}, where obstacles act at their nodes alone: refine the mesh there, or take a width of "
+                f"{2 * off:.3g} m or more"
+            )
 
     def _positions(self, values: dict, u: np.ndarray) -> np.ndarray:
         """Those of all scenes from displacements (scenes, frames, n, 3)."""

@@ -3,7 +3,6 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.obstacles.face_contact_points import has_face_contact
 from diffsim_ti.terms import SelfContact
 
 
@@ -16,8 +15,7 @@ def why_not(solver) -> str | None:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
     terms = dict(self_contact=scene.term(SelfContact)) | {x.name: True for x in scene.interactions if x.apart}
     terms |= dict(contact_by_pairs=any(term.primitives is not None for term in scene.terms))
-    terms |= dict(contact_within_faces=has_face_contact(scene), mesh_obstacles=_tables(scene))
-    terms |= dict(reduced_sets=scene.reduced)
+    terms |= dict(mesh_obstacles=_tables(scene), reduced_sets=scene.reduced)
     there = [name.replace("_", " ") for name, some in terms.items() if some]
     return f"it has {' and '.join(there)}" if there else None
 

@@ -31,7 +31,7 @@ class BatchWorkspace:
 
     def __init__(self, solver, derived: list[Derived]):
         self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
-        self.num_scenes, self.arrays = len(derived), SceneArrays(self.scene, solver.stages_contact, False, True)
+        self.num_scenes, self.arrays = len(derived), SceneArrays(self.scene, solver.stages_contact, True)
         self.layout = (Lanes if runtime.runs_on_cpu() else Innermost)(self.scene.precision, self.num_scenes)
         self.fp, self.substep = self.arrays.fp, solver.substep
         self.in_parallel = 1 if self.layout.in_lanes else solver.passes_per_launch()

@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
-from diffsim_ti.mesh.curved_triangles import curved_faces
+from diffsim_ti.mesh.face_points import curved_faces
 from diffsim_ti.mesh.geometry import triangle_normals
 
 

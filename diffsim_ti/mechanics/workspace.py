@@ -42,7 +42,6 @@ class Workspace:
     chambers = None  # of explicit steps
     volumes = None  # of chambers, that are held
     stages_pairs = False  # whether pairs of surfaces act as a stage of passes, not as a force
-    faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
     last_multipliers = None  # of constrained volumes, in implicit steps
@@ -54,9 +53,7 @@ class Workspace:
         self.substep = solver.substep  # length of the passes that were last looked after [s]
         self.owner = runtime.program()
         explicit = solver.explicit
-        self.arrays = SceneArrays(
-            self.scene, solver.stages_contact, self.has_face_contact(self.scene, bend), explicit, not explicit, bend
-        )
+        self.arrays = SceneArrays(self.scene, solver.stages_contact, explicit, not explicit, bend)
         self.parallel = solver.runs_parallel()
         self.pairs = pairs_of(self.pairs_kind, self.arrays, self.parallel)
         self.state = self.history(1)
@@ -65,14 +62,6 @@ class Workspace:
         self.watch, self.bending = ContactWatch(self), Bending.of(self)
         self._launches = {}
         self.load(derived)
-
-    @staticmethod
-    def has_face_contact(scene, bend: float = 0.0) -> bool:
-        """Whether passes take forces at points within faces."""
-        return False
-
-    def check_between_points(self, now: int) -> None:
-        """Note what contact within faces may have missed before pass `now`."""
 
     def history(self, num_slots: int, record: bool = False) -> History:
         """Room for states of this run."""
@@ -123,6 +112,9 @@ class Workspace:
         parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
         key = (kernel, *map(id, parts))
         return self.kept(key, lambda: (kernel.bind(self.arrays.in_vectors, scene=self.arrays, **records), parts))[0]
+
+    def check_apart(self) -> None:
+        """Raise Overlap where the state is in an obstacle and steps could not bring it out."""
 
     def forget(self) -> None:
         """The state was set from outside: forget what came before it."""

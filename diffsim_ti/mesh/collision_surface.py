@@ -8,10 +8,10 @@ from diffsim_ti.mesh.face_points import bow
 BOWED, MOST_CUTS = 0.1, 3
 
 
-def cuts_of(mesh, term, bend: float = 0.0) -> int:
-    """How often self-contact cuts the four triangles of each face in four, until they are within BOWED widths of it as it is
-    at rest or bends by `bend` [m]; MOST_CUTS at most. A cut leaves a fourth of the distance."""
-    off = max(bow(mesh), bend if mesh.order == 2 else 0.0) / (BOWED * float(term.values["self_contact_width"]))
+def cuts_of(mesh, width: float, bend: float = 0.0) -> int:
+    """How often pairs cut the four triangles of each face in four, until they are within BOWED widths [m] of it as it is at
+    rest or bends by `bend` [m]; MOST_CUTS at most. A cut leaves a fourth of the distance."""
+    off = max(bow(mesh), bend if mesh.order == 2 else 0.0) / (BOWED * width)
     return int(np.clip(np.ceil(np.log2(max(off, 1.0)) / 2), 0, MOST_CUTS))
 
 

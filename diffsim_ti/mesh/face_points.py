@@ -8,6 +8,8 @@ from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
 from diffsim_ti.mesh.ten_nodes import QUARTERS
 
+STRAIGHT = 1e-5  # of its length: what an edge may be off that is straight, in files of single precision too
+
 
 def _crossing(v: np.ndarray) -> np.ndarray:
     """The matrices of w -> v x w, shape (..., 3, 3)."""
@@ -101,6 +103,14 @@ class QuadraticFaces:
 def face_points(faces: np.ndarray) -> LinearFaces | QuadraticFaces:
     """Of faces of three or six nodes, shape (k, 3) or (k, 6)."""
     return QuadraticFaces(faces) if faces.shape[1] == 6 else LinearFaces(faces)
+
+
+def curved_faces(mesh) -> np.ndarray:
+    """Whether a face of ten-node tetrahedra has an edge that is not straight, Booleans, shape (len(surface_faces),)."""
+    x = mesh.vertices[mesh.surface_faces]
+    off = np.linalg.norm(x[:, 3:] - (x[:, :3] + np.roll(x[:, :3], -1, 1)) / 2, axis=2).max(1, initial=0)
+    longest = np.linalg.norm(x[:, :3] - np.roll(x[:, :3], -1, 1), axis=2).max(1, initial=0)
+    return off > STRAIGHT * longest
 
 
 def bow(mesh) -> float:

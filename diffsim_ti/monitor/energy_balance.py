@@ -102,8 +102,6 @@ class EnergyBalance:
     def _begin(self, first: int, num_passes: int, level: float | None) -> None:
         if self.ws.arrays.features().driven:
             runtime.fill(self.ws.contact.work, 0)
-            if self.ws.faces:
-                self.ws.faces.clear_work()
         if self.ws.volumes:
             self.ws.volumes.work = 0.0
         self.window = Window(first, num_passes, self.ws.changes, self.ws.substep, level)
@@ -124,8 +122,6 @@ class EnergyBalance:
     def _check(self, now: int, num_passes: int) -> None:
         window, features = self.window, self.ws.arrays.features()
         work = self._noted_work() if features.driven else 0.0
-        if features.moving and self.ws.faces:
-            work += self.ws.faces.all_work()
         if self.ws.volumes:
             work += self.ws.volumes.work
         if window.level is None:
@@ -145,7 +141,7 @@ class EnergyBalance:
     def _level_at_start(self, window: Window) -> float | None:
         """The level of the state that was kept; None where forces there cannot be had any more."""
         ws, features = self.ws, self.ws.arrays.features()
-        if ws.pairs or (features.moving and (features.pressing or ws.faces)):
+        if ws.pairs or (features.moving and features.pressing):
             return None
         here = ws.history(1)
         ws.save(here, 0)
@@ -170,8 +166,6 @@ class EnergyBalance:
         stored = quantities.elastic_energy(ws) + sum(quantities.stored_energies(ws).values())
         if features.groups:  # a stage does not act on fixed vertices
             stored += float((quantities.barrier_energies(ws) * (free if features.num_staged else 1)).sum())
-        if ws.faces:
-            stored += float(ws.faces.energies().sum())
         if ws.pairs:
             stored += ws.pairs.look(ws.state.u)[0]
         self.moving = max(self.moving, kinetic + stored)

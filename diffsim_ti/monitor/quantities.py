@@ -196,10 +196,6 @@ def energy(workspace: Workspace) -> Energy:
         parts["gravity"] = float(-((values.rest + u) * (workspace.mass * g)).sum())
     if features.groups:
         parts["contact"] = float(barrier_energies(workspace).sum())
-        if workspace.potential is not None and workspace.potential.faces:
-            parts["contact"] += float(workspace.potential.faces.energies_at(workspace.state.u, a.offsets).sum())
-    if workspace.faces:
-        parts["contact"] += float(workspace.faces.energies().sum())
     if workspace.pairs:
         parts["contact"] = parts.get("contact", 0.0) + workspace.pairs.look(workspace.state.u)[0]
     return Energy(parts | stored_energies(workspace))

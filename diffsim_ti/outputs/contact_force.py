@@ -37,7 +37,7 @@ class ContactForce(Output):
     The gradient is exact by all inputs: moduli, density, rest shape, the obstacle's stiffness, friction, shape, path.
 
     Raises ValueError, when a Rollout is made, for an obstacle that the scene has not, another part, a name that is taken,
-    and an explicit solver with contact="force"; and while one runs where several push on the faces around one vertex.
+    and an explicit solver with contact="force".
     Wriggers, Computational Contact Mechanics, 2nd ed., 2006, sec. 5 and 8, doi:10.1007/978-3-540-32609-0.
     """
 

@@ -363,6 +363,7 @@ class Scene(MadeAgain):
             for t in self.terms
             if isinstance(t, Obstacle) and t.chooses_stiffness
         ]
+        by_pairs = [type(t).__name__ for t in self.terms if t.primitives is not None]
         return "\n".join(
             [
                 f"{self.mesh!r}",
@@ -375,6 +376,7 @@ class Scene(MadeAgain):
                 + (", moving" if self.motion is not None else ""),
                 *([f"moving by few numbers: {self.reduced.describe()}"] if self.reduced else []),
                 *chosen,
+                *([f"felt between vertices, by pairs: {', '.join(by_pairs)}"] if by_pairs else []),
                 "inputs: " + ", ".join(f"{name}{i.in_brackets}" for name, i in self.inputs.described.items()),
             ]
         )

@@ -7,7 +7,6 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived, poses
-from diffsim_ti.mesh.curved_triangles import are_treated_as_curved
 from diffsim_ti.mesh.patches import in_eights, volume_patches
 from diffsim_ti.runtime import LANES
 from diffsim_ti.state.bodies import BodyArrays
@@ -23,13 +22,7 @@ class SceneArrays:
     """What the kernels read of a scene: its topology, once, and its numbers (state/numbers.py), per load."""
 
     def __init__(
-        self,
-        scene,
-        stages_contact: bool = False,
-        has_face_contact: bool = False,
-        presses: bool = False,
-        in_steps: bool = False,
-        bend: float = 0.0,
+        self, scene, stages_contact: bool = False, presses: bool = False, in_steps: bool = False, bend: float = 0.0
     ):
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
@@ -44,12 +37,7 @@ class SceneArrays:
         self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
-        self.fixed, self.held, self.supports, self.has_face_contact = (
-            scene.fixed,
-            scene.held,
-            scene.supports,
-            has_face_contact,
-        )
+        self.fixed, self.held, self.supports = scene.fixed, scene.held, scene.supports
         self.interactions = tuple(x for x in scene.interactions if x.in_kernels) if presses else ()
         self._all = scene.interactions
         self.own = {name: kind for x in self._all for name, kind in x.derived.items()}  # their numbers
@@ -57,10 +45,9 @@ class SceneArrays:
         self._upload_topology(scene, presses)
         self._rows = rows = scene.inputs.parameters
         self.obstacles = self._counterparts(scene)
-        self.curved, self.bend = are_treated_as_curved(mesh, self.contacts, bend), bend
+        self.bend = bend
         self._features = dict(
             order=mesh.order,
-            curved=self.curved,
             groups=grouped(self.obstacles),
             stages=stages_contact,
             moving=sum(poses.columns_of(term.path_width) for term in scene.moving),
@@ -147,7 +134,7 @@ class SceneArrays:
             rows = scene.inputs.parameters.of(term)
             counterpart = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
             if isinstance(term, Obstacle):
-                kind = dict(per_area=term.per_area, turns=term.turns, by_pairs=term.by_pairs)
+                kind = dict(per_area=term.per_area, turns=term.turns)
                 counterpart = replace(counterpart, **kind)
             if (
                 counterpart.size + term.num_extra != rows.stop - rows.start
@@ -242,6 +229,13 @@ class SceneArrays:
         for name, data in rows.items():
             runtime.fill(getattr(self, name), self.growth_blocks(data) if name == "growths" else data)
             self.rows[name] = data
+
+    @property
+    def width_of_pairs(self) -> float:
+        """The least width of what acts by pairs [m]; infinite without."""
+        widths = [float(x.values["barrier_width"]) for x in self.contacts if x.primitives is not None]
+        widths += [float(self.self_contact.values["self_contact_width"])] if self.self_contact else []
+        return min(widths, default=np.inf)
 
     # ---- the stiffness of obstacles ----------------------------------------------------------------------------------
 

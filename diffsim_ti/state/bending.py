@@ -1,7 +1,9 @@
 """Ten-node faces that bend in a run, where they are near obstacles or other surfaces.
 
-Contact takes a face for the four triangles of its nodes, unless it was curved from the start: that is right to BOWED widths.
-Where a face has bent farther, the run that finds it is done again with faces as curved as they are.
+Contact takes a face for the four triangles of its nodes; pairs take smaller ones where it was curved from the start. That
+is right to BOWED widths. Where a face that pairs look at has bent farther, the run that finds it is done again with
+triangles as small as the bow asks for; where it is farther than FAR widths from the triangles that an obstacle meets at
+nodes, a warning says so.
 """
 
 import weakref
@@ -12,6 +14,8 @@ from diffsim_ti import runtime
 from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.collision_surface import BOWED, cuts_of
 from diffsim_ti.mesh.face_points import bow, bows, points_of_bow
+
+FAR = 0.5
 
 
 class FacesBend(Exception):
@@ -28,12 +32,12 @@ class Bending:
     def __init__(self, workspace):
         self.ws, a = weakref.proxy(workspace), workspace.arrays
         self.faces, known = a.mesh.surface_faces, 2 * max(bow(a.mesh), a.bend)
-        self.limits = [BOWED * float(term.values["barrier_width"]) + known for term in a.contacts]
-        self.of_pairs, pair = np.inf, a.self_contact
-        if pair:
-            cut = BOWED * float(pair.values["self_contact_width"]) * 4 ** cuts_of(a.mesh, pair, a.bend)
-            self.of_pairs = max(known, cut)
-        self.limit = min([self.of_pairs, *self.limits])
+        at_nodes = [k for k, term in enumerate(a.contacts) if not (term.primitives and term.primitives.whole)]
+        self.limits = {k: FAR * float(a.contacts[k].values["barrier_width"]) + 2 * bow(a.mesh) for k in at_nodes}
+        self.width, self.of_pairs = a.width_of_pairs, np.inf
+        if np.isfinite(self.width):
+            self.of_pairs = max(known, BOWED * self.width * 4 ** cuts_of(a.mesh, self.width, a.bend))
+        self.limit = min([self.of_pairs, *self.limits.values()])
 
     @classmethod
     def of(cls, workspace) -> "Bending | None":
@@ -42,27 +46,32 @@ class Bending:
         return cls(workspace) if a.mesh.order == 2 and (a.contacts or a.self_contact) else None
 
     def check(self, now: int, u: np.ndarray) -> None:
-        """Raise FacesBend if displacements u before pass `now` ask for it."""
+        """Raise FacesBend if displacements u before pass `now` ask for it, or warn, once."""
         a = self.ws.arrays
         nodes = (a.values.rest + u)[self.faces]
         off = bows(nodes)
         if not off.max(initial=0) > self.limit:  # nor where it is not finite
             return
         if self.ws.pairs and self.ws.pairs.list.count and off.max() > self.of_pairs:
-            bend, width = FacesBend(float(off.max())), self.ws.pairs.width
-            left = bend.bend / 2 / 4 ** cuts_of(a.mesh, a.self_contact, bend.bend)
-            if left > width:
+            bend = FacesBend(float(off.max()))
+            left = bend.bend / 2 / 4 ** cuts_of(a.mesh, self.width, bend.bend)
+            if left > self.width:
                 warn(
-                    f"{bend}, and lie up to {left:.3g} m from the triangles of SelfContact, more than its width {width:.3g} "
+                    f"{bend}, and lie up to {left:.3g} m from the triangles of pairs, more than the width {self.width:.3g} "
                     f"m: refine the mesh, or take a width of {left:.3g} m"
                 )
             raise bend
         self.ws.place_obstacles(now)
         places = runtime.fetch(a.offsets).astype(np.float64)
-        for k, (term, limit) in enumerate(zip(a.contacts, self.limits)):
-            far = np.flatnonzero(off > limit)
+        for k, limit in list(self.limits.items()):
+            term, far = a.contacts[k], np.flatnonzero(off > limit)
             points = points_of_bow(nodes[far]).reshape(-1, 3)
             gaps = term.gap(points, a.poses.row_of(k, places)).reshape(len(far), -1).min(1)
             near = gaps < float(term.values["barrier_width"])
             if near.any():
-                raise FacesBend(float(off[far][near].max()))
+                del self.limits[k]
+                most = float(off[far][near].max())
+                warn(
+                    f"{FacesBend(most)}, where {term!r} acts at their nodes alone: refine the mesh there, or take a width "
+                    f"of {2 * most:.3g} m or more"
+                )

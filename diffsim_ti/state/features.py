@@ -65,7 +65,6 @@ class Features:
     moving: int = 0  # columns of the paths that obstacles follow
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra
-    curved: bool = False  # whether faces are curved, as contact takes them (mesh/curved_triangles.py)
     recorded: bool = False  # whether a loss names what a contact stage does
     balanced: bool = False  # whether the work of the body's own forces is counted
     density: bool = False  # the last two: adjoints that cost extra, only if asked for
@@ -144,14 +143,10 @@ class Features:
         """Whether adjoints of the surface's areas are wanted: the rest shape decides about them."""
         return self.shape and any(group.force.per_area for group in self.groups)
 
-    def reaches(self, group: ObstacleGroup) -> bool:
-        """Whether obstacles may be nearer to a point within a face than to its corners."""
-        return self.curved or not (group.force.hollow or group.force.by_pairs)
-
     def of_state(self) -> "Features":
         """What energies, forces and their derivatives in a given state see of it: scenes that differ in the rest share their
         kernels."""
-        kept = "order groups growing growth_per_step growth_uniform uniform curved density shape".split()
+        kept = "order groups growing growth_per_step growth_uniform uniform density shape".split()
         numbers = self.num_parameters if self.density or self.shape else 0  # say where other sums begin
         return Features(**{name: getattr(self, name) for name in kept}, num_parameters=numbers)
 

@@ -35,13 +35,11 @@ def limits(solver) -> tuple[float, float]:
 class ContactResolution:
     """How well a run's substeps resolve its contacts, over all of its passes.
 
-    omega_dt: largest h sqrt(b''(d) / m), the barrier's stiffness against the vertex's mass. Points within faces act by
-    a force; theirs counts times what a stage may exceed a force by.
+    omega_dt: largest h sqrt(b''(d) / m), the barrier's stiffness against the vertex's mass.
     travel: largest approach to an obstacle in one substep, as a share of its width.
     share: the same as a share of the depth at which the barrier alone would stop the vertex.
     The last two are the largest of these at which gradients of a bounce stay within 10 %, with these solver's contacts.
-    smallest_gap [m], with the vertex (or the corners of the face) and obstacle that reached it; infinite if no barrier was
-    felt.
+    smallest_gap [m], with the vertex and obstacle that reached it; infinite if no barrier was felt.
     substep [s]: the substep h; advised_substep [s]: one at which gradients of a bounce stay within 10 %.
     """
 
@@ -49,7 +47,7 @@ class ContactResolution:
     travel: float
     share: float
     smallest_gap: float
-    vertex: int | tuple[int, ...] | None
+    vertex: int | None
     obstacle: str | None
     substep: float
     largest_omega_dt: float = LARGEST_OMEGA_DT
@@ -72,9 +70,8 @@ class ContactResolution:
     def __str__(self) -> str:
         if self.obstacle is None:
             return "contact: none"
-        place = place_name(np.atleast_1d(self.vertex))
         return (
-            f"contact: smallest gap {self.smallest_gap:.4g} m, of {place} to {self.obstacle}; "
+            f"contact: smallest gap {self.smallest_gap:.4g} m, of vertex {self.vertex} to {self.obstacle}; "
             f"omega dt {self.omega_dt:.3g} (advised {self.largest_omega_dt:.3g}), |v| dt {self.travel:.3g} of the width and "
             f"{self.share:.3g} of the depth (advised {self.largest_share:.3g})"
         )
@@ -87,11 +84,6 @@ def worst(seen: list[ContactResolution]) -> ContactResolution:
     return replace(coarsest, **where)
 
 
-def place_name(vertices: tuple[int, ...]) -> str:
-    """A vertex, or a face by its corners, in words."""
-    return f"vertex {vertices[0]}" if len(vertices) == 1 else f"face ({', '.join(map(str, vertices))})"
-
-
 class ContactWatch:
     """Three rows for each contact term (gap, (omega dt)^2, travel), which each vertex keeps for itself in the passes."""
 
@@ -99,8 +91,7 @@ class ContactWatch:
         self.ws, arrays = weakref.proxy(workspace), workspace.arrays  # which holds this: no circle
         self.contacts, self._obstacles = arrays.contacts, arrays.obstacles
         self._shown = [repr(term) for term in self.contacts]
-        self._corners = arrays.mesh.surface_triangles if arrays.has_face_contact else np.zeros((0, 3), int)
-        n = arrays.num_vertices + len(self._corners) if self.contacts else 1  # faces after vertices
+        n = arrays.num_vertices if self.contacts else 1
         self.seen = runtime.array(arrays.fp, 3 * len(self.contacts), n)
         self.clear()
 
@@ -131,7 +122,7 @@ class ContactWatch:
         runtime.fill(self.seen, rows)
 
     def crossing(self) -> tuple[int, int, float] | None:
-        """(contact, place, depth [m]) of the deepest place on or behind an obstacle, or None; places: `vertices_of`."""
+        """(contact, vertex, depth [m]) of the deepest vertex on or behind an obstacle, or None."""
         if not self.contacts:
             return None
         host = runtime.view(self.seen)
@@ -139,30 +130,10 @@ class ContactWatch:
         k, i = np.unravel_index(np.argmin(gaps), gaps.shape)
         return (int(k), int(i), -float(gaps[k, i])) if gaps[k, i] <= 0 else None
 
-    def note(self, met, face: int) -> None:
-        """A face, or where that is negative a vertex, that was found in an obstacle
-        (mechanics/obstacles/collision_detection.py)."""
-        rows = self.rows()
-        place = self.ws.arrays.num_vertices + face if face >= 0 else met.vertices[0]
-        rows[3 * met.obstacle, place] = min(met.value, rows[3 * met.obstacle, place])
-        self.put(rows)
-
-    def vertices_of(self, place: int) -> tuple[int, ...]:
-        """The vertex, or the corners of the face, that a column of `seen` is about."""
-        n = self.ws.arrays.num_vertices
-        return (int(place),) if place < n else tuple(int(i) for i in self._corners[place - n])
-
     def largest_omega_dt(self) -> float:
         """Largest h sqrt(b''(d) / m) of vertices since the run's start."""
-        return float(np.sqrt(self._squares()[:, : self.ws.arrays.num_vertices].max()))
-
-    def faces_omega_dt(self) -> float:
-        """The same of points within faces, by a bound of all that a corner feels of them."""
-        return float(np.sqrt(self._squares()[:, self.ws.arrays.num_vertices :].max(initial=0)))
-
-    def _squares(self) -> np.ndarray:
         host = runtime.view(self.seen)
-        return (runtime.fetch(self.seen) if host is None else host)[1::3]
+        return float(np.sqrt((runtime.fetch(self.seen) if host is None else host)[1::3].max()))
 
     def resolution(self) -> ContactResolution:
         """What was seen since the run's start."""
@@ -188,22 +159,16 @@ class ContactWatch:
         gaps, travel = rows[::3], rows[2::3]
         k, i = (int(x) for x in np.unravel_index(np.argmin(gaps), gaps.shape))
         seen = np.isfinite(gaps[k, i])
-        n = self.ws.arrays.num_vertices
-        squares, stricter = rows[1::3], largest[0] / LARGEST_OMEGA_DT
         return ContactResolution(
-            float(np.sqrt(max(squares[:, :n].max(), stricter**2 * squares[:, n:].max(initial=0)))),
+            float(np.sqrt(rows[1::3].max())),
             float(travel.max()),
             float((travel / self._depths(travel, values, h)).max()),
             float(gaps[k, i]),
-            self._named(i) if seen else None,
+            i if seen else None,
             self._shown[k] if seen else None,
             h,
             *largest,
         )
-
-    def _named(self, place: int) -> int | tuple[int, ...]:
-        vertices = self.vertices_of(place)
-        return vertices[0] if len(vertices) == 1 else vertices
 
     def _depths(self, travel: np.ndarray, values: Derived, h: float) -> np.ndarray:
         """Depths in the barriers, in widths, that stop vertices with these speeds: m v^2 / 2 = k w^2 beta(1 - depth)."""
@@ -213,9 +178,6 @@ class ContactWatch:
             * (area if counterpart.per_area else np.ones_like(area))
             for counterpart, first, _ in self._obstacles
         ]
-        faces = self._corners
-        mass = np.concatenate([values.mass, values.mass[faces].min(1, initial=np.inf)])
-        stiffness = [np.concatenate([row, np.ones(len(faces))]) for row in stiffness]
         with np.errstate(over="ignore"):  # of runs that blow up
-            energy = mass * travel**2 / (2 * h * h * np.array(stiffness))
+            energy = values.mass * travel**2 / (2 * h * h * np.array(stiffness))
         return np.interp(energy, STOPPED, DEPTHS) + 1e-12

@@ -114,7 +114,7 @@ class SelfContact(Term):
     def check(self, mesh: TetrahedralMesh) -> None:
         own = self._on(mesh)
         width = float(own.values["self_contact_width"])
-        off = bow(mesh) / 4 ** cuts_of(mesh, own)  # so far faces may reach through
+        off = bow(mesh) / 4 ** cuts_of(mesh, width)  # so far faces may reach through
         if off > width:
             warn(
                 f"{type(self).__name__}: faces of this mesh are curved, and lie up to {off:.3g} m from the triangles that "

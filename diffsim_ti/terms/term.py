@@ -31,7 +31,6 @@ class Term(metaclass=Public):
     """
 
     acts_on_surface = False
-    by_pairs = False  # whether what is narrower than faces acts on them by pairs, and not by points within them
     primitives = None  # by which an obstacle acts on faces and edges of bodies too (terms/obstacles/primitives.py)
     interaction = None  # the kind of interaction (mechanics/interaction.py) that a term of a user brings with it
     path = None  # displacement over time, of an obstacle that moves

@@ -222,7 +222,7 @@ class ForwardRun:
                 if watch:
                     watch.begin()
                 other.step()
-            except (FloatingPointError, Overlap):  # explicit steps see obstacles only at points within faces
+            except (FloatingPointError, Overlap):
                 continue
             self.seen.implicit_parts += 1
             self.seen.retries.append(f"t = {sim.time:.4g} s: {why}; this part by {substeps} steps of implicit Euler")

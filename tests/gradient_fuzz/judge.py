@@ -228,12 +228,13 @@ class Judge:
         return KINK if kink and any(max(e, abs(row.reverse - side)) <= gate for side, e in sides) else FAILED
 
     def faces_felt(self) -> bool:
-        """Whether points within faces were pushed in explicit steps."""
+        """Whether narrow obstacles press on faces by pairs at the end of explicit steps."""
         if not self.configuration.structure.explicit or not self.configuration.placed:
             return False
         rollout = self.configuration.rollout()
         rollout.forward()
-        return rollout.sweep.workspace.watch.faces_omega_dt() > 0
+        pairs = rollout.sweep.workspace.pairs
+        return bool(pairs and pairs.obstacles) and pairs.look(rollout.sweep.workspace.state.u)[0] > 0
 
     def seen(self) -> dict[str, bool]:
         """What contacts do in this configuration."""

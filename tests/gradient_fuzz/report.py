@@ -12,7 +12,7 @@ SAID = {
     "slides": "friction slides",
     "self_contact": "pairs of self-contact press",
     "static_contact": "statics press on an obstacle",
-    "faces": "points within faces are pushed in explicit steps",
+    "faces": "narrow obstacles press on faces in explicit steps",
 }
 LARGEST_EXPLAINED, LARGEST_ZERO = 0.05, 0.10
 

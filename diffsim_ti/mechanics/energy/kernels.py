@@ -14,7 +14,7 @@ from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed, with_frozen, with_pass
 
 A = ti.template()
-PASS = dict(poses="vectors", lag="vectors2", pressed="vectors2")  # what contact sees of a pass (obstacles.py)
+PASS = dict(poses="vectors", lag="vectors2")  # what contact sees of a pass (obstacles.py)
 NUMBERS = dict(num_items="int", num_tetrahedra="int", num_vertices="int", per_gamma="float")
 
 
@@ -302,7 +302,7 @@ class PotentialKernels:
     @cached_property
     def vjp(self) -> Kernel:
         """y = df/du w (it is symmetric) and adjoints of the pass; adds the adjoints of all else that forces depend on."""
-        adjoint = ADJOINT | dict(lag="vectors2", poses="vectors2", pressed="vectors2")
+        adjoint = ADJOINT | dict(lag="vectors2", poses="vectors2")
         own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=with_frozen(adjoint, self.law))
         return self._kernel("vjp", self.all_vjp, **own)
 

@@ -10,7 +10,6 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.host_force import NONE
-from diffsim_ti.mechanics.obstacles.face_contact import FaceContact
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.patch_coupling import PatchCoupling
 from diffsim_ti.runtime.slots import copy_slot
@@ -26,14 +25,11 @@ class Potential:
     def __init__(self, arrays, tetrahedra: np.ndarray, parallel: bool, pairs=None):
         self.arrays, self.tetrahedra, self.pairs, a = arrays, tetrahedra, pairs, arrays
         self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
-        n, m, num_obstacles = a.num_vertices, a.num_places, len(a.obstacles)
+        n, m = a.num_vertices, a.num_places
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))  # displacement, direction, result
         self.has_friction = bool(a.features().rough)
         self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the poses
         self.poses = runtime.array(a.vector, a.poses.size)
-        self.faces = FaceContact(self, parallel) if FaceContact.is_active(arrays) else None
-        self.presses = any(g.force.friction and a.features().reaches(g) for g in a.features().groups)
-        self.pressed = runtime.array(a.vector, num_obstacles if self.presses else 1, n if self.presses else 1)
         self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
         self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
         self.elastic, self.J = runtime.array(a.fp, a.points * m), runtime.array(a.fp, a.points * m)
@@ -148,8 +144,6 @@ class Potential:
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
         if self.pairs:
             contact = np.concatenate([contact, self.pairs.energies()])
-        if self.faces:
-            contact = np.concatenate([contact, self.faces.energies()])
         contact = np.concatenate([contact, *(part.energies(self.held_at) for part in self._on_host())])
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
 
@@ -159,9 +153,6 @@ class Potential:
             self.pairs.forces(self.u, 0, self.arrays.corner)
         self.launch("forces")
         forces, sizes = (runtime.fetch(x).astype(np.float64) for x in (self.y, self.size))
-        if self.faces:
-            pushed = self.faces.forces()
-            forces, sizes = forces + pushed, sizes + np.linalg.norm(pushed, axis=1)
         for part in self._on_host():
             forces, sizes = forces + part.forces(self.held_at), sizes + part.sizes(self.held_at)
         return forces[0], sizes
@@ -171,20 +162,14 @@ class Potential:
         scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the units
         runtime.fill(self.w, (w / scale)[None])
         self.multiply(convex)
-        y = runtime.fetch(self.y)[0].astype(np.float64)
-        y = (y + self.faces.product() if self.faces else y) * -scale
+        y = runtime.fetch(self.y)[0].astype(np.float64) * -scale
         return y + self.hosts.product(self.held_at, w, convex) if self.hosts else y
 
     def multiply(self, convex: bool = False) -> None:
-        """y = -d2E/du2 w on the device, without faces and host forces."""
+        """y = -d2E/du2 w on the device, without host forces."""
         if self.pairs:
             self.pairs.hessian_product(self.u, self.w, convex)
         self.launch("product")
-
-    @property
-    def stays_on_device(self) -> bool:
-        """Whether `multiply` does all of `product` but host forces."""
-        return not self.faces
 
     @property
     def is_one_kernel(self) -> bool:
@@ -203,8 +188,6 @@ class Potential:
         if self.pairs:
             self.pairs.add_blocks(self.u, self._block_arrays.blocks)
         blocks = np.swapaxes(runtime.fetch(self._block_arrays.blocks).astype(np.float64), 0, 1)
-        if self.faces:
-            blocks = blocks + self.faces.blocks()
         for part in self._on_host():
             blocks = blocks + part.blocks(self.held_at)
         if a.points > 1:
@@ -277,8 +260,6 @@ class Potential:
             self.launch("contact_blocks", lanes=False, out=self._barriers)
             blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
             y += np.einsum("kij,kj->ki", blocks, w)
-        if self.faces:
-            y -= self.faces.product()[0]
         if self.pairs:
             self.pairs.hessian_product(self.u, self.w, False)
             y[a.mesh.surface_vertices] -= runtime.fetch(a.corner)[a.first_contact_corner :][
@@ -295,5 +276,4 @@ class Potential:
         if self.pairs:
             self.pairs.add_blocks(self.u, self._barriers.blocks)
         blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
-        blocks = blocks + self.faces.blocks() if self.faces else blocks
         return blocks if on_host is None else blocks + on_host

@@ -1,1 +1,1 @@
-"""Obstacles: contact at vertices and within faces, friction, and the motion of obstacles."""
+"""Obstacles: contact at vertices, friction, and the motion of obstacles."""

@@ -1,4 +1,4 @@
-"""Collision detection along the motion of a scene's surface past its obstacles."""
+"""Collision detection along the motion of a surface's vertices past obstacles."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -7,15 +7,14 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.obstacles.face_lattice import nodes_of_faces
 from diffsim_ti.mechanics.obstacles.swept import swept_kernels
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 
 
 @dataclass(frozen=True)
 class Met:
-    """The vertex or face of a surface that is nearest to an obstacle, or stopped first: its vertices, which obstacle it
-    is, and the distance [m] or the free share of a step."""
+    """What of a surface is nearest to an obstacle, or stopped first: a vertex, or those of a pair (curved_pairs.py); which
+    obstacle it is, and the distance [m] or the free share of a step."""
 
     vertices: tuple[int, ...]
     obstacle: int
@@ -24,11 +23,11 @@ class Met:
     def __str__(self) -> str:
         if len(self.vertices) == 1:
             return f"vertex {self.vertices[0]}"
-        return f"face ({', '.join(map(str, self.vertices))})"
+        return f"what is between vertices ({', '.join(map(str, self.vertices))})"
 
 
 class CollisionDetection:
-    """Vertices and faces of a surface against the obstacles of a scene, whose numbers are those that are loaded.
+    """Vertices of a surface against the obstacles of a scene, whose numbers are those that are loaded.
 
     places, drifts: where obstacles are, and how they go meanwhile (state/obstacle_poses.py).
     """
@@ -39,13 +38,9 @@ class CollisionDetection:
         self.a, a = arrays, arrays
         self.terms, mesh = a.contacts, a.mesh
         self._kernels = swept_kernels(a.features(), a.precision, parallel)
-        faces = nodes_of_faces(a)
-        vertices = np.repeat(mesh.surface_vertices[:, None], faces.shape[1], 1)
-        any_reaches = any(a.features().reaches(group) for group in a.features().groups)
-        self.corners_of = np.concatenate([vertices, faces if any_reaches else faces[:0]])
-        self.num_vertices, self.count = len(vertices), len(self.corners_of)
+        self.vertices, self.count = mesh.surface_vertices, len(mesh.surface_vertices)
         self._way = SimpleNamespace(
-            corners=runtime.upload(self.corners_of.ravel(), ti.i32),
+            vertices=runtime.upload(self.vertices, ti.i32),
             step=runtime.array(a.vector, 1, a.num_vertices),
             places=runtime.array(a.vector, a.poses.size // 3),
             drifts=runtime.array(a.vector, a.poses.size // 3),
@@ -58,7 +53,7 @@ class CollisionDetection:
     def share(
         self, u: np.ndarray, step: np.ndarray, places: np.ndarray, drifts=0.0, most: float = 1.0, kept=0.1
     ) -> float:
-        """A share of the step from u, at most `most`, on which no vertex or face meets an obstacle. Where one would, the
+        """A share of the step from u, at most `most`, on which no vertex meets an obstacle. Where one would, the
         share `kept` of its distance (or of the width, if that is less) is kept. `met` says what stopped it."""
         if not self.terms or not (np.any(step) or np.any(drifts)):
             self.met = None
@@ -77,19 +72,14 @@ class CollisionDetection:
         self._check("distances", u, places, max(within, 1e-30))
         return self.met
 
-    def check_apart(self, u: np.ndarray, places: np.ndarray, within: float = 0.0) -> np.ndarray:
-        """Distances [m] of faces to what is nearest, or `within` of those that are farther away; from half of it on they are
-        what is known to be free. Raises Overlap if a vertex or a face is in an obstacle. A state that is not finite is
-        looked at elsewhere."""
-        if not np.all(np.isfinite(u)):
-            return np.full(self.count - self.num_vertices, within)
-        met = self.nearest(u, places, within)
-        if met is not None and met.value <= 1e-30:
+    def check_apart(self, u: np.ndarray, places: np.ndarray) -> None:
+        """Raises Overlap if a vertex is in an obstacle. A state that is not finite is looked at elsewhere."""
+        met = self.nearest(u, places) if np.all(np.isfinite(u)) else None
+        if met is not None:
             raise Overlap(
                 f"{self.terms[met.obstacle]!r} reaches {-met.value:.3g} m into {met} of the body: move the body or the "
                 "obstacle"
             )
-        return self.found[self.num_vertices :] if self.terms else np.zeros(0)
 
     def _check(self, name: str, u, places, most: float, kept: float = 0.0) -> None:
         if name not in self._launches:
@@ -97,14 +87,10 @@ class CollisionDetection:
             self._launches[name] = getattr(self._kernels, name).bind(**own)
         runtime.fill(self._at.u, u[None])
         runtime.fill(self._way.places, places)
-        self._launches[name](num_vertices=self.num_vertices, count=self.count, most=most, kept=kept)
+        self._launches[name](count=self.count, most=most, kept=kept)
         found, blocker = runtime.fetch(self._out.found), runtime.fetch(self._out.blocker)
         j = int(found.argmin())
-        self.found, self.met = found.astype(np.float64), None
-        if blocker[j] >= 0:
-            self.met = Met(
-                tuple(int(i) for i in dict.fromkeys(self.corners_of[j, :3])), int(blocker[j]), float(found[j])
-            )
+        self.met = Met((int(self.vertices[j]),), int(blocker[j]), float(found[j])) if blocker[j] >= 0 else None
 
     @property
     def widths(self) -> list[float]:

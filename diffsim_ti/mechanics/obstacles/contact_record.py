@@ -15,45 +15,26 @@ from diffsim_ti.mechanics.obstacles.obstacle_shares import share_kernels
 class Shares:
     """Forces of each obstacle on each vertex in the pass that a potential is told of, shape (obstacles, 2, n, 3)."""
 
-    def __init__(self, workspace, features=None, at=None):
-        """at: what says where the forces are taken, instead of the potential (pressed.py)."""
-        self.p, self.a = workspace.potential if at is None else at, workspace.arrays
+    def __init__(self, workspace, features=None):
+        self.p, self.a = workspace.potential, workspace.arrays
         a, features = self.a, workspace.arrays.features() if features is None else features
-        self.at_vertices, self.of_faces = share_kernels(features, a.precision, workspace.parallel)
+        self.kernels = share_kernels(features, a.precision, workspace.parallel)
         self.num_obstacles = len(a.obstacles)
         self.force = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
         self.y = runtime.array(a.vector, 1, a.num_vertices)
-        self.reaching = [g.number + k for g in features.groups if features.reaches(g) for k in range(g.count)]
         self._launches = {}
 
-    def _sizes(self, **more) -> dict:
-        return dict(num_vertices=self.a.num_vertices, per_gamma=self.p.per_gamma) | more
-
     def run(self, name: str, **records) -> None:
-        """A kernel of obstacles at vertices."""
         if name not in self._launches:
             own = dict(scene=self.a, pass_=self.p, at=(self.p, self), out=self) | records
-            self._launches[name] = getattr(self.at_vertices, name).bind(**own)
-        self._launches[name](**self._sizes())
-
-    def run_face(self, name: str, which: int, **records) -> np.ndarray:
-        """A kernel of one obstacle at points within faces; its result on vertices."""
-        if ("face", name) not in self._launches:
-            place = SimpleNamespace(poses=self.p.poses), self.p.faces
-            own = dict(scene=self.a, pass_=place, at=self.p, out=self) | records
-            self._launches["face", name] = getattr(self.of_faces, name).bind(**own)
-        self._launches["face", name](**self._sizes(which=which))
-        return runtime.fetch_row(self.y, 0)
+            self._launches[name] = getattr(self.kernels, name).bind(**own)
+        self._launches[name](num_vertices=self.a.num_vertices, per_gamma=self.p.per_gamma)
 
     def forces(self, name: str = "forces", **records) -> np.ndarray:
         """Forces, or "jvp": their change for w of the potential and `tangent`."""
         self.run(name, **records)
         n = self.a.num_vertices
-        out = runtime.fetch(self.force).astype(np.float64).reshape(self.num_obstacles, 2, n, 3)
-        if self.p.faces:
-            for k in self.reaching:
-                out[k, 0] += self.run_face(name, k, **records)
-        return out
+        return runtime.fetch(self.force).astype(np.float64).reshape(self.num_obstacles, 2, n, 3)
 
 
 class ContactRecord:
@@ -97,29 +78,21 @@ class ContactRecord:
 class SharesAdjoint(Shares):
     """Adjoints by those of the forces."""
 
-    def __init__(self, workspace, features, numbers, face_areas, at=None):
-        super().__init__(workspace, features, at)
+    def __init__(self, workspace, features, numbers):
+        super().__init__(workspace, features)
         p, a = self.p, self.a
         self.seed = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
         self.lag = runtime.array(a.vector, *p.lag.shape)
         self.poses = runtime.array(a.vector, a.poses.size, a.num_vertices)
-        self.pressed = runtime.array(a.vector, *p.pressed.shape)
-        own = SimpleNamespace(lag=self.lag, poses=self.poses, pressed=self.pressed, face_areas=face_areas)
-        self.numbers = (own, numbers)
+        self.numbers = SimpleNamespace(lag=self.lag, poses=self.poses), numbers
 
     def pull_back(self, seed: np.ndarray) -> tuple[np.ndarray, ...]:
-        """(adjoint of u*, of the two rows of lag, of `pressed`, of the rows of obstacle poses) in float64; adds those
+        """(adjoint of u*, of the two rows of lag, of the rows of obstacle poses) in float64; adds those
         of the scene's numbers."""
         runtime.fill(self.seed, seed.reshape(-1, *seed.shape[2:]))
-        for target in (self.lag, self.poses, self.pressed):
+        for target in (self.lag, self.poses):
             runtime.fill(target, 0)
         self.run("vjp", adjoint=self.numbers)
         by_u = runtime.fetch_row(self.y, 0)
-        if self.p.faces:
-            for k in self.reaching:
-                runtime.fill(self.p.w, seed[k, :1])
-                by_u = by_u + self.run_face("vjp", k, adjoint=self.numbers)
-        by_lag, by_pressed, by_poses = (
-            runtime.fetch(x).astype(np.float64) for x in (self.lag, self.pressed, self.poses)
-        )
-        return by_u, by_lag, by_pressed, by_poses.sum(1)
+        by_lag, by_poses = (runtime.fetch(x).astype(np.float64) for x in (self.lag, self.poses))
+        return by_u, by_lag, by_poses.sum(1)

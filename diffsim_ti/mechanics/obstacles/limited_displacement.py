@@ -1,8 +1,7 @@
 """Displacements that would lead a vertex behind an obstacle, of which it takes a share.
 
 The stage moves a vertex by z to a distance y > 0 from the tangent plane, normal n, that each obstacle has where the pass
-begins (contact_stage.py). What comes after that, friction and contact within faces, adds a way e, of which the vertex takes
-the share c(x):
+begins (contact_stage.py). What comes after that, friction, adds a way e, of which the vertex takes the share c(x):
 
     x = max_o -e . n_o / y_o,    c(x) = 1 for x <= 1/2,    c(x) = (1 - exp(1 - 2 x) / 2) / x beyond,
 

@@ -83,13 +83,9 @@ class ObstacleCollisions:
             self.ws.pairs.follow(self.rows, AT_STAGE)
 
     def check_apart(self) -> None:
-        """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
+        """Raise Overlap if a vertex is in an obstacle."""
         u, poses = runtime.fetch_row(self.ws.state.u, 0), runtime.fetch(self.ws.arrays.offsets)[::3].astype(np.float64)
-        faces = self.ws.potential.faces
-        if faces is None:
-            self.detection.check_apart(u, poses)
-        else:
-            faces.begin(self.detection.check_apart(u, poses, 2 * faces.reach.max(initial=0)))
+        self.detection.check_apart(u, poses)
 
     def check_end(self, j: int, u_star, u_next) -> None:
         """Raise Tunnelling where surfaces, or a surface and an obstacle, meet beyond the middle of a step."""

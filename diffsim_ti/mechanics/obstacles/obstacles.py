@@ -2,7 +2,7 @@
 
 Obstacles are taken where they are in the pass, which `pass_.poses` says (state/obstacle_poses.py). `pass_.lag` holds
 two rows: the displacement of the body where the pass begins, from which friction takes its normal force, and x, so that
-(u - x) per_gamma is the velocity. `pass_.pressed` holds a row for each obstacle (`reaches`).
+(u - x) per_gamma is the velocity.
 """
 
 from dataclasses import dataclass
@@ -63,12 +63,6 @@ class ObstaclePotential(ObstacleFunctions):
         return by_u, by_t
 
     # ---- friction ----------------------------------------------------------------------------------------------------
-    # Of obstacles that reach into faces, points within them push as well: N and its direction are then the size and the
-    # direction of `pass_.pressed`, all that an obstacle pushes a vertex with where the pass begins.
-
-    def reaches(self, g) -> bool:
-        """Whether friction of a group takes its normal force from `pressed`."""
-        return g.force.friction and self.features.reaches(g)
 
     @ti.func
     def velocity(self, i, u, pass_: A, plan: A):
@@ -130,29 +124,14 @@ class ObstaclePotential(ObstacleFunctions):
         return by_u, by_t
 
     @ti.func
-    def on_friction_area(self, g: A, i, x, scene: A):
-        """Friction on the area of vertex i; `pressed` is of the whole already."""
-        out = x
-        if ti.static(not self.reaches(g)):
-            out = self.on_area(g, i, x, scene)
-        return out
-
-    @ti.func
     def has_friction_at(self, g: A, k, i, scene: A, pass_: A):
         """Whether friction of an obstacle acts."""
-        felt = False
-        if ti.static(self.reaches(g)):
-            felt = pass_.pressed[g.number + k, i].norm_sqr() > 0
-        else:
-            X = self.rest_before(g, k, i, scene, pass_)
-            felt = g.force.touches(scene.parameters, g.first + k * g.size, X, pass_.lag[0, i])
-        return felt
+        X = self.rest_before(g, k, i, scene, pass_)
+        return g.force.touches(scene.parameters, g.first + k * g.size, X, pass_.lag[0, i])
 
     @traced
     def lagged_at(self, g, k, i, scene, pass_):
-        """What friction takes its normal force from, as `friction_force` has it: a place, or `pressed`."""
-        if self.reaches(g):
-            return None, let(at(pass_.pressed, g.number + k, i))
+        """The place where friction takes its normal force from, as `friction_force` has it."""
         return self.rest_before(g, k, i, scene, pass_), let(at(pass_.lag, 0, i))
 
     @ti.func
@@ -204,7 +183,7 @@ class ObstaclePotential(ObstacleFunctions):
                 if ti.static(rough and g.force.friction):
                     if self.has_friction_at(g, k, i, scene, pass_):
                         lost = self.lost(g, k, i, u, scene, pass_, plan)
-                        value += self.on_friction_area(g, i, lost, scene) / plan.per_gamma
+                        value += self.on_area(g, i, lost, scene) / plan.per_gamma
         return value
 
     @ti.func
@@ -215,7 +194,7 @@ class ObstaclePotential(ObstacleFunctions):
                 f += self.push(g, k, i, u, scene, pass_)
                 if ti.static(g.force.friction):
                     if self.has_friction_at(g, k, i, scene, pass_):
-                        f += self.on_friction_area(g, i, self.drag(g, k, i, u, scene, pass_, plan), scene)
+                        f += self.on_area(g, i, self.drag(g, k, i, u, scene, pass_, plan), scene)
         return f
 
     @ti.func
@@ -229,7 +208,7 @@ class ObstaclePotential(ObstacleFunctions):
                 f += self.on_area(g, i, change, scene)
                 if ti.static(rough and g.force.friction):
                     if self.has_friction_at(g, k, i, scene, pass_):
-                        f += self.on_friction_area(g, i, self.drag_product(g, k, i, u, w, scene, pass_, plan), scene)
+                        f += self.on_area(g, i, self.drag_product(g, k, i, u, w, scene, pass_, plan), scene)
         return f
 
     # ---- derivatives by everything -----------------------------------------------------------------------------------
@@ -259,16 +238,14 @@ class ObstaclePotential(ObstacleFunctions):
             dv,
             dv_obstacle,
         )
-        f = self.on_friction_area(g, i, f, scene)
-        if ti.static(g.force.per_area and not self.reaches(g)):
+        f = self.on_area(g, i, f, scene)
+        if ti.static(g.force.per_area):
             f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
         return f
 
     @traced
     def lagged_jvp(self, g, k, i, scene, pass_, tangent):
-        """Change of what friction takes its normal force from."""
-        if self.reaches(g):
-            return at(tangent.pressed, g.number + k, i)
+        """Change of the place where friction takes its normal force from."""
         X, u = self.rest_before(g, k, i, scene, pass_), at(pass_.lag, 0, i)
         return self.moved(g, k, AT_BEGIN, X, u, at(tangent.lag, 0, i) + at(tangent.rest, i), scene, tangent)
 
@@ -297,21 +274,18 @@ class ObstaclePotential(ObstacleFunctions):
     @ti.func
     def drag_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A, plan: A):
         n, first = 3 * (g.number + k), g.first + k * g.size
-        if ti.static(g.force.per_area and self.features.shape and not self.reaches(g)):
+        if ti.static(g.force.per_area and self.features.shape):
             self.add_to_area(g, i, self.drag(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
-        w = self.on_friction_area(g, i, w, scene)
+        w = self.on_area(g, i, w, scene)
         v, v_obstacle = self.velocity(i, u, pass_, plan), self.v_obstacle(g, k, i, scene, pass_)
         by_lagged, by_v, by_v_obstacle, by = g.force.friction_force_vjp(
             scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle, w
         )
         self.add_to_numbers(g, k, i, by, adjoint)
-        if ti.static(self.reaches(g)):
-            adjoint.pressed[g.number + k, i] = by_lagged
-        if ti.static(g.force.turns or not self.reaches(g)):
-            by_u, by_t = self.lagged_vjp(g, k, i, by_lagged, by_v_obstacle, scene, pass_, adjoint)
-            self.add_to_rest(i, by_u, adjoint)
-            adjoint.lag[0, i] = adjoint.lag[0, i] + by_u
-            adjoint.poses[n + AT_BEGIN, i] = by_t
+        by_u, by_t = self.lagged_vjp(g, k, i, by_lagged, by_v_obstacle, scene, pass_, adjoint)
+        self.add_to_rest(i, by_u, adjoint)
+        adjoint.lag[0, i] = adjoint.lag[0, i] + by_u
+        adjoint.poses[n + AT_BEGIN, i] = by_t
         adjoint.poses[n + RATE, i] = by_v_obstacle
         adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
         return plan.per_gamma * by_v
@@ -321,8 +295,7 @@ class ObstaclePotential(ObstacleFunctions):
         """Adjoints of the place where the pass begins and of the obstacle's displacement there."""
         if not g.force.turns:
             return by_lagged, self.vector(0) - by_lagged
-        by_place = ti.Vector.zero(self.fp, 6) if self.reaches(g) else by_lagged
-        return self.turned_velocity_vjp(g, k, i, by_place, by_v_obstacle, scene, pass_, adjoint)
+        return self.turned_velocity_vjp(g, k, i, by_lagged, by_v_obstacle, scene, pass_, adjoint)
 
     @ti.func
     def add_vjp(self, i, f, u, w, scene: A, pass_: A, adjoint: A, plan: A):

@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from diffsim_ti.mechanics.obstacles.face_contact_points import has_face_contact
 from diffsim_ti.terms import SelfContact
 
 if TYPE_CHECKING:
@@ -22,11 +21,6 @@ def check_bodies(scene: "Scene", contact: str) -> None:
         raise ValueError(
             f"{said} take obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
             'contact="force"'
-        )
-    if has_face_contact(scene):
-        raise ValueError(
-            f"{said} touch obstacles at their vertices only in explicit steps, and an obstacle could reach into a face "
-            "here: take a finer mesh, a wider barrier, or an implicit solver"
         )
     if scene.holds_volumes:
         raise ValueError(f"{said} and FilledChamber do not go together in explicit steps: take an implicit solver")

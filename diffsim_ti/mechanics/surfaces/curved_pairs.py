@@ -24,15 +24,15 @@ ROWS = dict(start="ints", index="ints", weight="scalars")
 def pairs_of(kind: type, arrays, parallel: bool, with_obstacles: bool = True):
     """Pairs of a kind (surface_pairs.py, implicit_pairs.py), of a finer surface where faces are curved and smooth, and with
     the corners of obstacles; None where a scene has none."""
-    mesh, term, parts = arrays.mesh, arrays.self_contact, False
-    if with_obstacles and any(x.primitives is not None for x in arrays.contacts):
-        corners = ObstacleCorners(arrays)
-        parts = True
-    if not (term or parts):
+    mesh, term = arrays.mesh, arrays.self_contact
+    corners = (
+        ObstacleCorners(arrays) if with_obstacles and any(x.primitives is not None for x in arrays.contacts) else None
+    )
+    if not (term or corners):
         return None
-    cuts = cuts_of(mesh, term, arrays.bend) if term else 0
+    cuts = cuts_of(mesh, arrays.width_of_pairs, arrays.bend)
     surface = CollisionSurface(mesh, cuts) if cuts else mesh
-    if parts:
+    if corners:
         surface = SurfaceWithObstacles(surface, surface_edges(surface), corners, term)
     return kind(arrays, parallel) if surface is mesh else CurvedPairs(kind, arrays, parallel, surface)
 

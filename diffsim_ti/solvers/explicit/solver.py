@@ -16,9 +16,7 @@ from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
-from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
-from diffsim_ti.mechanics.obstacles.face_contact_points import FaceContactPoints, has_face_contact
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies
 from diffsim_ti.mechanics.stage import Passes
@@ -70,8 +68,7 @@ class ExplicitSolver(Solver):
         are `reduced` take obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
         SelfContact(stage=True) acts likewise, in parts of each substep (surfaces/contact_stage.py): it keeps surfaces apart
         whatever its stiffness, with friction in it; it needs "stage", and no reduced sets.
-        In both, what is narrower than faces acts on points within them in a stage of its own, which integrates the substep
-        again in as many parts as barrier and speed ask for (explicit_face_kernels.py), and then friction acts there.
+        Obstacles that act by pairs do so likewise with their points and edges; with "force" by one more force.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.
@@ -123,7 +120,6 @@ class ExplicitSolver(Solver):
         alone = (
             self.scene.term(SelfContact)
             or any(term.primitives is not None for term in self.scene.terms)
-            or has_face_contact(self.scene)
             or any(x.apart for x in self.scene.interactions)
             or self.scene.reduced
         )  # which act between passes
@@ -144,11 +140,6 @@ class ExplicitSolver(Solver):
 
     def workspace(self, derived: Derived, bend: float = 0.0) -> "ExplicitWorkspace":
         """Arrays and bound launches for runs of this solver; bend: see state/bending.py."""
-        if bend and self.scene.reduced:
-            raise ValueError(
-                f"reduced sets ({self.scene.reduced.describe()}) touch obstacles at their vertices only in explicit steps, "
-                f"and ten-node faces bend by {bend / 2:.3g} m where they touch: take a finer mesh, or an implicit solver"
-            )
         return ExplicitWorkspace(self, derived, bend)
 
     def adjoint(self, workspace, density: bool, shape: bool):
@@ -163,17 +154,14 @@ class ExplicitSolver(Solver):
 class ExplicitWorkspace(Workspace):
     """A run of an explicit solver: one launch for many passes, or one per pass on all threads."""
 
-    has_face_contact = staticmethod(has_face_contact)
     work_per_launch = 4_000_000  # tetrahedra x passes in one launch: a tenth of a second, so that Ctrl-C is heard
 
     def __init__(self, solver, derived: Derived, bend: float = 0.0):
         self.table = PassTable(runtime.PRECISIONS[solver.scene.precision])
         super().__init__(solver, derived, bend)
-        self.in_parallel = 1 if self.arrays.has_face_contact else solver.passes_per_launch()
+        self.in_parallel = solver.passes_per_launch()
         self.repeated = self.parallel and self.in_parallel > 1
         features, a = self.arrays.features(), self.arrays
-        self.faces = FaceContactPoints(self) if a.has_face_contact else None
-        self.check_apart()
         self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
         self.volumes = VolumeConstraints(self) if self.scene.holds_volumes else None
         self.stages = stages_of(self)
@@ -188,10 +176,6 @@ class ExplicitWorkspace(Workspace):
         self.probe = None  # room for a pass that is not taken
         unwatched = self.scene.term(Growth) or self.has_unnoted_work
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not unwatched else None
-
-    def load(self, derived: Derived) -> None:
-        super().load(derived)
-        self.check_apart()
 
     @property
     def stages_pairs(self) -> bool:
@@ -230,34 +214,6 @@ class ExplicitWorkspace(Workspace):
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         return self.impulses.collect() / frame_time
-
-    def forget(self) -> None:
-        super().forget()
-        self.check_apart()
-
-    def check_apart(self) -> None:
-        """Raise ValueError if a face is in an obstacle that faces feel."""
-        a = self.arrays
-        if a.has_face_contact:
-            far = 2 * self.faces.full_reach.max(initial=0) if self.faces else 0.0
-            distances = self.collisions.check_apart(*self._in_front_of_obstacles(), far)
-            if self.faces:
-                self.faces.starts(distances)
-
-    @property
-    def collisions(self) -> CollisionDetection:
-        return self.kept("way", lambda: CollisionDetection(self.arrays, self.parallel))
-
-    def _in_front_of_obstacles(self) -> tuple:
-        return runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
-
-    def check_between_points(self, now: int) -> None:
-        """Note what got into an obstacle before pass `now` between points of faces that do not reach as far as that."""
-        if self.faces and self.faces.is_shortened:
-            self.place_obstacles(now)
-            met = self.collisions.nearest(*self._in_front_of_obstacles())
-            if met is not None:
-                self.watch.note(met, int(self.collisions.found.argmin()) - self.collisions.num_vertices)
 
     def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
         return self.volumes.of_all(num_frames)

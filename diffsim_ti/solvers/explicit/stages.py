@@ -4,16 +4,13 @@ from contextlib import nullcontext
 
 from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import VolumeConstraintAdjoint, VolumeConstraintTangent
 from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
-from diffsim_ti.mechanics.obstacles.face_contact_derivatives import FaceContactAdjoint, FaceContactTangent
-from diffsim_ti.mechanics.obstacles.face_contact_points import FaceContactPoints
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.stages import SurfaceForces, SurfaceFriction
 
 # stages whose tangents and adjoints have buffers: what makes these of them for a run
 BUFFERED = dict(
-    tangent={VolumeConstraints: VolumeConstraintTangent, FaceContactPoints: FaceContactTangent},
-    adjoint={VolumeConstraints: VolumeConstraintAdjoint, FaceContactPoints: FaceContactAdjoint},
+    tangent={VolumeConstraints: VolumeConstraintTangent}, adjoint={VolumeConstraints: VolumeConstraintAdjoint}
 )
 
 
@@ -52,7 +49,7 @@ def stages_of(ws) -> list[Stage]:
         forces = PairContact(ws.pairs, ws.solver.contact_damping)
     elif ws.pairs:
         forces, friction = SurfaceForces(ws.pairs), SurfaceFriction(ws.pairs) if ws.pairs.friction else None
-    every = forces, ws.volumes, friction, ws.chambers, ws.faces, KickDrift()
+    every = forces, ws.volumes, friction, ws.chambers, KickDrift()
     return [stage for stage in every if stage]
 
 

@@ -13,9 +13,6 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.record import ChamberRecord
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, SharesAdjoint
-from diffsim_ti.mechanics.obstacles.face_kernels import face_kernels
-from diffsim_ti.mechanics.obstacles.face_lattice import nodes_of_faces, rest_of_areas
-from diffsim_ti.mechanics.obstacles.pressed import PressedAdjoint
 from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
@@ -40,7 +37,6 @@ class ImplicitAdjoint(RecordedPasses):
         self.potential = p
         self.lag = runtime.array(a.vector, 2, n if p.has_friction else 1)
         self.poses = runtime.array(a.vector, a.poses.size, n if num_obstacles else 1)
-        self.pressed = runtime.array(a.vector, *p.pressed.shape)
         self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, adjoint=(self, self.numbers))
         if self.z is not None:  # the state of the law
             corner, y = runtime.array(a.vector, *a.corner.shape), runtime.array(a.vector, 1, n)
@@ -49,16 +45,11 @@ class ImplicitAdjoint(RecordedPasses):
         self.law_frames = LawFrames(workspace) if workspace.law_frames else None
         self.held = a.frozen_numbers()  # in a pass, by the law
         self._vjp = self.kernels.vjp.bind(a.in_vectors, **own)
-        if p.faces:
-            faces = face_kernels(self.features, a.precision, workspace.parallel)
-            self.face_areas = runtime.array(a.fp, nodes_of_faces(a).size if self.features.areas else 1)
-            self._vjp_of_faces = p.faces.bind(faces.vjp, adjoint=(self, self.numbers))
         self.chamber_record = ChamberRecord(workspace.solver, workspace.constrained_chambers)
-        self.contacts, areas = None, self.face_areas if p.faces else runtime.array(a.fp, 1)
+        self.contacts = None
         if workspace.impulses:
             self.contacts = ContactRecord(workspace)
-            self._shares = SharesAdjoint(workspace, self.features, self.numbers, areas) if num_obstacles else None
-        self._by_pressed = PressedAdjoint(workspace, self.features, self.numbers, areas) if p.presses else None
+            self._shares = SharesAdjoint(workspace, self.features, self.numbers) if num_obstacles else None
 
     def fits(self, workspace) -> bool:
         """Whether kernels and arrays are still those of the run."""
@@ -72,8 +63,6 @@ class ImplicitAdjoint(RecordedPasses):
             runtime.fill(self.z, 0)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
-        if self.ws.potential.faces:
-            runtime.fill(self.face_areas, 0)
         a = self.ws.arrays
         self.frames = tuple(np.asarray(x, np.float64) for x in (positions_adj, velocities_adj))
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
@@ -160,14 +149,12 @@ class ImplicitAdjoint(RecordedPasses):
             by_pressure = self.chamber_record.adjoint(j, save_every)
             by_star, nu = ws.volumes.adjoint(ws.potential.held_at, by_star, by_pressure, self.solve)
         runtime.fill(ws.potential.w, by_star[None])
-        for target in (self.lag, self.poses, *[self.pressed] * ws.potential.presses):
+        for target in (self.lag, self.poses):
             runtime.fill(target, 0)
         if ws.pairs:
             ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
         self._vjp(**ws.potential.sizes())
         reaction = runtime.fetch(ws.potential.y)[0].astype(np.float64)
-        if ws.potential.faces:
-            reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
         if ws.hosts:
             by_place, by_speed = ws.hosts.vjp(ws.potential.held_at, by_star, self.by_hosts)
@@ -186,17 +173,13 @@ class ImplicitAdjoint(RecordedPasses):
         # where inertia starts from
         inertial = self.mass * by_star
         reaction = reaction - inertial  # fixed vertices are felt by their neighbours' inertia too
-        x_adj, by_begin = inertial - s.e0 / s.gamma * q_free + by_x, 0.0
+        x_adj = inertial - s.e0 / s.gamma * q_free + by_x
         if ws.potential.has_friction:
             by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
             by_lag, x_adj = by_lag + by_first, x_adj + by_first_x
-        if self._by_pressed:
-            by_pressed = runtime.fetch(self.pressed).astype(np.float64) + (0.0 if seen is None else seen[2])
-            by_place, by_begin = self._by_pressed.pull_back(by_pressed)
-            by_lag = by_lag + by_place
         if self.path is not None:
             by_poses = runtime.fetch(self.poses).astype(np.float64).sum(1)
-            by_poses = by_poses + by_begin + (0.0 if seen is None else seen[3])
+            by_poses = by_poses + (0.0 if seen is None else seen[2])
             if ws.pairs and ws.pairs.obstacles:
                 by_poses = by_poses + ws.pairs.obstacles.take_rows()
             ws.collisions.vjp(by_poses, j, s, self.path)
@@ -278,9 +261,6 @@ class ImplicitAdjoint(RecordedPasses):
             by_parameters, by_pairs = self.ws.pairs.collect()
             out.parameters += by_parameters
             rest = rest + by_pairs
-        if self.ws.potential.faces and features.areas:
-            by_areas = runtime.fetch(self.face_areas).astype(np.float64)
-            rest = rest + rest_of_areas(a, a.values.rest, by_areas)
         out.rest = rest + self.rest_adj + out.rest
         out.growths = self.growth
         out.forces, out.motion, out.path = self.forces, self.motion, self.path

@@ -9,7 +9,6 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.record import ChamberRecord
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
-from diffsim_ti.mechanics.obstacles.pressed import PressedTangent
 from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
@@ -27,8 +26,7 @@ class ImplicitTangent(RecordedPasses):
         self.features = a.features()
         kernels = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
         self.numbers = Tangent(a, tangent)
-        self.lag, self.poses, self.pressed = (runtime.array(a.vector, *x.shape) for x in (p.lag, p.poses, p.pressed))
-        self._presses = PressedTangent(workspace, self) if p.presses else None
+        self.lag, self.poses = (runtime.array(a.vector, *x.shape) for x in (p.lag, p.poses))
         self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, tangent=(self, self.numbers))
         if self.z is not None:
             runtime.fill(self.z, 0)
@@ -36,8 +34,6 @@ class ImplicitTangent(RecordedPasses):
         self.law_frames = LawFrames(workspace) if workspace.law_frames else None
         self.held = a.frozen_numbers()
         self._jvp = kernels.jvp.bind(a.in_vectors, **own)
-        if p.faces:
-            self._jvp_of_faces = p.faces.bind(p.faces.kernels.jvp, tangent=(self, self.numbers))
         self.contacts = ContactRecord(workspace) if workspace.impulses else None
         self._shares = Shares(workspace) if workspace.impulses and len(a.obstacles) else None
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
@@ -83,8 +79,6 @@ class ImplicitTangent(RecordedPasses):
             runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
         if poses is not None:
             runtime.fill(self.poses, poses)
-        if self._presses:
-            self._presses.begin(self.du, poses)
         if ws.strains:
             ws.strains.jvp(s, (self.u, self.du), (self.before, self.tangent_before), self)
         if ws.pairs:
@@ -94,8 +88,6 @@ class ImplicitTangent(RecordedPasses):
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + self.mass_dot * self.weight(share)
         dR += from_friction
-        if ws.potential.faces:
-            dR += self._jvp_of_faces()
         if a.features().gravity >= 0:
             dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
         dR += ws.applied_forces(tangent.forces, j, s)
@@ -123,7 +115,7 @@ class ImplicitTangent(RecordedPasses):
         """Change of the forces of obstacles, and of friction between surfaces, in pass j, u* changing by d_star."""
         p = self.ws.potential
         runtime.fill(p.w, d_star[None])
-        record = dict(tangent=(SimpleNamespace(lag=self.lag, poses=self.poses, pressed=self.pressed), self.numbers))
+        record = dict(tangent=(SimpleNamespace(lag=self.lag, poses=self.poses), self.numbers))
         along, by_pairs = (d_star, dx, self.du, self.numbers), self.ws.pair_shares
         of_bodies = dict(poses_dot=poses, only=0) if by_pairs else {}
 

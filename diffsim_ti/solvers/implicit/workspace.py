@@ -12,7 +12,6 @@ from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
-from diffsim_ti.mechanics.obstacles.pressed import Pressed
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.frozen_strains import FrozenStrains
 from diffsim_ti.mechanics.stress.law_state import law_state_kernels
@@ -63,7 +62,6 @@ class ImplicitWorkspace(PrescribedInPasses):
         if not self._launches.get("potential"):
             self.potential = Potential(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
-            self.pressed = Pressed(self) if self.potential.presses else None
             self.strains = FrozenStrains(self) if self.potential.held is not None else None
         a = self.arrays
         self._mass = self.mass_of(derived)
@@ -317,7 +315,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     # ---- what obstacles do -------------------------------------------------------------------------------------------
 
     def check_apart(self) -> None:
-        """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
+        """Raise Overlap if a vertex is in an obstacle."""
         self.collisions.check_apart()
 
     def record_contacts(self) -> None:
@@ -365,8 +363,6 @@ class ImplicitWorkspace(PrescribedInPasses):
         """Tell the potential where obstacles are in pass j and where friction is measured from."""
         self.collisions.begin(j, stage)
         self.potential.begin(u, x, 1 / stage.gamma, self.collisions.rows)
-        if self.pressed:
-            self.pressed.begin(u, self.collisions.rows)
         self.origin = x
         self.apply_loads(j, stage)
         if self.volumes:  # after all that the stiffness at rest is made of

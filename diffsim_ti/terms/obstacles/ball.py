@@ -32,10 +32,6 @@ class SphereForce(ObstacleForce):
     def hollow(self):
         return self.inside
 
-    @property
-    def convex(self):
-        return not self.inside
-
     @traced
     def distance_and_normal(self, g, p, X, u):
         *center, radius = p
@@ -61,12 +57,8 @@ class Sphere(Obstacle):
     ):
         shape = place("center", center, "sphere_center"), extent("radius", radius, "sphere_radius")
         self.inside = bool(inside)
+        self.all_primitives = None if inside else BALL
         super().__init__(shape, **options)
-
-    @property
-    def all_primitives(self):
-        """Its centre, unless bodies are inside it."""
-        return None if self.inside else BALL
 
     def distance(self, positions):
         d = np.linalg.norm(positions - self.values["sphere_center"], axis=1) - self.values["sphere_radius"]
@@ -94,7 +86,6 @@ class CapsuleForce(ObstacleForce):
 
     count = 7
     lanes = True
-    convex = True
 
     @traced
     def distance_and_normal(self, g, p, X, u):

@@ -13,8 +13,8 @@ from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.ball import check_axis, radial
-from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
-from diffsim_ti.terms.obstacles.primitives import BOX
+from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions
+from diffsim_ti.terms.obstacles.primitives import BOX, PrismPrimitives
 
 
 @traced
@@ -42,7 +42,6 @@ class BoxForce(ObstacleForce):
     """Of y = R^T (x - center): d of |y| - half sizes (see `corner`); R the rotation of a quaternion (w, x, y, z)."""
 
     count = 10
-    convex = True
 
     @traced
     def distance_and_normal(self, g, p, X, u):
@@ -113,7 +112,6 @@ class CylinderForce(ObstacleForce):
     """d of (distance to the axis - radius, distance along it to the nearer end), see `corner`."""
 
     count = 7
-    convex = True
 
     @traced
     def distance_and_normal(self, g, p, X, u):
@@ -137,12 +135,16 @@ class Cylinder(Obstacle):
     whose other arguments it takes.
     """
 
-    counterpart = CylinderForce
+    counterpart, all_primitives = CylinderForce, PrismPrimitives.of(np.eye(3)[1], 1.0, 1.0)
 
     def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options: Unpack[ObstacleOptions]):
         ends = place("start", start, "cylinder_start"), place("end", end, "cylinder_end")
         super().__init__([*ends, extent("radius", radius, "cylinder_radius")], **options)
         check_axis(self, "cylinder_start", "cylinder_end")
+
+    def primitives_for(self, mesh, width):
+        start, end, radius = self.values["cylinder_start"], self.values["cylinder_end"], self.values["cylinder_radius"]
+        return PrismPrimitives.of(end - start, float(radius), BOW * width)
 
     def distance(self, positions):
         a, b = self.values["cylinder_start"], self.values["cylinder_end"]

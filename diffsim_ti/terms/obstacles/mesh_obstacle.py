@@ -1,6 +1,5 @@
 """Triangles, segments and points as an obstacle, by the exact distance to what is nearest of them."""
 
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,15 +16,12 @@ from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
-from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
+from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
 from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.surface_distance import SurfaceDistance
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
 from diffsim_ti.terms.obstacles.turning import rotation_matrix
-
-STRETCH = 1.2  # of a body's longest edge: how far it may be stretched
-BOW = 0.12  # of the width: what faces need not feel
 
 
 class MeshObstacle(Obstacle):
@@ -113,16 +109,16 @@ class MeshObstacle(Obstacle):
         return points + self.values["mesh_position"], triangles
 
     def settled(self, scene, density, initial_positions, initial_velocities):
-        """With those of its edges and corners that faces of the body are wide enough to meet between their own corners."""
-        out = copy(super().settled(scene, density, initial_positions, initial_velocities))
+        out = super().settled(scene, density, initial_positions, initial_velocities)
         if "barrier_width" in self.left_to_scene:
             out._check_rounding()
-        x = scene.mesh.vertices[scene.mesh.surface_triangles[:, :3]]
-        longest = STRETCH * float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0))
-        edges = self._made.sharp_edges(longest, BOW * float(out.values["barrier_width"]))
-        points = np.union1d(edges, self._made.one[self._made.points])
-        out.all_primitives = MeshPrimitives.of(points, edges, self._tree.x) if len(points) else None
         return out
+
+    def primitives_for(self, mesh, width):
+        """Those of its edges and corners that faces of the body are wide enough to feel between their own corners."""
+        edges = self._made.sharp_edges(longest_edge(mesh), BOW * width)
+        points = np.union1d(edges, self._made.one[self._made.points])
+        return MeshPrimitives.of(points, edges, self._tree.x) if len(points) else None
 
     def kernel(self, precision, table=0):
         if precision == "f32" and table + self.table.size > 2**24:

@@ -1,14 +1,17 @@
 """What all obstacles share: a barrier of the distance, friction, a path, and every derivative of these."""
 
 from collections.abc import Sequence
+from copy import copy
 from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common import deprecated
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
+from diffsim_ti.mesh.face_points import bow
 from diffsim_ti.terms.described import chosen_width, place, positive
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
@@ -20,6 +23,8 @@ from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_pat
 from diffsim_ti.terms.term import Term
 
 PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
+STRETCH = 1.2  # of a body's longest edge: how far it may be stretched
+BOW = 0.12  # of the width: how much nearer than their corners faces may be to what acts at vertices alone
 
 
 class ObstacleOptions(TypedDict, total=False):
@@ -33,6 +38,7 @@ class ObstacleOptions(TypedDict, total=False):
     name: str | None
     stiffness_per_area: float | None
     about: ArrayLike | None
+    by_pairs: bool | None
 
 
 class Obstacle(Term):
@@ -50,8 +56,6 @@ class Obstacle(Term):
     stiffness [N/m]: k of every vertex alike, however many there are.
     width [m]: the distance at which the barrier begins to act. None: 1 % of the body (of the longest side of the smallest
     one, `mesh.body_size`), which `scene.describe()` says.
-    Faces of ten-node tetrahedra that are curved in the mesh, by 0.02 widths or more, are treated as curved as they move, by
-    points on them (curved_faces.py). Friction there is, in explicit steps, a stage after those of the pushes.
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
     friction is smoothed, and with which a vertex that is held may creep.
     path: the obstacle's displacement over time [m], a function of time [s] that returns 3 numbers, or keyframes
@@ -60,12 +64,16 @@ class Obstacle(Term):
     the obstacle as it was made to c + t + R (x - c), with constant angular velocity between keyframes and within steps.
     Quaternions take the short way; rotation vectors on one axis keep their turns, less than one in a step.
     about [m]: the point c.
-    by_pairs: whether a ball, capsule or box acts on faces and edges of bodies between their vertices as bodies act on each
-    other, exactly: a ball's centre on triangles, at the distance less the radius; of a capsule its axis on edges and its
-    ends on triangles, of a box its twelve edges and eight corners. Energy of a pair as of a vertex, m b(d) with m of
-    `SelfContact`; the stiffness per area is multiplied by the triangle's area in the mesh, or by a third of that of the
-    triangles at the edge. Mesh obstacles always do so with what is sharp of them. Otherwise contact points within faces meet
-    what is narrower than these.
+    by_pairs: whether it also acts on faces and edges of bodies between their vertices, as bodies act on each other: a ball's
+    centre on triangles, at the distance less the radius; of a capsule its axis on edges and its ends on triangles; of a box
+    its twelve edges and eight corners; a cylinder as the prism whose edges lie on it, at most 0.12 widths within it. Energy
+    of a pair as of a vertex, m b(d) with m of `SelfContact`; the stiffness per area is multiplied by the triangle's area in
+    the mesh, or by a third of that of the triangles at the edge. None: it does where it is narrow, that is where a ball of
+    its least radius R, which touches a face whose longest edge in the mesh is L, could be nearer to it than to its corners
+    by more than 0.12 widths, (1.2 L)^2 > 6 R 0.12 width; a ball or a capsule also where faces are curved. That is decided
+    when the scene is built. Mesh obstacles always do so with what is sharp of them.
+    A face of ten-node tetrahedra is felt as the four triangles of its six nodes, and by pairs as many smaller ones as its
+    bow asks for; a warning says where it lies farther than half a width from triangles that act at nodes alone.
 
     Inputs with gradient: the shape's own numbers, "barrier_stiffness_per_area" or "barrier_stiffness", "barrier_width",
     with friction also "friction" and "friction_speed", with a path "<shape>_path", shape (steps + 1, 3), of a pose
@@ -102,10 +110,10 @@ class Obstacle(Term):
         name: str | None = None,
         stiffness_per_area: float | None = None,
         about: ArrayLike | None = None,
-        by_pairs: bool = False,
+        by_pairs: bool | None = None,
     ):
-        self.by_pairs = bool(by_pairs)
-        if self.by_pairs and self.all_primitives is None:
+        self.by_pairs = by_pairs
+        if by_pairs and self.all_primitives is None:
             raise ValueError(
                 f"{type(self).__name__}: by_pairs is for shapes of points and edges, and this one has none: leave it out"
             )
@@ -182,9 +190,10 @@ class Obstacle(Term):
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
         """With the width that the body asks for, and the stiffness per area that the fall from the start, the start's
         velocity, motions over the first second, and what presses on the body ask for."""
-        out = self
+        out = copy(self)
         if "barrier_width" in self.left_to_scene:
             out = self.with_input("barrier_width", value=chosen_width(scene.mesh))
+        out._decide_on_pairs(scene.mesh)
         if not self.chooses_stiffness:
             return out
         gravity = scene.term(Gravity)
@@ -211,6 +220,29 @@ class Obstacle(Term):
                 "must be; pass stiffness_per_area [N/m^3]"
             )
         return out.with_input(PER_AREA, value=stiffness)
+
+    def _decide_on_pairs(self, mesh) -> None:
+        """Choose whether it acts by pairs where that is left to the scene, its width being known."""
+        width, off = float(self.values["barrier_width"]), bow(mesh)
+        self.all_primitives = self.primitives_for(mesh, width)
+        is_whole = self.all_primitives is not None and self.all_primitives.whole
+        is_narrow = longest_edge(mesh) ** 2 > 6 * self.least_radius() * BOW * width
+        if self.by_pairs is None:
+            self.by_pairs = self.all_primitives is not None and (is_narrow or (is_whole and off > BOW * width))
+            if is_narrow and not self.by_pairs:
+                warn(
+                    f"{self!r} may be narrower than faces of the body, and acts at their vertices alone: give its class "
+                    "least_radius, how round it is [m], or all_primitives, its corners and edges, or pass by_pairs=False"
+                )
+        if off > 0.5 * width and not (self.by_pairs and is_whole):
+            warn(
+                f"faces of this mesh are curved, and lie up to {off:.3g} m from the triangles of their nodes, where "
+                f"{self!r} acts: refine the mesh where it is curved, or take a width of {2 * off:.3g} m or more"
+            )
+
+    def primitives_for(self, mesh, width: float) -> "Primitives | None":
+        """The corners and edges by which it acts on faces and edges of a body, with a barrier of a width [m]."""
+        return self.all_primitives
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         """Distance [m] of each position, shape (k, 3), to the obstacle as it was made; negative inside."""
@@ -265,7 +297,13 @@ class Obstacle(Term):
 
     @property
     def variant(self) -> tuple:
-        return self.has_friction, self.path is not None, self.per_area, self.turns, self.by_pairs
+        return self.has_friction, self.path is not None, self.per_area, self.turns
 
     def kernel(self, precision: str) -> ObstacleForce:
         return self.counterpart(precision, self.has_friction)
+
+
+def longest_edge(mesh) -> float:
+    """The longest that an edge of the body's triangles may be [m]: that of the mesh, stretched."""
+    x = mesh.vertices[mesh.surface_triangles]
+    return STRETCH * float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0))

@@ -20,7 +20,6 @@ class ObstacleForce(VertexForce):
     """Device counterpart of an obstacle: `count` numbers of its shape, then stiffness, width [, friction, friction_speed].
 
     per_area: whether stiffness is per area [N/m^3]; what is said here of a vertex is then said of one square metre.
-    by_pairs: whether what is narrower than faces acts on them by pairs (mechanics/surfaces/obstacle_corners.py).
     A shape writes one function, `distance_and_normal`, in numbers of a graph; everything else follows from it. Positions
     are relative to the obstacle: callers take its displacement from X. The numbers of one that turns end in the point that
     it turns about, and its X is seven numbers: a place, and the unit quaternion of its rotation. A change of X + u is then
@@ -30,13 +29,10 @@ class ObstacleForce(VertexForce):
     friction: bool = False
     per_area: bool = field(default=False, kw_only=True)
     turns: bool = field(default=False, kw_only=True)
-    by_pairs: bool = field(default=False, kw_only=True)
 
     count = 0
     watched = True
-    # what its distance says of a face between the face's corners: at least the least of theirs (hollow), that it lies on
-    # one side of each tangent plane (convex), or neither
-    hollow, convex = False, False
+    hollow = False  # whether no point of a triangle is nearer than its nearest corner
     lanes = False  # whether `distance_and_normal` also takes numbers in lanes
 
     @property
@@ -64,7 +60,7 @@ class ObstacleForce(VertexForce):
         g.first, g.corners = first, []
         p = [g.leaf(x) for x in self._numbers(parameters, first)]
         rest, moved = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (X, u))
-        if self.turns and length_of(X) == 7:  # not of a face's corners, which come as the obstacle was made
+        if self.turns and length_of(X) == 7:  # else X + u is a place as the obstacle was made
             moved, d, n = self._record_turned(g, p, let(X), rest, moved)
         else:
             d, n = self.distance_and_normal(g, p[: self.count], rest, moved)
@@ -158,11 +154,6 @@ class ObstacleForce(VertexForce):
         for k, (leaf, by) in enumerate(zip(leaves, adjoints)):
             row = getattr(leaf, "row", first + k)
             assign(at(sums, row, i), at(sums, row, i) + by)
-
-    @traced
-    def clearance(self, parameters, first, X, u):
-        """(n, d) with a distance d [m] within which the obstacle is surely not met."""
-        return self.contact_plane(parameters, first, X, u)
 
     @ti.func
     def width(self, parameters: ti.template(), first):
@@ -313,19 +304,12 @@ class ObstacleForce(VertexForce):
         return (*self.parted(adjoints, len(moved)), adjoints[len(moved) + 6], by)
 
     # ---- friction as a force of implicit passes, at the velocity v; felt: (X, u), the place where N and n are those of the
-    # barrier, or (None, N n), the normal force itself [N] -----------------------------------------------------------------
+    # barrier ------------------------------------------------------------------------------------------------------------
 
     @traced
     def _record_friction_force(self, parameters, first, felt, v, v_obstacle):
-        X, u = felt
-        if X is None:
-            g = Graph(self.fp, parameters)
-            p, place = [g.leaf(x) for x in self._numbers(parameters, first)], [g.leaf(at(u, d)) for d in range(3)]
-            push = g.sqrt(g.dot(place, place))
-            n = [x / push for x in place]
-        else:
-            g, p, place, d, n = self.record(parameters, first, X, u)
-            n, push = friction.normal_force(g, n, self.push(g, p, d))
+        g, p, place, d, n = self.record(parameters, first, *felt)
+        n, push = friction.normal_force(g, n, self.push(g, p, d))
         speed, v_obstacle = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, v_obstacle))
         return g, p, place, speed, v_obstacle, n, push
 

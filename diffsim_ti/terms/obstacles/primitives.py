@@ -20,6 +20,8 @@ class Primitives:
     points: np.ndarray
     edges: np.ndarray
 
+    whole = False  # whether they are all of the obstacle, so that nothing of it is felt by its distance alone
+
     def at(self, p: np.ndarray) -> tuple[np.ndarray, float]:
         raise NotImplementedError
 
@@ -35,6 +37,8 @@ class Primitives:
 @dataclass(frozen=True)
 class RoundPrimitives(Primitives):
     """Of all that is within a radius, the last number, of corners, the others."""
+
+    whole = True
 
     def at(self, p):
         return p[:-1].reshape(-1, 3), float(p[-1])
@@ -73,6 +77,47 @@ class BoxPrimitives(Primitives):
 BOX = BoxPrimitives(
     np.arange(8), np.array([[a, b] for a in range(8) for b in range(a + 1, 8) if (SIGNS[a] != SIGNS[b]).sum() == 1])
 )
+
+
+@dataclass(frozen=True)
+class PrismPrimitives(Primitives):
+    """Of a cylinder: start, end, radius; the edges of a prism of `sides` sides whose corners lie on it. across: a direction
+    that a first corner lies in, less its part along the axis."""
+
+    sides: int
+    across: np.ndarray
+
+    @classmethod
+    def of(cls, axis: np.ndarray, radius: float, off: float) -> "PrismPrimitives":
+        """Of a cylinder with an axis [m], from which it is off by so much at most [m]."""
+        n = max(8, int(np.ceil(np.pi / np.arccos(max(1 - off / radius, 0.0)))))
+        ring, following = np.arange(n), np.roll(np.arange(n), -1)
+        pairs = (ring, following), (n + ring, n + following), (ring, n + ring)
+        edges = np.concatenate([np.stack(pair, 1) for pair in pairs])
+        return cls(np.arange(2 * n), edges, n, np.eye(3)[np.abs(axis).argmin()])
+
+    def _corners(self, p):
+        """By operations that take complex numbers."""
+        start, end, radius = p[:3], p[3:6], p[6]
+        axis = (end - start) / np.sqrt(((end - start) ** 2).sum())
+        a = self.across - axis * (axis @ self.across)
+        a = a / np.sqrt((a**2).sum())
+        angle = 2 * np.pi * np.arange(self.sides) / self.sides
+        ring = radius * (np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * np.cross(axis, a))
+        return np.concatenate([start + ring, end + ring])
+
+    def _by_numbers(self, p) -> np.ndarray:
+        """Derivatives by the numbers, shape (7, corners, 3), exact by steps into the complex plane."""
+        return np.stack([self._corners(p + 1e-30j * row).imag / 1e-30 for row in np.eye(7)])
+
+    def at(self, p):
+        return self._corners(p), 0.0
+
+    def jvp(self, p, dp):
+        return np.einsum("m,mkd->kd", dp, self._by_numbers(p)), 0.0
+
+    def vjp(self, p, by_corners, by_radius):
+        return np.einsum("mkd,kd->m", self._by_numbers(p), by_corners)
 
 
 def _rotation(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
