@@ -62,7 +62,7 @@ class Together:
 
 
 class Reduced:
-    """The sets of a scene that move by few numbers.
+    """The sets of a scene that move by few numbers, and vertices that ties glue (glued.py).
 
     affine: displacements A X + t of the mesh's places X, twelve numbers, u = B q; `x -> of(x)` is the nearest such to any
     x, a projection. B is that of the mesh, whatever rest_positions a run takes.
@@ -80,7 +80,9 @@ class Reduced:
     of others, sets that are not known, lie in a plane, or share vertices with each other or with what is fixed.
     """
 
-    def __init__(self, mesh: TetrahedralMesh, given: Mapping[str, str | ArrayLike] | None, held: np.ndarray):
+    def __init__(
+        self, mesh: TetrahedralMesh, given: Mapping[str, str | ArrayLike] | None, held: np.ndarray, glued: tuple = ()
+    ):
         if not isinstance(given, Mapping | None):
             raise ValueError(f'reduced: must be {{name of a set: "affine", "rigid" or a basis}}, got {shown(given)}')
         self.bodies = tuple(self._body(mesh, name, kind) for name, kind in (given or {}).items())
@@ -93,6 +95,14 @@ class Reduced:
                     "vertex in common, and hold others"
                 )
             taken |= dict.fromkeys(map(int, body.vertices), repr(body.name))
+        for tie in glued:
+            both = np.intersect1d(tie.vertices, np.concatenate([[], *(body.vertices for body in self.bodies)]))
+            if len(both):
+                raise ValueError(
+                    f"{tie.name}: vertex {int(both[0])} is in a set of reduced= too, and moves by that alone; leave its "
+                    "faces out of the tie, or let the set end before them"
+                )
+        self.bodies += glued
 
     @staticmethod
     def _body(mesh: TetrahedralMesh, name: str, kind: str | ArrayLike) -> Together:
@@ -118,6 +128,16 @@ class Reduced:
 
     def __bool__(self) -> bool:
         return bool(self.bodies)
+
+    @property
+    def by_few(self) -> tuple[Together, ...]:
+        """Affine and rigid sets, which explicit kernels know."""
+        return tuple(body for body in self.bodies if body.kind in KINDS)
+
+    @property
+    def by_basis(self) -> tuple[Together, ...]:
+        """The others: what ties glue too."""
+        return tuple(body for body in self.bodies if body.kind not in KINDS)
 
     @property
     def rigid(self) -> tuple[Together, ...]:

@@ -320,7 +320,7 @@ class ExplicitWorkspace(Workspace):
     def _sizes(self) -> dict:
         """Numbers that all launches take."""
         a = self.arrays
-        out = dict(num_items=a.num_items, num_vertices=a.num_vertices, num_bodies=len(self.scene.reduced.bodies))
+        out = dict(num_items=a.num_items, num_vertices=a.num_vertices, num_bodies=len(self.scene.reduced.by_few))
         return out | a.counts
 
     def _rows(self) -> int:
