@@ -21,6 +21,7 @@ from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.mechanics.obstacles.face_contact_points import FaceContactPoints, has_face_contact
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies
+from diffsim_ti.mechanics.reduced.projected_sets import ProjectedSets
 from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance
@@ -176,6 +177,7 @@ class ExplicitWorkspace(Workspace):
         self.check_apart()
         self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
         self.volumes = VolumeConstraints(self) if self.scene.holds_volumes else None
+        self.projected = ProjectedSets(self) if self.scene.reduced.by_basis else None
         self.stages = stages_of(self)
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
