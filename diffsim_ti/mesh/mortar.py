@@ -20,8 +20,8 @@ FEW = 20_000  # pairs whose polygons are made at once
 
 @dataclass(frozen=True)
 class Mortar:
-    """D and M, sparse, of all vertices of the mesh; gap [m] between the surfaces, the largest; `covered`: which share of each
-    face of b lies on a, shape (k,)."""
+    """D and M, sparse, of all vertices of the mesh; gap [m] between the surfaces, the largest; `covered`: which share of
+    each face of b lies on a, shape (k,)."""
 
     D: object
     M: object

@@ -64,7 +64,9 @@ def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages
         lam = means[patches]
     dilatation, largest = (x.copy() for x in _squares_of_strains(scene, derived))
     within = scene.reduced.elements(scene.mesh.elements) if scene.reduced else []
-    together = [(body, own) for body, own in zip(scene.reduced.bodies, within) if body in scene.reduced.by_few and len(own)]
+    together = [
+        (body, own) for body, own in zip(scene.reduced.bodies, within) if body in scene.reduced.by_few and len(own)
+    ]
     for _, own in together:
         dilatation[own] = largest[own] = 0.0
     viscous = material.viscosities({name: values[name] for name in material.inputs})

@@ -76,7 +76,9 @@ class Reaction(Output):
         out = copy(self)
         if isinstance(self.support, Tie):
             if self.support not in (*scene.terms, *scene.arguments["terms"]):
-                raise ValueError(f"Reaction: the scene does not list {self.support!r}; pass the tie that is among its terms")
+                raise ValueError(
+                    f"Reaction: the scene does not list {self.support!r}; pass the tie that is among its terms"
+                )
             out.vertices = self.support.glued_vertices(scene.mesh)
             out.onto = scene.supports.freedom(scene.mesh.num_vertices)[out.vertices]
         else:

@@ -31,7 +31,10 @@ class Glued(Together):
     def of(cls, mesh: TetrahedralMesh, ties: Sequence[Tie], supports: Supports, moved: np.ndarray) -> "Glued":
         """moved: vertices with a prescribed motion."""
         D, M, followers = _coupled(mesh, ties)
-        own, fixed = np.unique(np.concatenate([followers, np.unique(M.indices)])), np.zeros((mesh.num_vertices, 3), bool)
+        own, fixed = (
+            np.unique(np.concatenate([followers, np.unique(M.indices)])),
+            np.zeros((mesh.num_vertices, 3), bool),
+        )
         at = np.isin(supports.vertices, own)
         held = supports.held[at]
         axes = np.round(np.diagonal(held, axis1=1, axis2=2)).astype(bool)
@@ -47,6 +50,10 @@ class Glued(Together):
                 "vertices that lie in no glued face"
             )
         fixed[supports.vertices[at]] = axes
+        if fixed[own].all():
+            raise ValueError(
+                f"{ties[0]!r}: all vertices of both surfaces are fixed, so that nothing is left to glue: leave it out"
+            )
         weights, known = [], {}
         for d in range(3):
             key = fixed[own, d].tobytes()

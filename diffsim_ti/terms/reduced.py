@@ -172,7 +172,7 @@ class Reduced:
     def describe(self) -> str:
         """In a line."""
         return ", ".join(
-            f"{b.name!r} {b.count} for {3 * len(b.vertices)}"
+            f"{b.name if b.kind == 'tie' else repr(b.name)} {b.count} for {3 * len(b.vertices)}"
             + ("" if b.follows_translations() else ", tied to its place")
             for b in self.bodies
         )

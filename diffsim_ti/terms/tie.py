@@ -50,8 +50,6 @@ class Tie(Term):
         super().__init__(name=name)
         self.a, self.b = a, b
         self.tolerance = None if tolerance is None else number("Tie: tolerance", tolerance, unit="m")
-        if self.tolerance is not None and not 0 < self.tolerance < np.inf:
-            raise ValueError(f"Tie: tolerance must be a length above 0 [m], got {tolerance!r}")
 
     def __repr__(self) -> str:
         said = [repr(x) if isinstance(x, str) else "faces" for x in (self.a, self.b)]

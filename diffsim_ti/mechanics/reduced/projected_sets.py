@@ -5,9 +5,10 @@ that they can have, and so do velocities:
 
     u' = P u*,    v' = P v*,    P = B G^-1 B^T M,    G = B^T M B
 
-That is the pass of the equations of motion in the numbers q of B, G q'' = B^T f: forces of constraint do no work, momentum is
-kept where B has the rigid motions, and the largest frequency is at most that of vertices by themselves. Frames show
-P (v + pre a). Derivatives by masses are dP x = S dM (x - P x) with S = B G^-1 B^T. Dense products with B in each pass.
+That is the pass of the equations of motion in the numbers q of B, G q'' = B^T f: forces of constraint do no work, momentum
+is kept where B has the rigid motions, and the largest frequency is at most that of vertices by themselves. Frames show
+P (v + pre a). Derivatives by masses are dP x = S dM (x - P x) with S = B G^-1 B^T. Each pass takes products with B, which is
+dense.
 """
 
 import weakref
@@ -15,6 +16,7 @@ from contextlib import contextmanager, nullcontext
 
 import numpy as np
 
+from diffsim_ti.common.blas_threads import one_blas_thread
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import VertexRows
@@ -54,8 +56,9 @@ class ProjectedSets(Stage):
     def mass(self) -> np.ndarray:
         return self.ws.arrays.values.mass[self.nodes]
 
+    @one_blas_thread
     def each(self, name: str, x: np.ndarray) -> np.ndarray:
-        """"P", "S" or "transposed" of vectors of all sets' vertices, shape (n, 3)."""
+        """ "P", "S" or "transposed" of vectors of all sets' vertices, shape (n, 3)."""
         values = self.ws.arrays.values
         parts = [slice(*ends) for ends in zip(self._first, self._first[1:])]
         if self._known[0] is not values:

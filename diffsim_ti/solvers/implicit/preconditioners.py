@@ -63,8 +63,9 @@ class BlockJacobi(Preconditioner):
 
 class BodyBlocks(BlockJacobi):
     """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, with inertia and
-    contact as they are; where its basis is of each component turned with it, as in multigrid.py. What ties glue takes the
-    blocks of its vertices. Of sets that do not deform q are shifts and turns (mechanics/reduced/rigid_sets.py), whose part of the body at rest turns with them, too."""
+    contact as they are; where its basis is of each component turned with it, as in multigrid.py. Of sets that do not deform
+    q are shifts and turns (mechanics/reduced/rigid_sets.py), whose part of the body at rest turns with them, too. What ties
+    glue takes the blocks of its vertices."""
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
         super().__init__(potential, mass, free, size, parallel)
