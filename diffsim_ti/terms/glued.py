@@ -19,9 +19,9 @@ class Glued(Together):
 
         C D u_f = C M u_c,    u_f = W u_c,
 
-    C being the identity on f, to which each row h adds its multiplier in equal parts to its neighbours in f: so constants are
-    among the multipliers, and constant stress goes through, up to the edge where both parts are fixed. With supports along
-    axes this is so of each component.
+    C being the identity on f, and of each h its multiplier in equal parts for the neighbours in f: so constants are among
+    the multipliers, and constant stress goes through, up to the edge where both parts are fixed. With supports along axes
+    this is so of each component.
     matrix: T, sparse, of all components of all vertices, which puts u_f in the place of what it eliminates.
     """
 
@@ -40,14 +40,14 @@ class Glued(Together):
         axes = np.round(np.diagonal(held, axis1=1, axis2=2)).astype(bool)
         if held.size and np.abs(held - axes[:, :, None] * np.eye(3)).max() > 1e-9:
             raise ValueError(
-                f"{ties[0]!r}: vertices of a tie may be fixed along x, y and z, and others are fixed along other directions; "
-                "fix them along axes, or leave their faces out of the tie"
+                f"{ties[0]!r}: vertices of a tie may be fixed along x, y and z, and here some are fixed along other "
+                "directions; fix them along axes, or leave their faces out of the tie"
             )
         driven = np.intersect1d(own, moved)
         if len(driven):
             raise ValueError(
-                f"{ties[0]!r}: motion= moves vertex {driven[0]} of a tie, whose fixed vertices have to stay where they are; move "
-                "vertices that lie in no glued face"
+                f"{ties[0]!r}: motion= moves vertex {driven[0]} of a tie, whose fixed vertices have to stay where they are; "
+                "move vertices that lie in no glued face"
             )
         fixed[supports.vertices[at]] = axes
         if fixed[own].all():
@@ -80,8 +80,8 @@ def _coupled(mesh: TetrahedralMesh, ties: Sequence[Tie]):
         for i in tie.glued_vertices(mesh):
             if int(i) in owner:
                 raise ValueError(
-                    f"{tie!r}: vertex {i} of b is glued by {owner[int(i)]!r} already; leave the faces out that both have, or "
-                    "exchange a and b of one"
+                    f"{tie!r}: vertex {i} of b is glued by {owner[int(i)]!r} already; leave the faces out that both have, "
+                    "or exchange a and b of one"
                 )
             owner[int(i)] = tie
         leader |= dict.fromkeys(np.unique(tie.faces(mesh, tie.a)).tolist(), tie)
@@ -89,7 +89,8 @@ def _coupled(mesh: TetrahedralMesh, ties: Sequence[Tie]):
         D, M = D + own.D, M + own.M
     for i in owner.keys() & leader.keys():
         raise ValueError(
-            f"{leader[i]!r}: vertex {i} of a is in b of {owner[i]!r}, and can follow one surface only; exchange a and b of one"
+            f"{leader[i]!r}: vertex {i} of a is in b of {owner[i]!r}, and so follows another surface; exchange a and b of "
+            "one, or leave the faces out"
         )
     return D, M, np.array(sorted(owner))
 

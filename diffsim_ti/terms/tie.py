@@ -18,16 +18,17 @@ class Tie(Term):
 
         int N_i (u_b - u_a) = 0 for the function N_i of each vertex i of b,    D u_b = M u_a
 
-    Displacements of b's vertices follow those of a's, u_b = D^-1 M u_a, and the forces on them go to these by the transpose:
-    no stiffness is chosen, steps stay as long as they were, momentum is kept, and linear displacements (constant stress) go
-    through exactly, of four and of ten nodes. Let b be the finer surface, and the one that lies wholly on the other.
+    Displacements of b's vertices follow those of a's, u_b = D^-1 M u_a, and the forces on them go to these by the
+    transpose: no stiffness is chosen, steps stay as long as they were, momentum is kept, and linear displacements (constant
+    stress) go through exactly, of four and of ten nodes. Let b be the finer surface, and one that lies wholly on a.
 
     a, b: name of a surface set, or of a vertex set whose faces are meant; several names, rows of `surface_triangles` or
-        triangles, shape (k, 3). tolerance [m]: how far apart they may lie, by default 5 % of the mean edge of b. What is left
-        of a gap stays as it is at rest while the body moves, and turns with it only in part.
-    Weights are those of the mesh's places and flat faces, whatever rest_positions a run takes. Vertices of a and b may be fixed
-    along axes, where they stand still at rest. `Reaction(tie)` is the force on b. Implicit solvers support all that acts beside
-    it; explicit ones obstacles with contact="force" and without friction. Self-contact takes glued faces for faces that meet.
+        triangles, shape (k, 3).
+    tolerance [m]: how far apart they may lie, by default 5 % of the mean edge of b. What is left of a gap, as between
+        facets of a curved surface, stays as it is at rest and does not turn with the body.
+    Weights are those of the mesh's places and flat faces, whatever rest_positions a run takes. Vertices of a and b may be
+    fixed along axes, where they stand still at rest. `Reaction(tie)` is the force on b. Explicit solvers take obstacles
+    beside it by contact="force" and without friction; SelfContact, for which the surfaces touch, goes with it in no solver.
 
     Raises ValueError for surfaces that do not meet, share vertices, or of which b lies on a in part only, for vertices of b
     that another tie has, and for fixed vertices that move or are fixed along a direction that is no axis.
@@ -71,8 +72,8 @@ class Tie(Term):
         shared = np.intersect1d(a, b)
         if len(shared):
             raise ValueError(
-                f"{self!r}: vertex {shared[0]} is in both surfaces ({len(shared)} are), which needs no glue there; name surfaces "
-                "of parts that share no vertices"
+                f"{self!r}: vertex {shared[0]} is in both surfaces ({len(shared)} are), which needs no glue there; name "
+                "surfaces of parts that share no vertices"
             )
         edge = float(np.linalg.norm(x[b[:, :3]] - x[np.roll(b[:, :3], 1, 1)], axis=2).mean())
         reach = 0.05 * edge if self.tolerance is None else self.tolerance
@@ -82,14 +83,14 @@ class Tie(Term):
             near = Mortar.of(x, b, a, 2 * edge)
             apart = f"they lie up to {near.gap:.3g} m apart, " if near.gap else "they do not face each other, "
             raise ValueError(
-                f"{self!r}: the surfaces do not meet within {reach:.3g} m: {apart}with edges of {edge:.3g} m; name faces that "
-                "lie on each other, move the parts together, or pass tolerance= [m]"
+                f"{self!r}: the surfaces do not meet within {reach:.3g} m: {apart}with edges of {edge:.3g} m; name faces "
+                "that lie on each other, move the parts together, or pass tolerance= [m]"
             )
         if part.any():
             raise ValueError(
-                f"{self!r}: {part.sum()} of {len(b)} faces of b lie on a in part only, or not within {reach:.3g} m, the first "
-                f"about {np.round(x[b[np.argmax(part), :3]].mean(0), 6).tolist()}: exchange a and b, or let b be only the faces "
-                "that lie wholly on a (mesh.with_surface_set)"
+                f"{self!r}: {part.sum()} of {len(b)} faces of b lie on a in part only, or not within {reach:.3g} m, the "
+                f"first about {np.round(x[b[np.argmax(part), :3]].mean(0), 6).tolist()}: exchange a and b, or let b be only "
+                "the faces that lie wholly on a (mesh.with_surface_set)"
             )
         return out
 
