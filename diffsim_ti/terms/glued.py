@@ -52,7 +52,7 @@ class Glued(Together):
         fixed[supports.vertices[at]] = axes
         if fixed[own].all():
             raise ValueError(
-                f"{ties[0]!r}: all vertices of both surfaces are fixed, so that nothing is left to glue: leave it out"
+                f"{ties[0]!r}: all vertices of both surfaces are fixed, which leaves nothing to glue: omit it"
             )
         weights, known = [], {}
         for d in range(3):

@@ -8,6 +8,7 @@ from diffsim_ti.common.checked import number
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.mortar import Mortar
 from diffsim_ti.mesh.named_sets import SetOrIndices
+from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, nonempty
 
 WHOLE = 0.99  # share of a face that is to lie on the other surface
@@ -79,7 +80,7 @@ class Tie(Term):
         reach = 0.05 * edge if self.tolerance is None else self.tolerance
         out = Mortar.of(x, b, a, reach)
         part = out.covered < WHOLE
-        if part.all():
+        if not out.covered.any():
             near = Mortar.of(x, b, a, 2 * edge)
             apart = f"they lie up to {near.gap:.3g} m apart, " if near.gap else "they do not face each other, "
             raise ValueError(
@@ -95,6 +96,11 @@ class Tie(Term):
         return out
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Tie":
+        if any(isinstance(term, SelfContact) for term in scene.terms):
+            raise ValueError(
+                f"{self!r}: glued surfaces touch, which SelfContact refuses; leave one of both out, or join the parts by "
+                "common nodes (mesh.merged)"
+            )
         out = copy(self)
         own = np.union1d(self.faces(scene.mesh, self.a), self.faces(scene.mesh, self.b))
         out.held = np.intersect1d(own, scene.held)
