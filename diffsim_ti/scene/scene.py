@@ -98,7 +98,7 @@ class Scene(MadeAgain):
         whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
         much was added. Implicit steps and static solves add none.
     reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, in every
-        solver. "rigid": by six, turned and moved, in every solver. Or a basis, in implicit and static solves: weights of a
+        solver. "rigid": by six, turned and moved, in every solver. Or a basis, in every solver: weights of a
         `designs.Cage`, the shapes of `modes`. Of a start only the admissible motions of a set count (reduced.py).
 
     Raises ValueError with rule, value and remedy for what no solver takes, and runs no kernel. What one kind of solver does

@@ -67,13 +67,13 @@ class Reduced:
     affine: displacements A X + t of the mesh's places X, twelve numbers, u = B q; `x -> of(x)` is the nearest such to any
     x, a projection. B is that of the mesh, whatever rest_positions a run takes.
     rigid: places R X + t of the rest positions X of a run, six numbers. A start is the nearest such (inputs/rigid_start.py).
-    a basis, in implicit steps and static solves, of all the mesh's vertices, of which those of the set count: m
-    functions for each component, shape (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m
-    fields of displacements, (m, num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
+    a basis, of all the mesh's vertices, of which those of the set count: m functions for each component, shape
+    (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m fields of displacements, (m,
+    num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
 
     The set moves by u = B q alone, so that forces do what B^T f says, and what B lacks is held as by a support. Linear
-    momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule, where
-    it is of each component and has X, too, as cages have; both of rigid sets. Modes of a body that is held have neither:
+    momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule and explicit
+    steps, where it is of each component and has X, too, as cages have; both of rigid sets. Modes of a body that is held have neither:
     they are for what stays where it is and does not turn far.
 
     Raises ValueError for what is no {name: kind or basis}, bases of other shapes or of which some are all but combinations
