@@ -72,9 +72,9 @@ class Reduced:
     num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
 
     The set moves by u = B q alone, so that forces do what B^T f says, and what B lacks is held as by a support. Linear
-    momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule and explicit
-    steps, where it is of each component and has X, too, as cages have; both of rigid sets. Modes of a body that is held have neither:
-    they are for what stays where it is and does not turn far.
+    momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule and
+    explicit steps, where it is of each component and has X, too, as cages have; both of rigid sets. Modes of a body that is
+    held have neither: they are for what stays where it is and does not turn far.
 
     Raises ValueError for what is no {name: kind or basis}, bases of other shapes or of which some are all but combinations
     of others, sets that are not known, lie in a plane, or share vertices with each other or with what is fixed.
