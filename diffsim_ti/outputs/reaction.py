@@ -57,7 +57,7 @@ class Reaction(Output):
 
     def __init__(
         self,
-        support: "SetOrIndices | Tie | None" = None,
+        support: SetOrIndices | Tie | None = None,
         name: str = "reaction",
         about: ArrayLike | None = None,
         per_vertex: bool = False,
