@@ -10,6 +10,7 @@ from test_term_order import SOLVERS
 
 import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
+from diffsim_ti.solvers.implicit.preconditioners import BodyBlocks, Preconditioner
 
 LAW = ds.StableNeoHookean(1e5, 0.3)
 box = ds.TetrahedralMesh.create_box
@@ -110,6 +111,20 @@ def test_three_parts_in_a_row_and_a_shared_surface():
     scene = ds.Scene(mesh, LAW, terms=[*ties, pull], fixed="low_ymin", precision="f64")
     frames = equilibrium(scene, outputs=[ds.Reaction(tie, name=f"tie{k}") for k, tie in enumerate(ties)])
     np.testing.assert_allclose([frames[f"tie{k}"][-1, 1] for k in range(3)], [-1e3, 0.0, -1e3], atol=1e-5)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_every_preconditioner_leads_to_the_same_equilibrium(order, monkeypatch):
+    """Blocks and multigrid, and the factorisation that takes the place of what is too slow."""
+    scene, ends = scene_of([ds.Gravity((0, -0.5, 0))], halves(order), fixed="left_xmin"), []
+    for preconditioner, patience in (("block_jacobi", 10**9), ("multigrid", 10**9), ("block_jacobi", 1)):
+        monkeypatch.setattr(Preconditioner, "patience", patience)
+        monkeypatch.setattr(BodyBlocks, "patience", patience)
+        solver = ds.StaticSolver(scene, tolerance=1e-11, preconditioner=preconditioner)
+        ends.append(ds.Rollout(solver, 1, gradients=[]).forward().displacements[-1])
+    assert np.abs(ends[0]).max() > 0.01
+    for end in ends[1:]:
+        np.testing.assert_allclose(end, ends[0], atol=1e-8)
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------

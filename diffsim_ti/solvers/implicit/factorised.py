@@ -82,7 +82,7 @@ class Factorised:
         matrix = hessian(operator).tocsc()
         self._eliminate = getattr(free, "elimination", None)
         if self._eliminate is not None:
-            matrix = _eliminated(matrix, self._eliminate)
+            matrix = eliminated(matrix, self._eliminate)
         matrix.eliminate_zeros()
         self._solve, self._free, self._along, self.negative = None, free, None, 0
         pivoting = 0.0 if symmetric else 0.1
@@ -118,7 +118,7 @@ class Factorised:
         return (out if T is None else T @ out).reshape(-1, 3) * self._free
 
 
-def _eliminated(matrix, T):
+def eliminated(matrix, T):
     """T^T A T, with a diagonal in the place of what T leaves out."""
     from scipy.sparse import diags
 
