@@ -239,7 +239,8 @@ def test_what_is_refused_works_as_said():
         scene_of(mesh=apart, tie=ds.Tie("a_xmax", "b_xmin"))
     with pytest.raises(ValueError, match="exchange a and b"):
         scene_of(mesh=apart, tie=ds.Tie("b_xmin", "a_xmax", tolerance=0.1))
-    scene_of(mesh=apart, tie=ds.Tie("a_xmax", "b_xmin", tolerance=0.1))
+    with pytest.warns(UserWarning, match="up to 0.05 m apart, .* does not turn with the body"):
+        scene_of(mesh=apart, tie=ds.Tie("a_xmax", "b_xmin", tolerance=0.1))
     smooth, rough = ([ds.Ground(-1.0, stiffness=1e4, width=0.1, friction=mu)] for mu in (0.0, 0.5))
     with pytest.raises(ValueError, match='pass contact="force"'):
         ds.SemiImplicitSolver(scene_of(smooth), 1e-3)

@@ -5,6 +5,7 @@ from copy import copy
 import numpy as np
 
 from diffsim_ti.common.checked import number
+from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.mortar import Mortar
 from diffsim_ti.mesh.named_sets import SetOrIndices
@@ -12,6 +13,7 @@ from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, nonempty
 
 WHOLE = 0.99  # share of a face that is to lie on the other surface
+NARROW = 1e-3  # of an edge: gaps beyond are said
 
 
 class Tie(Term):
@@ -92,6 +94,11 @@ class Tie(Term):
                 f"{self!r}: {part.sum()} of {len(b)} faces of b lie on a in part only, or not within {reach:.3g} m, the "
                 f"first about {np.round(x[b[np.argmax(part), :3]].mean(0), 6).tolist()}: exchange a and b, or let b be only "
                 "the faces that lie wholly on a (mesh.with_surface_set)"
+            )
+        if out.gap > NARROW * edge:
+            warn(
+                f"{self!r}: the surfaces lie up to {out.gap:.3g} m apart, {100 * out.gap / edge:.2g} % of an edge; the gap stays "
+                "as it is at rest and does not turn with the body: let the surfaces meet where it turns far"
             )
         return out
 

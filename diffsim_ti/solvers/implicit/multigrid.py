@@ -21,7 +21,7 @@ class Multigrid(Preconditioner):
     The V-cycle over it is cycle.py's.
     Below ten-node tetrahedra lie the linear ones of their corners, and aggregates of these (p-multigrid): aggregates of all
     ten nodes take half as many iterations again.
-    Of ties (terms/glued.py) the matrix is T^T K T, with the large weights of T alone, and residuals and corrections take all.
+    Of ties (terms/glued.py) the matrix is T^T K T, with the large weights of T alone; residuals and corrections take all.
     Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142; Heys,
     Manteuffel, McCormick, Olson 2005, Algebraic multigrid for higher-order finite elements, doi:10.1016/j.jcp.2004.09.021.
     """
