@@ -97,8 +97,8 @@ class Tie(Term):
             )
         if out.gap > NARROW * edge:
             warn(
-                f"{self!r}: the surfaces lie up to {out.gap:.3g} m apart, {100 * out.gap / edge:.2g} % of an edge; the gap stays "
-                "as it is at rest and does not turn with the body: let the surfaces meet where it turns far"
+                f"{self!r}: the surfaces lie up to {out.gap:.3g} m apart, {100 * out.gap / edge:.2g} % of an edge; the gap "
+                "stays as it is at rest and does not turn with the body: let the surfaces meet where it turns far"
             )
         return out
 
