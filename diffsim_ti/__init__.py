@@ -109,6 +109,7 @@ from diffsim_ti.terms import (
     Sphere,
     Spring,
     SurfaceDrag,
+    Tie,
     Traction,
 )
 from diffsim_ti.torch_bridge.ensemble import Ensemble
@@ -120,7 +121,7 @@ __all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "Initi
 __all__ += ["Ogden", "Orthotropic", "FibreReinforced", "KelvinVoigt"]
 __all__ += ["Prony", "Gravity", "Drag", "ExternalForce", "Traction", "Pressure", "GasChamber", "FilledChamber"]
 __all__ += ["BodyForce", "Spring", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
-__all__ += ["Growth", "Muscle"]
+__all__ += ["Growth", "Muscle", "Tie"]
 __all__ += ["SelfContact", "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "Pose"]
 __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", "ImplicitEulerSolver"]
 __all__ += ["ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Rollout", "Frames", "Batch"]

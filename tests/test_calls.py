@@ -110,6 +110,7 @@ def calls() -> dict:
         "Growth": (ds.Growth, dict(growth=0.1, tetrahedra=None, per="all", name=None)),
         "RotatingFrame": (ds.RotatingFrame, dict(angular_velocity=[0, 1, 0], center=[0, 0, 0], name=None)),
         "SurfaceDrag": (ds.SurfaceDrag, dict(density=1.0, normal=1.0, tangential=0.1, stream=[0, 0, 0], surface=None)),
+        "Tie": (tied, dict(a="body_0_xmax", b="body_1_xmin", tolerance=None, name=None)),
         "MeshObstacle": (
             ds.MeshObstacle,
             dict(vertices=[[0, -3, 0], [1, -3, 0], [0, -3, 1], [0, -4, 0]], triangles=TETRAHEDRON, resolution=4) | wall,
@@ -161,6 +162,13 @@ def runs() -> dict:
 def of_motion(**arguments):
     """A motion as a scene takes it, which asks it for places."""
     return objects()["scene"].replace(fixed="xmin", motion=ds.Pose(**arguments))
+
+
+def tied(**arguments):
+    """Two cubes that a scene glues."""
+    mesh = objects()["mesh"]
+    both = ds.TetrahedralMesh.joined([mesh, mesh.translated([1, 0, 0])])
+    return objects()["scene"].replace(mesh=both, terms=[ds.Tie(**arguments)])
 
 
 def output_of(kind):

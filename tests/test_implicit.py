@@ -477,7 +477,7 @@ def test_blas_is_left_as_it_was():
     """One thread while a step is solved, also if it fails; before and after it what the program chose."""
     from threadpoolctl import ThreadpoolController, threadpool_limits
 
-    from diffsim_ti.solvers.implicit.threads import one_blas_thread
+    from diffsim_ti.common.blas_threads import one_blas_thread
 
     def threads():
         return [pool["num_threads"] for pool in ThreadpoolController().select(user_api="blas").info()]

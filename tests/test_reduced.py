@@ -108,9 +108,12 @@ def test_modes_ring_as_the_whole_body_does():
     scene = scene.replace(initial_velocities=0.02 * shapes.sum(0))
     ends = []
     for reduced in (None, {"free": shapes}):
-        solver = ds.ImplicitMidpointSolver(scene.replace(reduced=reduced), dt=5e-3, tolerance=1e-12)
-        ends.append(ds.Rollout(solver, 20, gradients=[]).forward().displacements[-1])
-    assert np.abs(ends[1] - ends[0]).max() < 1e-9 * np.abs(ends[0]).max()
+        scene = scene.replace(reduced=reduced)
+        solvers = ds.ImplicitMidpointSolver(scene, dt=5e-3, tolerance=1e-12), ds.VelocityVerletSolver(scene, dt=5e-4)
+        for solver, steps in zip(solvers, (20, 200)):
+            ends.append(ds.Rollout(solver, steps, gradients=[]).forward().displacements[-1])
+    for whole, few in (ends[::2], ends[1::2]):
+        assert np.abs(few - whole).max() < 1e-9 * np.abs(whole).max()
     assert "'free' 3 for 36, tied to its place" in solver.scene.describe()
 
 
@@ -259,9 +262,22 @@ def test_refused(reduced, options, words):
 
 @pytest.mark.parametrize("kind", ["functions", "fields"])
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
-def test_explicit_steps_refuse_bases(solver, kind):
-    with pytest.raises(ValueError, match="explicit steps support affine and rigid sets.*take an implicit solver"):
-        solver(scene_of({"shell": motions(kind, bar())}), dt=1e-5)
+def test_gradients_of_bases_in_explicit_steps(solver, kind):
+    """Functions of all affine motions go on as an affine set does."""
+    start = dict(fixed="xmin", initial_velocities=np.random.default_rng(1).standard_normal((16, 3)))
+    density = 1000.0 * np.linspace(0.5, 1.5, bar().num_tetrahedra)
+    scene = scene_of({"shell": motions(kind, bar())}, **start).replace(density=density)
+    rollout = ds.Rollout(solver(scene, dt=1e-4), 5, gradients="all")
+    assert ds.dot_product_test(rollout) < 1e-12
+    frames, way = rollout.forward(), 1e-3 * np.sin(np.arange(len(density)))
+    found = rollout.vjp(frames, np.cos(frames.positions))["density"] @ way
+    ends = [rollout.forward(density=density + s * way).positions for s in (1, -1)]
+    assert found == pytest.approx((np.sin(ends[0]).sum() - np.sin(ends[1]).sum()) / 2, rel=1e-6)
+    if kind == "functions":
+        X = bar().vertices
+        sets = [scene_of({"shell": basis}, **start) for basis in ("affine", np.column_stack([np.ones(len(X)), X]))]
+        pair = [ds.Rollout(solver(scene, dt=1e-4), 5, gradients=[]).forward().positions for scene in sets]
+        np.testing.assert_allclose(pair[0], pair[1], atol=1e-13)
 
 
 def test_modes_refuse():

@@ -81,6 +81,7 @@ def parts() -> int:
         ds.Growth(0.01),
         ds.Muscle((1.0, 0.0, 0.0), 1e3, activation=0.5),
         ds.SelfContact(width=1e-3),
+        ds.Tie("xmax", "xmin", tolerance=1e-4),
         spring,
         cable,
         ball,

@@ -167,20 +167,49 @@ def _connections(vertices: np.ndarray, elements: np.ndarray, size: float) -> lis
         out.append(Finding(what, "a crack that is meant is fine; else take mesh.merged()"))
     if len(names) > 1 and (touching := _touching(vertices, elements, piece, size)):
         what = f"{counted(touching, 'vertex lies', 'vertices lie')} on faces of another piece, without a node there"
-        out.append(Finding(what, "mesh both parts with common nodes (in Gmsh: fragment), or leave them to contact"))
-    _, order, same = sorted_faces(elements[:, :4], len(vertices))
-    first, second = order[:-1][same] // 4, order[1:][same] // 4
-    solid = components(first, second, len(elements))
-    hinges = len(np.unique(solid)) - len(names)
-    if hinges > 0:
-        pairs = np.unique(np.stack([elements[:, :4].ravel(), np.repeat(solid, 4)], 1), axis=0)
-        shared = np.nonzero(np.bincount(pairs[:, 0]) > 1)[0]
-        what = (
-            f"{counted(hinges, 'hinge')}: parts hang together by an edge or a vertex alone, at vertices "
-            f"{shared[:6].tolist()}{' ...' if len(shared) > 6 else ''}"
+        out.append(
+            Finding(
+                what,
+                "mesh both parts with common nodes (in Gmsh: fragment), glue them by ds.Tie, or leave them to contact",
+            )
         )
-        out.append(Finding(what, "such parts turn freely about it; give them common faces"))
-    return out
+    return out + hinges(elements, len(vertices))
+
+
+def hinges(elements: np.ndarray, num_vertices: int) -> list[Finding]:
+    """Where parts share an edge or a vertex and no face: none or one."""
+    _, order, same = sorted_faces(elements[:, :4], num_vertices)
+    solid = components(order[:-1][same] // 4, order[1:][same] // 4, len(elements))
+    if not solid.any():
+        return []
+    pairs = np.unique(elements[:, :4].astype(np.int64) * len(elements) + solid[:, None])
+    vertex, part = np.divmod(pairs, len(elements))
+    joint = vertex[1:] == vertex[:-1]
+    count = solid.max() - components(part[:-1][joint], part[1:][joint], solid.max() + 1).max()
+    if not count:
+        return []
+    at = np.unique(vertex[1:][joint])
+    what = (
+        f"{counted(count, 'hinge')}: parts hang together by an edge or a vertex alone, at vertices "
+        f"{at[:6].tolist()}{' ...' if len(at) > 6 else ''}"
+    )
+    return [Finding(what, "such parts turn freely about it; give them common faces")]
+
+
+def is_manifold(triangles: np.ndarray) -> bool:
+    """Whether a closed surface, shape (k, 3), meets itself at no edge and no vertex: each edge has two triangles, and those
+    about each vertex go round it once."""
+    start, end = triangles.ravel(), np.roll(triangles, -1, 1).ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = np.lexsort((high, low))
+    low, high = low[order], high[order]
+    again = (low[1:] == low[:-1]) & (high[1:] == high[:-1])
+    if len(order) % 2 or not again[::2].all() or again[1::2].any():
+        return False
+    here, there = order[::2], order[1::2]  # corners of two triangles, from which their common edge goes
+    after = np.arange(len(start)).reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    fans = components(np.concatenate([here, after[here]]), np.concatenate([after[there], there]), len(start))
+    return len(np.unique(fans)) == len(np.unique(start))
 
 
 def _touching(vertices: np.ndarray, elements: np.ndarray, piece: np.ndarray, size: float) -> int:

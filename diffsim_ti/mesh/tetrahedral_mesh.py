@@ -17,7 +17,16 @@ from diffsim_ti.common.public import Public, public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
-from diffsim_ti.mesh.doctor import COINCIDING, Findings, coinciding, coinciding_of_pieces, counted, findings
+from diffsim_ti.mesh.doctor import (
+    COINCIDING,
+    Findings,
+    coinciding,
+    coinciding_of_pieces,
+    counted,
+    findings,
+    hinges,
+    is_manifold,
+)
 from diffsim_ti.mesh.elements import Elements
 from diffsim_ti.mesh.exchange import Exchange
 from diffsim_ti.mesh.grid import box
@@ -88,6 +97,9 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
                 f"({self.num_pieces} pieces): if these are one body, take mesh.merged(); where they are meant to touch, "
                 "TetrahedralMesh.joined says so"
             )
+        if not is_manifold(self.surface_faces[:, :3]):
+            for hinge in hinges(self.elements, self.num_vertices):
+                warn(str(hinge))
         warn_of_rounding("vertices", given, self, "give them in float64")
 
     @classmethod
@@ -156,7 +168,8 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
             raise ValueError("joined needs at least one mesh, got none")
         vertices, tetrahedra, sets = join(parts, list(meshes) if named else [f"body_{k}" for k in range(len(parts))])
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "[0-9]+ (vertex coincides|vertices coincide)")
+            for said in ("(vertex coincides|vertices coincide)", "hinge"):  # of each body by itself
+                warnings.filterwarnings("ignore", f"[0-9]+ {said}")
             return cls(vertices, tetrahedra, **sets)
 
     # What it consists of

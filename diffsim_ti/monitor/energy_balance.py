@@ -102,8 +102,8 @@ class EnergyBalance:
     def _begin(self, first: int, num_passes: int, level: float | None) -> None:
         if self.ws.arrays.features().driven:
             runtime.fill(self.ws.contact.work, 0)
-        if self.ws.volumes:
-            self.ws.volumes.work = 0.0
+        for stage in self._constraints:
+            stage.work = 0.0
         self.window = Window(first, num_passes, self.ws.changes, self.ws.substep, level)
         if level is None and self.ws.arrays.features().moving:
             self.ws.place_obstacles(first)
@@ -122,8 +122,7 @@ class EnergyBalance:
     def _check(self, now: int, num_passes: int) -> None:
         window, features = self.window, self.ws.arrays.features()
         work = self._noted_work() if features.driven else 0.0
-        if self.ws.volumes:
-            work += self.ws.volumes.work
+        work += sum(stage.work for stage in self._constraints)
         if window.level is None:
             window.level = self._level_at_start(window)
         level = self._level(now, num_passes)
@@ -132,6 +131,11 @@ class EnergyBalance:
             self._lowest = min(self._lowest, self._risen)
             self.gained = max(self.gained, self._risen - self._lowest)
         self._begin(now, num_passes, level)
+
+    @property
+    def _constraints(self) -> list:
+        """Stages that count the work of what they do to velocities."""
+        return [stage for stage in (self.ws.volumes, self.ws.projected) if stage]
 
     def _noted_work(self) -> float:
         """By passes, of loads, walls and what holds the body [J]."""
@@ -176,6 +180,8 @@ class EnergyBalance:
         forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes, pulls=not self.steady) + weight
         if a.bodies:  # without what holds them together
             forces = a.bodies.pulled(forces, u)
+        if ws.projected:
+            forces = ws.projected.pulled(forces)
         if ws.solver.lags(now, num_passes):
             swapped = 0.5 * h * float((v * forces).sum())
         else:

@@ -15,6 +15,7 @@ from diffsim_ti.scene import Scene
 from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.viscous_stages import ViscousStages
 from diffsim_ti.terms.mass_scaling import row_sums
+from diffsim_ti.terms.reduced import KINDS
 
 ONE = ViscousStages()
 
@@ -64,7 +65,7 @@ def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages
         lam = means[patches]
     dilatation, largest = (x.copy() for x in _squares_of_strains(scene, derived))
     within = scene.reduced.elements(scene.mesh.elements) if scene.reduced else []
-    together = [(body, own) for body, own in zip(scene.reduced.bodies, within) if body.kind != "basis" and len(own)]
+    together = [(body, own) for body, own in zip(scene.reduced.bodies, within) if body.kind in KINDS and len(own)]
     for _, own in together:
         dilatation[own] = largest[own] = 0.0
     viscous = material.viscosities({name: values[name] for name in material.inputs})

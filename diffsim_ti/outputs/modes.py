@@ -167,13 +167,16 @@ def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values
         raise ValueError(f"modes: scene must be a Scene, got {shown(scene)}")
     if scene.precision != "f64":
         scene = scene.replace(precision="f64")
-    if scene.reduced:
+    if any(body.kind != "tie" for body in scene.reduced.bodies):
         raise ValueError(
             "modes: a scene with sets that are reduced= has no modes here; leave it out for those of all vertices"
         )
     u = scene.checked_displacements(displacements)
     scene = scene.with_consistent_mass().with_values(values)
     free = free_directions(scene)
+    for tie in scene.reduced.bodies:
+        free = (tie.matrix @ free).tocsc()
+        free = free[:, np.diff(free.indptr) > 0]
     count = free.shape[1]
     if k not in range(1, count + 1) or isinstance(k, bool):
         raise ValueError(f"modes: k must be a whole number of 1 .. {count}, the free unknowns, got {shown(k)}")
@@ -182,7 +185,7 @@ def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values
     scale = 1 / np.sqrt(abs(free).T.power(2) @ mass.diagonal())
     K = free.T @ scene.stiffness_matrix(u) @ free
     A = diags(scale) @ (0.5 * (K + K.T)) @ diags(scale)
-    M = diags(scale) @ (free.T @ mass @ free) @ diags(scale) if scene.mesh.order == 2 else None  # else the identity
+    M = diags(scale) @ (free.T @ mass @ free) @ diags(scale) if scene.mesh.order == 2 or scene.reduced else None
     size = float(abs(A).sum(1).max())
     if count <= DENSE or 3 * k >= count:
         values, vectors = eigh(A.toarray(), None if M is None else M.toarray(), subset_by_index=[0, k - 1])

@@ -12,6 +12,7 @@ from diffsim_ti.outputs.applied_loads import AppliedLoads
 from diffsim_ti.outputs.body_forces import BodyForces
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.terms import Tie
 
 if TYPE_CHECKING:
     from diffsim_ti.rollout.frames import Frames
@@ -33,6 +34,8 @@ class Reaction(Output):
     says of it.
 
     support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
+        Or a `Tie` of the scene: the force on its surface b, which the vertices there feel where no support holds them,
+        without their inertia.
     about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
         `mesh.vertex_indices(support)`. name: how a loss calls it.
     The gradient is exact by all inputs. In single precision a reaction is the small sum of large forces of stress: it has an
@@ -54,7 +57,7 @@ class Reaction(Output):
 
     def __init__(
         self,
-        support: SetOrIndices | None = None,
+        support: SetOrIndices | Tie | None = None,
         name: str = "reaction",
         about: ArrayLike | None = None,
         per_vertex: bool = False,
@@ -71,15 +74,23 @@ class Reaction(Output):
 
     def settled(self, scene: "Scene") -> "Reaction":
         out = copy(self)
-        out.vertices = scene.held if self.support is None else scene.mesh.vertex_indices(self.support)
-        loose = np.setdiff1d(out.vertices, scene.held)
-        if len(out.vertices) == 0 or len(loose):
-            raise ValueError(
-                f"Reaction: the support must be among the fixed vertices, but {len(loose) or 'all'} of its "
-                f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
-            )
+        if isinstance(self.support, Tie):
+            if self.support not in (*scene.terms, *scene.arguments["terms"]):
+                raise ValueError(
+                    f"Reaction: the scene does not list {self.support!r}; pass the tie that is among its terms"
+                )
+            out.vertices = self.support.glued_vertices(scene.mesh)
+            out.onto = scene.supports.freedom(scene.mesh.num_vertices)[out.vertices]
+        else:
+            out.vertices = scene.held if self.support is None else scene.mesh.vertex_indices(self.support)
+            loose = np.setdiff1d(out.vertices, scene.held)
+            if len(out.vertices) == 0 or len(loose):
+                raise ValueError(
+                    f"Reaction: the support must be among the fixed vertices, but {len(loose) or 'all'} of its "
+                    f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
+                )
+            out.onto = scene.supports.projectors(out.vertices, self.support)
         out.scene, out.body, out.loads = scene, BodyForces(scene), AppliedLoads(scene, moving=True)
-        out.onto = scene.supports.projectors(out.vertices, self.support)
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:

@@ -23,7 +23,8 @@ from diffsim_ti.mechanics.interactions import NUMBERS, interactions_of
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.sets import values_of_sets
 from diffsim_ti.scene.locking import LOCKING_RATIO, warn_if_locking
-from diffsim_ti.terms import Chamber, Drag, Gravity, Growth, Obstacle, SelfContact, Term
+from diffsim_ti.terms import Chamber, Drag, Gravity, Growth, Obstacle, SelfContact, Term, Tie
+from diffsim_ti.terms.glued import Glued
 from diffsim_ti.terms.mass_scaling import MassScaling
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
@@ -99,7 +100,7 @@ class Scene(MadeAgain):
         whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
         much was added. Implicit steps and static solves add none.
     reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, in every
-        solver. "rigid": by six, turned and moved, in every solver. Or a basis, in implicit and static solves: weights of a
+        solver. "rigid": by six, turned and moved, in every solver. Or a basis, in every solver: weights of a
         `designs.Cage`, the shapes of `modes`. Of a start only the admissible motions of a set count (reduced.py).
 
     Raises ValueError with rule, value and remedy for what no solver takes, and runs no kernel. What one kind of solver does
@@ -143,8 +144,10 @@ class Scene(MadeAgain):
         self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
-        self.reduced = Reduced(mesh, reduced, self.held)
         self.motion, (self.posed_supports, self.translates) = motion, self.supports.parts_of(motion)
+        ties = tuple(term for term in self.terms if isinstance(term, Tie))
+        glued = (Glued.of(mesh, ties, self.supports, self.supports.moved(motion)),) if ties else ()
+        self.reduced = Reduced(mesh, reduced, self.held, glued)
         self._check_terms()
         self._given = self.arguments["terms"] = self.terms
         settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)

@@ -21,7 +21,7 @@ def stable_dt(scene: Scene, tight: bool = True) -> StepLimit:
     without contact (`element_limit`), which needs no kernels and is smaller. Obstacles limit no step unless a solver is told
     contact="force"; that solver's own `stable_dt(tight=True)` knows them. Scenes with sets that are `reduced`, for which
     explicit solvers take contact="force" alone, have those obstacles counted that press at the start; sets that move by a
-    basis, which implicit steps alone support, count as if their vertices were free, which errs on the safe side.
+    basis, and what ties glue, count as if their vertices were free, which errs on the safe side.
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
@@ -44,9 +44,6 @@ class _AtStart(SemiImplicitSolver):
 def start_workspace(scene: Scene, of: Callable[[Scene, dict], dict] = lambda scene, values: values) -> Workspace:
     """A workspace of the scene at its start, with what `of` makes of its values; every explicit solver with its default
     contact has the same stiffness."""
-    kinds = {body.name: body.kind for body in scene.reduced.bodies}
-    if "basis" in kinds.values():
-        scene = scene.replace(reduced={name: kind for name, kind in kinds.items() if kind != "basis"})
     contact = "force" if scene.reduced else "stage"
     # motions are asked for their values at 0 and dt
     solver = _AtStart(scene, dt=1e-9, check_start=False, contact=contact)

@@ -56,7 +56,7 @@ class SceneArrays:
             motion=scene.motion is not None,
             partly_fixed=bool(len(scene.supports.partly_fixed)),
             num_parameters=rows.total,
-            reduced=presses and bool(scene.reduced),
+            reduced=presses and bool(scene.reduced.by_few),
             rigid=presses and bool(scene.reduced.rigid),
         )
         self.with_stress = scene.reduced.with_stress(mesh.elements, scene.volume)

@@ -28,7 +28,7 @@ class BodyArrays:
     """Of a scene, on the device."""
 
     def __init__(self, scene, fp, vector):
-        self.bodies, self.fp, self.vector, mesh = scene.reduced.bodies, fp, vector, scene.mesh
+        self.bodies, self.fp, self.vector, mesh = scene.reduced.by_few, fp, vector, scene.mesh
         members = [body.vertices for body in self.bodies]
         self.first = np.cumsum([0, *map(len, members)])
         self.vertices = np.concatenate(members)

@@ -20,12 +20,14 @@ from diffsim_ti.terms.rotating_frame import RotatingFrame
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.surface_drag import SurfaceDrag
 from diffsim_ti.terms.term import Term, VertexForce
+from diffsim_ti.terms.tie import Tie
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
 LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, Muscle)
 LOADS += (Growth, ElasticFoundation)
-TERMS = (Gravity, Drag, RotatingFrame, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact)
+TERMS = (Gravity, Drag, RotatingFrame, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact, Tie)
 __all__ = ["Anchor", "BodyForce", "Box", "Cable", "Capsule", "Chamber", "Cylinder", "Drag", "ElasticFoundation"]
 __all__ += ["ExternalForce", "FilledChamber", "GasChamber", "Gravity", "Ground", "Growth", "HalfSpace", "Load"]
 __all__ += ["MeshObstacle", "Muscle", "OBSTACLES", "Obstacle", "Pose", "Pressure", "SelfContact", "Sphere", "Spring"]
-__all__ += ["RotatingFrame", "SurfaceDrag", "Term", "TERMS", "Traction", "VertexForce"]
+__all__ += ["RotatingFrame", "SurfaceDrag", "Term", "TERMS", "Tie", "Traction"]
+__all__ += ["VertexForce"]

@@ -62,25 +62,27 @@ class Together:
 
 
 class Reduced:
-    """The sets of a scene that move by few numbers.
+    """The sets of a scene that move by few numbers, and vertices that ties glue (glued.py).
 
     affine: displacements A X + t of the mesh's places X, twelve numbers, u = B q; `x -> of(x)` is the nearest such to any
     x, a projection. B is that of the mesh, whatever rest_positions a run takes.
     rigid: places R X + t of the rest positions X of a run, six numbers. A start is the nearest such (inputs/rigid_start.py).
-    a basis, in implicit steps and static solves, of all the mesh's vertices, of which those of the set count: m
-    functions for each component, shape (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m
-    fields of displacements, (m, num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
+    a basis, of all the mesh's vertices, of which those of the set count: m functions for each component, shape
+    (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m fields of displacements, (m,
+    num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
 
     The set moves by u = B q alone, so that forces do what B^T f says, and what B lacks is held as by a support. Linear
-    momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule, where
-    it is of each component and has X, too, as cages have; both of rigid sets. Modes of a body that is held have neither:
-    they are for what stays where it is and does not turn far.
+    momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule and
+    explicit steps, where it is of each component and has X, too, as cages have; both of rigid sets. Modes of a body that is
+    held have neither: they are for what stays where it is and does not turn far.
 
     Raises ValueError for what is no {name: kind or basis}, bases of other shapes or of which some are all but combinations
     of others, sets that are not known, lie in a plane, or share vertices with each other or with what is fixed.
     """
 
-    def __init__(self, mesh: TetrahedralMesh, given: Mapping[str, str | ArrayLike] | None, held: np.ndarray):
+    def __init__(
+        self, mesh: TetrahedralMesh, given: Mapping[str, str | ArrayLike] | None, held: np.ndarray, glued: tuple = ()
+    ):
         if not isinstance(given, Mapping | None):
             raise ValueError(f'reduced: must be {{name of a set: "affine", "rigid" or a basis}}, got {shown(given)}')
         self.bodies = tuple(self._body(mesh, name, kind) for name, kind in (given or {}).items())
@@ -93,6 +95,14 @@ class Reduced:
                     "vertex in common, and hold others"
                 )
             taken |= dict.fromkeys(map(int, body.vertices), repr(body.name))
+        for tie in glued:
+            both = np.intersect1d(tie.vertices, np.concatenate([[], *(body.vertices for body in self.bodies)]))
+            if len(both):
+                raise ValueError(
+                    f"{tie.name}: vertex {int(both[0])} is in a set of reduced= too, and moves by that alone; leave its "
+                    "faces out of the tie, or let the set end before them"
+                )
+        self.bodies += glued
 
     @staticmethod
     def _body(mesh: TetrahedralMesh, name: str, kind: str | ArrayLike) -> Together:
@@ -118,6 +128,16 @@ class Reduced:
 
     def __bool__(self) -> bool:
         return bool(self.bodies)
+
+    @property
+    def by_few(self) -> tuple[Together, ...]:
+        """Affine and rigid sets, which explicit kernels know."""
+        return tuple(body for body in self.bodies if body.kind in KINDS)
+
+    @property
+    def by_basis(self) -> tuple[Together, ...]:
+        """The others: what ties glue too."""
+        return tuple(body for body in self.bodies if body.kind not in KINDS)
 
     @property
     def rigid(self) -> tuple[Together, ...]:
@@ -152,7 +172,7 @@ class Reduced:
     def describe(self) -> str:
         """In a line."""
         return ", ".join(
-            f"{b.name!r} {b.count} for {3 * len(b.vertices)}"
+            f"{b.name if b.kind == 'tie' else repr(b.name)} {b.count} for {3 * len(b.vertices)}"
             + ("" if b.follows_translations() else ", tied to its place")
             for b in self.bodies
         )

@@ -100,6 +100,12 @@ class Supports:
             return np.tile(np.linalg.pinv(directions, rcond=1e-6) @ directions, (len(vertices), 1, 1))
         return self.held[np.searchsorted(self.vertices, vertices)]
 
+    def moved(self, motion: Motion | Pose | Mapping | None) -> np.ndarray:
+        """Sorted indices of the vertices that a motion moves."""
+        if not isinstance(motion, Mapping):
+            return self.vertices[: 0 if motion is None else None]
+        return np.unique(np.concatenate([self.by_name[name][0] for name in motion if name in self.by_name] or [[]]))
+
     def parts_of(self, motion: Motion | Pose | Mapping | None) -> tuple[list[tuple[PosedSupport, Pose]], bool]:
         """What of a motion is a pose, and whether there is anything else."""
         parts = motion.values() if isinstance(motion, Mapping) else [motion]

@@ -11,12 +11,6 @@ if TYPE_CHECKING:
 def check_bodies(scene: "Scene", contact: str) -> None:
     """Raise ValueError for what these bodies do not have in explicit steps."""
     said = f"reduced sets ({scene.reduced.describe()})"
-    for body in scene.reduced.bodies:
-        if body.kind == "basis":
-            raise ValueError(
-                f"reduced: explicit steps support affine and rigid sets, and {body.name!r} moves by a basis: take an "
-                "implicit solver"
-            )
     if contact == "stage" and any(term.acts_on_surface for term in scene.terms):
         raise ValueError(
             f"{said} take obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
@@ -27,6 +21,8 @@ def check_bodies(scene: "Scene", contact: str) -> None:
     self_contact = scene.term(SelfContact)
     rough = [term for term in scene.terms if term.primitives is not None and term.has_friction]
     rough = [self_contact] if self_contact and self_contact.has_friction else rough
+    if scene.reduced.by_basis:
+        rough += [term for term in scene.terms if term.acts_on_surface and term.has_friction]
     if rough:
         raise ValueError(
             f"{said} have no friction in {type(rough[0]).__name__} in explicit steps, which slows every vertex by itself: "

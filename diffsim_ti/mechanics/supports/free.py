@@ -67,6 +67,12 @@ class FreeBodies(FreeDirections):
     __mul__ = __rmul__
 
     @property
+    def elimination(self):
+        """T of glued.py, where ties are all that there is; else None."""
+        only = len(self.reduced.bodies) == 1 and self.reduced.bodies[0].kind == "tie"
+        return self.reduced.bodies[0].matrix if only else None
+
+    @property
     def linear(self) -> "FreeBodies":
         return FreeBodies(self.mask, self.partly_fixed, self.sliding_supports, self.reduced)
 

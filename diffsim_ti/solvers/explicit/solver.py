@@ -19,6 +19,7 @@ from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies
+from diffsim_ti.mechanics.reduced.projected_sets import ProjectedSets
 from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance
@@ -164,6 +165,7 @@ class ExplicitWorkspace(Workspace):
         features, a = self.arrays.features(), self.arrays
         self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
         self.volumes = VolumeConstraints(self) if self.scene.holds_volumes else None
+        self.projected = ProjectedSets(self) if self.scene.reduced.by_basis else None
         self.stages = stages_of(self)
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
@@ -276,7 +278,7 @@ class ExplicitWorkspace(Workspace):
     def _sizes(self) -> dict:
         """Numbers that all launches take."""
         a = self.arrays
-        out = dict(num_items=a.num_items, num_vertices=a.num_vertices, num_bodies=len(self.scene.reduced.bodies))
+        out = dict(num_items=a.num_items, num_vertices=a.num_vertices, num_bodies=len(self.scene.reduced.by_few))
         return out | a.counts
 
     def _rows(self) -> int:

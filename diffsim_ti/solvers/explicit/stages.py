@@ -4,13 +4,15 @@ from contextlib import nullcontext
 
 from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import VolumeConstraintAdjoint, VolumeConstraintTangent
 from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
+from diffsim_ti.mechanics.reduced.projected_sets import ProjectedAdjoint, ProjectedSets, ProjectedTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.stages import SurfaceForces, SurfaceFriction
 
 # stages whose tangents and adjoints have buffers: what makes these of them for a run
 BUFFERED = dict(
-    tangent={VolumeConstraints: VolumeConstraintTangent}, adjoint={VolumeConstraints: VolumeConstraintAdjoint}
+    tangent={VolumeConstraints: VolumeConstraintTangent, ProjectedSets: ProjectedTangent},
+    adjoint={VolumeConstraints: VolumeConstraintAdjoint, ProjectedSets: ProjectedAdjoint},
 )
 
 
@@ -49,7 +51,7 @@ def stages_of(ws) -> list[Stage]:
         forces = PairContact(ws.pairs, ws.solver.contact_damping)
     elif ws.pairs:
         forces, friction = SurfaceForces(ws.pairs), SurfaceFriction(ws.pairs) if ws.pairs.friction else None
-    every = forces, ws.volumes, friction, ws.chambers, KickDrift()
+    every = forces, ws.volumes, friction, ws.chambers, ws.projected, KickDrift()
     return [stage for stage in every if stage]
 
 

@@ -80,6 +80,9 @@ class Factorised:
 
         free, symmetric = operator.free, operator.symmetric
         matrix = hessian(operator).tocsc()
+        self._eliminate = getattr(free, "elimination", None)
+        if self._eliminate is not None:
+            matrix = eliminated(matrix, self._eliminate)
         matrix.eliminate_zeros()
         self._solve, self._free, self._along, self.negative = None, free, None, 0
         pivoting = 0.0 if symmetric else 0.1
@@ -100,18 +103,27 @@ class Factorised:
 
     @classmethod
     def of(cls, operator) -> "Factorised | None":
-        """None where there is no such factorisation: of sets that move by few numbers, of singular matrices."""
-        if operator.rigid or isinstance(operator.free, FreeBodies):
+        """None where there is no such factorisation: of sets that move by few numbers but ties, of singular matrices."""
+        if isinstance(operator.free, FreeBodies) and operator.free.elimination is None:
             return None
         out = cls(operator)
         return out if out._solve else None
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
-        r = (r * self._free).ravel()
+        r, T = (r * self._free).ravel(), self._eliminate
+        r = r if T is None else T.T @ r
         out = self._solve(r)
         if self._along is not None:
             out = out + self._along @ (self._along.T @ r)
-        return out.reshape(-1, 3) * self._free
+        return (out if T is None else T @ out).reshape(-1, 3) * self._free
+
+
+def eliminated(matrix, T):
+    """T^T A T, with a diagonal in the place of what T leaves out."""
+    from scipy.sparse import diags
+
+    left_out = np.diff(T.tocsc().indptr) == 0
+    return (T.T @ matrix @ T + diags(left_out * np.abs(matrix.diagonal()).max())).tocsc()
 
 
 def hessian(operator):

@@ -7,6 +7,7 @@ from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, projectors_of
 from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
+from diffsim_ti.solvers.implicit.factorised import eliminated
 from diffsim_ti.solvers.implicit.preconditioners import Preconditioner
 from diffsim_ti.solvers.implicit.rotations import Frames
 
@@ -20,6 +21,7 @@ class Multigrid(Preconditioner):
     The V-cycle over it is cycle.py's.
     Below ten-node tetrahedra lie the linear ones of their corners, and aggregates of these (p-multigrid): aggregates of all
     ten nodes take half as many iterations again.
+    Of ties (terms/glued.py) the matrix is T^T K T, with the large weights of T alone; residuals and corrections take all.
     Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142; Heys,
     Manteuffel, McCormick, Olson 2005, Algebraic multigrid for higher-order finite elements, doi:10.1016/j.jcp.2004.09.021.
     """
@@ -33,16 +35,17 @@ class Multigrid(Preconditioner):
             at, hosts = potential.held_at, potential.hosts.matrices(potential.held_at)
             potential.blocks()
             matrix, diagonal = assemble(potential, mass, free, [own for own, _ in hosts])
+            self._ties = getattr(free, "elimination", None)
+            if self._ties is not None:
+                matrix, diagonal = glued(matrix, _short(self._ties))
             self._known = np.zeros((len(at), 3, 3))  # of what `update` adds
             for _, own in hosts:
                 self._known = self._known + (free.around(own) if isinstance(free, FreeDirections) else own)
         aggregated, allowed = matrix, free
         if mesh.order == 2:
-            aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest)
+            aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest, self._ties)
         matrices, ways = [aggregated], []
-        changes = (
-            potential.arrays.contacts or potential.pairs or potential.hosts or potential.faces
-        )  # on the finest level
+        changes = potential.arrays.contacts or potential.pairs or potential.hosts  # on the finest level
         if changes or len(rest) > self.direct:
             matrices, ways = _aggregated(aggregated, _allowed(_rigid_motions(rest), allowed))
         if mesh.order == 2:
@@ -72,10 +75,12 @@ class Multigrid(Preconditioner):
         self._contact = contact
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
-        solver = self.solver
+        solver, T = self.solver, self._ties
+        r = r if T is None else (T.T @ r.ravel()).reshape(r.shape)
         runtime.fill(solver.r, r[None])
         self.cycle(solver, 1.0 / (np.linalg.norm(r) or 1.0))
-        return runtime.fetch_row(solver.z, 0) * self.free
+        z = runtime.fetch_row(solver.z, 0)
+        return (z if T is None else (T @ z.ravel()).reshape(z.shape)) * self.free
 
 
 def _aggregated(matrix, motions: np.ndarray) -> tuple[list, list]:
@@ -106,17 +111,38 @@ def as_blocks(M):
     return M
 
 
-def of_corners(matrix, free: Free, mesh, rest: np.ndarray) -> tuple:
+def _short(T):
+    """T without weights below a thousandth, of which what is left keeps the sums of rows."""
+    from scipy.sparse import diags
+
+    near = T.multiply(abs(T) > 1e-3).tocsr()
+    sums, kept = (np.asarray(M.sum(1)).ravel() for M in (T, near))
+    return diags(np.divide(sums, kept, out=np.ones_like(sums), where=kept != 0)) @ near
+
+
+def glued(matrix, T) -> tuple:
+    """(T^T A T in blocks, places of its diagonal blocks), with a diagonal in the place of what T leaves out."""
+    out = eliminated(matrix, T).tobsr((3, 3))
+    out.sort_indices()
+    rows = np.repeat(np.arange(out.shape[0] // 3), np.diff(out.indptr))
+    return out, np.flatnonzero(rows == out.indices)
+
+
+def of_corners(matrix, free: Free, mesh, rest: np.ndarray, T=None) -> tuple:
     """(matrix of the linear elements on the corners of ten-node ones, what these may do, their places, the interpolation
     from them: the middle of an edge moves by the mean of its ends)."""
-    from scipy.sparse import eye, kron
+    from scipy.sparse import diags, eye, kron
 
     corners = mesh.corners
     allowed = free[corners] if isinstance(free, np.ndarray) else free.of(corners)
     may, may_here = (_block_diagonal(projectors_of(x)) for x in (free, allowed))
     up = may @ kron(mesh.from_corners, eye(3)) @ may_here
-    coarse = (up.T @ matrix @ up).tocsr()
     held = eye(3 * len(corners)) - may_here
+    if T is not None:  # what follows others is made of these in both meshes
+        stays = diags((np.diff(T.tocsc().indptr) > 0).astype(float))
+        up = stays @ up @ (T @ up).tocsr()[(3 * corners[:, None] + np.arange(3)).ravel()]
+        held = held + diags((np.diff(up.tocsc().indptr) == 0) * (1 - held.diagonal()))
+    coarse = (up.T @ matrix @ up).tocsr()
     return (
         (coarse + held * (np.abs(coarse.data).max(initial=0.0) or 1.0)).tobsr((3, 3)),
         allowed,

@@ -42,7 +42,7 @@ class Preconditioners:
         return inertia * (4.0 ** np.round(0.5 * np.log2(c)) / c)
 
     def _wants_multigrid(self, size: np.ndarray, mass: np.ndarray) -> bool:
-        if self.ws.scene.reduced:
+        if self.ws.scene.reduced and self.ws.free.elimination is None:
             return False
         if self.ws.solver.preconditioner != "auto":
             return self.ws.solver.preconditioner == "multigrid"

@@ -76,17 +76,21 @@ class BlockJacobi(Preconditioner):
 class BodyBlocks(BlockJacobi):
     """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, with inertia and
     contact as they are; where its basis is of each component turned with it, as in multigrid.py. Of sets that do not deform
-    q are shifts and turns (mechanics/reduced/rigid_sets.py), whose part of the body at rest turns with them, too."""
-
-    patience = 10**9  # for nothing takes its place
+    q are shifts and turns (mechanics/reduced/rigid_sets.py), whose part of the body at rest turns with them, too. What ties
+    glue takes the blocks of its vertices."""
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
         super().__init__(potential, mass, free, size, parallel)
         with potential.at_rest():
-            soft = [(body, body.fields()) for body in free.reduced.bodies if not body.rigid]
+            soft = [(body, body.fields()) for body in free.reduced.bodies if body.kind not in ("rigid", "tie")]
             stiff = [(own, own.fields()) for own in free.rigid.sets]
             self._at_rest = [(body, self._of_products(body.vertices, fields)) for body, fields in soft]
             self._rigid_at_rest = [(own, self._of_products(own.vertices, fields)) for own, fields in stiff]
+
+    @property
+    def patience(self) -> int:
+        """Where there are only ties the factorisation takes its place, else nothing does."""
+        return super().patience if self.free.elimination is not None else 10**9
 
     def _of_products(self, vertices: np.ndarray, fields: np.ndarray) -> np.ndarray:
         """B^T d2E/du2 B where the potential stands, shape (count, count), for fields B of shape (k, 3, count)."""
@@ -130,6 +134,9 @@ class BodyBlocks(BlockJacobi):
         for body, inverse in self._bodies:
             q = body.numbers(r)
             out[body.vertices] = body.motion((inverse @ q.ravel()).reshape(q.shape))
+        for body in self.free.reduced.bodies:
+            if body.kind == "tie":  # of what its vertices do each by itself, what they can do together
+                out[body.vertices] = body.motion(body.numbers(out))
         for own, inverse in self._rigid:
             fields = own.fields()
             out[own.vertices] = fields @ (inverse @ np.tensordot(fields, r[own.vertices], ((0, 1), (0, 1))))

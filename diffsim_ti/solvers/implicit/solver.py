@@ -60,7 +60,8 @@ class ImplicitSolver(Solver):
     ):
         if preconditioner not in ("auto", "block_jacobi", "multigrid"):
             raise ValueError(f"preconditioner must be auto, block_jacobi or multigrid, got {preconditioner!r}")
-        if preconditioner == "multigrid" and getattr(scene, "reduced", False):
+        bodies = getattr(getattr(scene, "reduced", None), "bodies", ())
+        if preconditioner == "multigrid" and any(body.kind != "tie" for body in bodies):
             raise ValueError(
                 'preconditioner: a scene with reduced= takes "block_jacobi", with blocks of the bodies; or "auto"'
             )

@@ -5,6 +5,7 @@ import time
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.common.blas_threads import one_blas_thread
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.mechanics.energy.potential import Potential
@@ -26,7 +27,6 @@ from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.solvers.implicit.prescribed import PrescribedInPasses
-from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.history import History
 from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms import Growth

@@ -1,6 +1,6 @@
-"""One BLAS thread while an implicit solver works.
+"""One BLAS thread while a solver works.
 
-Its vectors are short and its matrices sparse: threads that BLAS starts for a dot product wait for each other, and took a
+Vectors are short and matrices sparse or slender: threads that BLAS starts for a dot product wait for each other, and took a
 half to three quarters of the time of a static solve at 25 000 tetrahedra on two cores.
 """
 
