@@ -8,6 +8,7 @@ from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.fibre_reinforced import FibreReinforced
 from diffsim_ti.materials.gent import Gent
 from diffsim_ti.materials.grown import Grown
+from diffsim_ti.materials.j2_plasticity import J2Plasticity
 from diffsim_ti.materials.kelvin_voigt import KelvinVoigt
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
@@ -22,6 +23,6 @@ from diffsim_ti.materials.yeoh import Yeoh
 
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
-__all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw", "KelvinVoigt"]
-__all__ += ["Law", "LinearElastic", "Material", "MooneyRivlin", "Ogden", "Prony", "SmithNeoHookean"]
+__all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw"]
+__all__ += ["J2Plasticity", "KelvinVoigt", "Law", "LinearElastic", "Material", "MooneyRivlin", "Ogden", "Prony", "SmithNeoHookean"]
 __all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh", "invariants"]
