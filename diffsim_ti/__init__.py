@@ -53,11 +53,13 @@ from diffsim_ti.outputs import (
     ChamberPressure,
     ContactForce,
     ContactTraction,
+    Dissipation,
     ElasticEnergy,
     EnclosedVolume,
     KineticEnergy,
     Length,
     MaterialPoints,
+    PlasticStrain,
     Reaction,
     SelfContactForce,
     Strain,
@@ -118,7 +120,7 @@ __all__ = ["init", "TetrahedralMesh", "StableNeoHookean", "SmithNeoHookean", "Li
 __all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "Ogden", "FibreReinforced", "KelvinVoigt"]
 __all__ += ["J2Plasticity", "Prony", "Gravity", "Drag", "ExternalForce", "Traction", "Pressure", "GasChamber", "FilledChamber"]
 __all__ += ["BodyForce", "Spring", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
-__all__ += ["Growth", "Muscle"]
+__all__ += ["Growth", "Muscle", "Dissipation", "PlasticStrain"]
 __all__ += ["SelfContact", "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "Pose"]
 __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", "ImplicitEulerSolver"]
 __all__ += ["ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Rollout", "Frames", "Batch"]

@@ -31,7 +31,7 @@ class J2Law(EnergyLaw):
     kinematic: bool = False
     part: str = "all"
 
-    rate_independent = True
+    plastic = True
 
     @property
     def coefficient_names(self):

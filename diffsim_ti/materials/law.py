@@ -41,7 +41,7 @@ class Law(metaclass=Public):
     initial_state = ()  # one number for each of them, or none: zero
     reads: ClassVar[tuple[str, ...]] = ("H",)
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
-    rate_independent = False  # whether its state moves on with the strain alone, so that equilibria have one
+    plastic = False  # whether its state is a flow that keeps the volume, and moves on with the strain alone
     viscous = False  # whether it has a `viscous_differential`
     # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
     frozen_names: ClassVar[tuple[str, ...]] = ()
