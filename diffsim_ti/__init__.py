@@ -118,7 +118,17 @@ from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 __version__ = "0.2.0"
 __all__ = ["init", "TetrahedralMesh", "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated"]
 __all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "Ogden", "FibreReinforced", "KelvinVoigt"]
-__all__ += ["J2Plasticity", "Prony", "Gravity", "Drag", "ExternalForce", "Traction", "Pressure", "GasChamber", "FilledChamber"]
+__all__ += [
+    "J2Plasticity",
+    "Prony",
+    "Gravity",
+    "Drag",
+    "ExternalForce",
+    "Traction",
+    "Pressure",
+    "GasChamber",
+    "FilledChamber",
+]
 __all__ += ["BodyForce", "Spring", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
 __all__ += ["Growth", "Muscle", "Dissipation", "PlasticStrain"]
 __all__ += ["SelfContact", "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "Pose"]

@@ -24,5 +24,15 @@ from diffsim_ti.materials.yeoh import Yeoh
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
 __all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InvariantLaw"]
-__all__ += ["J2Plasticity", "KelvinVoigt", "Law", "LinearElastic", "Material", "MooneyRivlin", "Ogden", "Prony", "SmithNeoHookean"]
+__all__ += [
+    "J2Plasticity",
+    "KelvinVoigt",
+    "Law",
+    "LinearElastic",
+    "Material",
+    "MooneyRivlin",
+    "Ogden",
+    "Prony",
+    "SmithNeoHookean",
+]
 __all__ += ["StVenantKirchhoff", "StableNeoHookean", "StrainLaw", "Yeoh", "invariants"]

@@ -32,6 +32,8 @@ class J2Law(EnergyLaw):
     part: str = "all"
 
     plastic = True
+    # in patches a tetrahedron resists by itself a change of volume as little as of shape, but does not turn inside out
+    last_without_lam = (0.0, 1.0)
 
     @property
     def coefficient_names(self):
@@ -203,7 +205,9 @@ class J2Plasticity(Material):
         for name in {"hardening", "kinematic_hardening"} & {*values}:
             check_range(name, values[name], 0, np.inf, True, "what softens flows in a band of the mesh's width")
         if self.saturating:
-            check_range("saturation_exponent", values["saturation_exponent"], 0, np.inf, False, "leave both out, or raise it")
+            check_range(
+                "saturation_exponent", values["saturation_exponent"], 0, np.inf, False, "leave both out, or raise it"
+            )
             last, first = values["saturation_stress"], values["yield_stress"]
             if last.shape == first.shape or 1 in (last.size, first.size):  # else of sets, not on a mesh yet
                 rise = last - first
