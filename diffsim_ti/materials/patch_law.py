@@ -13,7 +13,8 @@ class PatchLaw(Law):
     coefficients p with lam = 0, split: psi(H; p') stays in each tetrahedron, the patch's mean of theta takes the rest.
 
     So a tetrahedron of a patch with pressure pi = lam theta_patch (positive in tension) [Pa] has the numbers
-    q = [*p', *z, pi], z its state if the law has one, which theta does not read; the stress P(H; p') + pi dtheta/dF and, as its share of the patch's energy, pi theta / 2.
+    q = [*p', *z, pi], z its state if the law has one, which theta does not read; the stress P(H; p') + pi dtheta/dF and, as
+    its share of the patch's energy, pi theta / 2.
     """
 
     base: Law
@@ -89,6 +90,19 @@ class PatchLaw(Law):
     def stress_jvp(self, H, dH, q, dq):
         by_rest = self.base.stress_change(H, q[:-1], dq[:-1])
         return self.stress_differential(H, dH, q) + by_rest + self.base.dilatation_gradient(H) * dq[-1]
+
+    @traced
+    def stress_and_jvp_at(self, x, dx, q, dq):
+        P, dP = self.base.stress_and_jvp_at(x, dx, q[:-1], dq[:-1])
+        G, turned = self.base.dilatation_gradient(*x), self.base.dilatation_gradient_differential(*x, *dx)
+        return P + G * q[-1], dP + turned * q[-1] + G * dq[-1]
+
+    @traced
+    def stress_and_vjp_at(self, x, W, q):
+        """At a fixed pressure; the products are those of p' and z."""
+        P, (dP,), products = self.base.stress_and_vjp_at(x, W, q[:-1])
+        G, turned = self.base.dilatation_gradient(*x), self.base.dilatation_gradient_differential(*x, W)
+        return P + G * q[-1], [dP + turned * q[-1]], products
 
     @traced
     def next_state_at(self, H, q, h):

@@ -24,7 +24,8 @@ class ElasticEnergy(Output):
     sets: tetrahedron sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it. The gradient is exact by all inputs.
     With volume="patches" a tetrahedron has pi theta / 2 of its patch's pressure pi in the place of lam theta^2 / 2.
-    Of a law with a state, such as `Prony`, it is what is stored in all its springs; of a plastic one see `Dissipation`. Raises ValueError for laws with rates.
+    Of a law with a state, such as `Prony`, it is what is stored in all its springs; of a plastic one `Dissipation` has the
+    rest. Raises ValueError for laws with rates.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 6.1.
     """
 

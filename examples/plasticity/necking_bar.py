@@ -1,9 +1,9 @@
 """Necking of a round bar in tension: how thin its middle becomes while its ends are drawn apart.
 
-An eighth of the bar, of ten-node tetrahedra with the mean dilatation of each, in quasi-static steps. The bar is 1.8 % thinner
-in its middle, so that it is there that it necks. Simo, Armero 1992, Geometrically non-linear enhanced strain mixed methods
-and the method of incompatible modes, doi:10.1002/nme.1620330705; de Souza Neto, Peric, Owen, Computational Methods for
-Plasticity, 2008, sec. 14.9, doi:10.1002/9780470694626.
+An eighth of the bar, of ten-node tetrahedra with the mean dilatation of each, in quasi-static steps. The bar is 1.8 %
+thinner in its middle, so that it is there that it necks. Simo, Armero 1992, Geometrically non-linear enhanced strain mixed
+methods and the method of incompatible modes, doi:10.1002/nme.1620330705; de Souza Neto, Peric, Owen, Computational Methods
+for Plasticity, 2008, sec. 14.9, doi:10.1002/9780470694626.
 
     python examples/plasticity/necking_bar.py [--quick]
 """

@@ -43,8 +43,7 @@ def logarithmic_strain(H: Tensor, coaxial: bool) -> tuple[Tensor, Tensor]:
         ratio, slope = difference_over_sinh(logs[i] - logs[j])
         scale = exp(0 - logs[i] - logs[j])
         rows[i][j] = scale * ratio * x
-        for a, b in ((i, j), (j, i)):
-            sign = 1 if a == i else -1
+        for a, sign in ((i, 1), (j, -1)):
             rows[a][a] = rows[a][a] + of_second_order(
                 x, x, lambda a=a, s=sign, r=ratio, d=slope, c=scale: exp(-2 * logs[a]) * c * (s * d - r)
             )

@@ -181,7 +181,8 @@ class PatchedTetrahedron(Tetrahedron):
 
         def push(q, H, dH, gradient, B, D, W):
             numbers, volume = self._numbers_in(patch, item, at, s, q), self.volume_of(item, scene.volumes, q)
-            dP, products = self.law.stress_differential_and_products(H, dH, numbers)
+            both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
+            *P, (dP,), products = both([H], dH, numbers)  # the stress itself is felt by the rest shape alone
             dP = dP + gradient * patch.dpi
             minus = let(ti.cast(-1, self.fp) * volume)
             by_p, by_z = self._parted([let(minus * x) for x in products])
@@ -189,7 +190,7 @@ class PatchedTetrahedron(Tetrahedron):
                 before = self.state_of(item, adjoint.z, 0, q)
                 self.put_state(item, adjoint.z, 0, [a + b for a, b in zip(before, by_z)], q)
             if shape:
-                P, theta = self.law.stress(H, numbers), self.law.base.dilatation(H)
+                (P,), theta = P, self.law.base.dilatation(H)
                 by_B = (D.transpose() @ dP + W.transpose() @ P) * minus
                 in_patch = patch.dtheta_p * (
                     patch.theta_p * (patch.lam - patch.lam_p - patch.lam_p) + patch.lam_p * theta
