@@ -66,8 +66,9 @@ class J2Law(EnergyLaw):
         return Y, dY, D
 
     def _flow(self, H, p, z):
-        """(N, dev e, back strain, c, x, q, stiffness, D): the flow is N A N^T, A = c (2 mu dev e - 2/3 k b) in the basis N,
-        whose size is x. q is the equivalent trial stress, or the flow stress where that is less."""
+        """(N, dev e, xi, b, c, x, q, stiffness, D), tensors in the basis N: the flow is A = c xi, xi = 2 mu dev e - 2/3 k b
+        the trial stress less the back stress, x the change of a. q = sqrt(3/2) |xi|, or the flow stress where that is
+        less."""
         graph, mu = H.numbers[0].graph, p[0]
         f, alpha = Tensor(z[:9]), z[9]
         N, L = logarithmic_strain(H + f + H @ f, coaxial=not self.kinematic)
@@ -133,8 +134,8 @@ class J2Plasticity(Material):
         Y(a) = yield_stress + hardening a + (saturation_stress - yield_stress) (1 - exp(-saturation_exponent a)),
 
     tau = J sigma Kirchhoff's stress, a the equivalent plastic strain. Plastic flow is in the direction of dev tau - back
-    stress and keeps the volume; it is found by a return mapping with the exponential, exact for a proportional strain
-    however long the pass. Y is linear without saturation_stress (Voce). kinematic_hardening k: a back stress 2/3 k times the
+    stress and keeps the volume; it is found by a return mapping with the exponential, which is exact for a proportional
+    strain however long the pass, and otherwise of first order in the strain of a pass. Y is linear without saturation_stress (Voce). kinematic_hardening k: a back stress 2/3 k times the
     integral of the rate of plastic strain, in the unloaded configuration, which has no spin (Prager).
 
     `J2Plasticity(E, nu, yield_stress=y, hardening=h)`, or with mu= and lam=. Each is one number, one per tetrahedron or by
@@ -145,8 +146,7 @@ class J2Plasticity(Material):
     numbers. The stress of a pass has a potential, whose Hessian is the consistent tangent of implicit and static solves; the
     latter follow the steps of a run, whatever their dt. Gradients are exact but where a point just reaches its yield stress:
     there the slope jumps from that of elastic to that of plastic loading, and one of both is given.
-    Linear tetrahedra lock in plastic flow: take mesh.quadratic() or volume="patches". A trial stress below the yield stress,
-    of an elastic body, costs what a plastic one does.
+    Linear tetrahedra lock in plastic flow: take mesh.quadratic() or volume="patches".
     `PlasticStrain`, `Dissipation` and `ElasticEnergy` show what a run has done.
     Simo, Hughes, Computational Inelasticity, 1998, ch. 9, doi:10.1007/b98904; Eterovic, Bathe 1990, A hyperelastic-based
     large strain elasto-plastic constitutive formulation with combined isotropic-kinematic hardening,
@@ -202,7 +202,7 @@ class J2Plasticity(Material):
     def check(self, values):
         super().check(values)
         check_range("yield_stress", values["yield_stress"], 0, np.inf, False, "the stress [Pa] at which flow begins")
-        for name in {"hardening", "kinematic_hardening"} & {*values}:
+        for name in ("hardening", *("kinematic_hardening",) * self.kinematic):
             check_range(name, values[name], 0, np.inf, True, "what softens flows in a band of the mesh's width")
         if self.saturating:
             check_range(

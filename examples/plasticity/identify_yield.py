@@ -1,6 +1,6 @@
 """Yield stress and hardening of a metal from one tensile test: the force while a tapered bar is drawn out, with noise.
 
-    python examples/plasticity/identify_yield.py
+python examples/plasticity/identify_yield.py
 """
 
 import numpy as np
