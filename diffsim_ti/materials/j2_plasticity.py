@@ -135,8 +135,9 @@ class J2Plasticity(Material):
 
     tau = J sigma Kirchhoff's stress, a the equivalent plastic strain. Plastic flow is in the direction of dev tau - back
     stress and keeps the volume; it is found by a return mapping with the exponential, which is exact for a proportional
-    strain however long the pass, and otherwise of first order in the strain of a pass. Y is linear without saturation_stress (Voce). kinematic_hardening k: a back stress 2/3 k times the
-    integral of the rate of plastic strain, in the unloaded configuration, which has no spin (Prager).
+    strain however long the pass, and otherwise of first order in the strain of a pass. Y is linear without saturation_stress
+    (Voce). kinematic_hardening k: a back stress 2/3 k times the integral of the rate of plastic strain, in the unloaded
+    configuration, which has no spin (Prager).
 
     `J2Plasticity(E, nu, yield_stress=y, hardening=h)`, or with mu= and lam=. Each is one number, one per tetrahedron or by
     sets, and an input with gradient [Pa; the exponent -]. hardening, kinematic_hardening >= 0, saturation_stress >=
