@@ -216,11 +216,11 @@ def test_gradients_of_equilibria(material, inputs):
 def test_gradients_of_ten_nodes():
     """A beam that is bent by a load, by implicit steps, of the law without saturation and kinematic hardening."""
     mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (2.0, 1.0, 1.0)).quadratic()
-    load = ds.Traction("xmax", [0, -1.0, 0])
+    load = ds.Traction([0, -1.0, 0], "xmax")
     body = ds.Scene(mesh, SIMPLE, 1.0, load, fixed="xmin", precision="f64")
     r = ds.Rollout(ds.ImplicitEulerSolver(body, dt=0.2, tolerance=1e-12), 3, gradients="all", outputs=OUTPUTS[2])
     assert r.forward().law_state is not None
-    assert verify.dot_product_test(r) <= 1e-11
+    assert verify.dot_product_test(r) <= 1e-10
     report = ds.check_gradients(r, inputs=("yield_stress", "hardening", "youngs_modulus"), verbose=False)
     assert report.passed, report
     assert r.forward()["dissipation"][-1] > 0
