@@ -33,6 +33,7 @@ from diffsim_ti.materials import (
     Gent,
     Grown,
     InitialStress,
+    J2Plasticity,
     KelvinVoigt,
     LinearElastic,
     Material,
@@ -54,11 +55,13 @@ from diffsim_ti.outputs import (
     ChamberPressure,
     ContactForce,
     ContactTraction,
+    Dissipation,
     ElasticEnergy,
     EnclosedVolume,
     KineticEnergy,
     Length,
     MaterialPoints,
+    PlasticStrain,
     Reaction,
     SelfContactForce,
     Strain,
@@ -118,10 +121,10 @@ from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 __version__ = "0.2.0"
 __all__ = ["init", "TetrahedralMesh", "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated"]
 __all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "InitialStress"]
-__all__ += ["Ogden", "Orthotropic", "FibreReinforced", "KelvinVoigt"]
+__all__ += ["Ogden", "Orthotropic", "FibreReinforced", "KelvinVoigt", "J2Plasticity"]
 __all__ += ["Prony", "Gravity", "Drag", "ExternalForce", "Traction", "Pressure", "GasChamber", "FilledChamber"]
 __all__ += ["BodyForce", "Spring", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
-__all__ += ["Growth", "Muscle", "Tie"]
+__all__ += ["Growth", "Muscle", "Tie", "Dissipation", "PlasticStrain"]
 __all__ += ["SelfContact", "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "Pose"]
 __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", "ImplicitEulerSolver"]
 __all__ += ["ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Rollout", "Frames", "Batch"]

@@ -10,7 +10,7 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 AREAS = {
     "meshes, scenes, materials": "mesh exchange files locate scene inputs named_sets loads chambers springs muscles "
     "loads_together held_volumes supports materials tensor_calculus open_laws growth growth_over_time surface_drag "
-    "rotating_frame step_inputs laws_with_state orthotropic initial_stress viscosity viscous_stages deprecated "
+    "rotating_frame step_inputs laws_with_state orthotropic initial_stress plasticity viscosity viscous_stages deprecated "
     "rubber_library",
     "motion against closed forms": "reference_motion step_limit mass_scaling unequal_steps energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",

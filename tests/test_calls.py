@@ -65,6 +65,10 @@ def calls() -> dict:
         "InitialStress": (ds.InitialStress, dict(material=ds.StableNeoHookean(1e5, 0.3), stress=[1, 0, 0, 0, 0, 0])),
         "KelvinVoigt": (ds.KelvinVoigt, dict(material=ds.StableNeoHookean(1e5, 0.3), time=0.01)),
         "Prony": (ds.Prony, dict(material=ds.StableNeoHookean(1e5, 0.3), shares=[0.5], times=[0.1])),
+        "J2Plasticity": (
+            ds.J2Plasticity,
+            dict(youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=1e3, hardening=1e2, kinematic_hardening=1e2),
+        ),
         "Gravity": (ds.Gravity, dict(acceleration=-9.81)),
         "Drag": (ds.Drag, dict(rate=1.0)),
         "Ground": (ds.Ground, dict(height=-1.0) | wall),

@@ -505,7 +505,7 @@ class TwoForOne(FadingLaw):
         ),
         (
             lambda: scene(volume="patches").law,
-            r"averages energies of displacements, but RelaxingLaw has a state .*; take",
+            r"averages the part lam/2 theta\^2 of an energy, but RelaxingLaw does not say what its theta is; .* take",
         ),
         (simulated, r"has a state .* that DifferentiableSimulator does not support: .* rollout_frames"),
         (energy_of_gradients, r"has a state .* that energy_density\(F\) does not support: ask Simulator"),

@@ -64,6 +64,7 @@ def parts() -> int:
         ds.InitialStress(soft, (1e3, 0.0, 0.0, 0.0, 0.0, 0.0)),
         ds.KelvinVoigt(soft, time=1e-3),
         ds.Prony(soft, [0.5], [0.1]),
+        ds.J2Plasticity(1e4, 0.3, 100.0, hardening=50.0, kinematic_hardening=20.0),
     ]
     spring = ds.Spring(0, ds.Anchor((0.0, 0.0, -1.0)), stiffness=10.0, name="spring")
     cable = ds.Cable([0, 1], tension=lambda t: 2 * t, name="cable")
@@ -116,6 +117,8 @@ def parts() -> int:
         ds.Tension(spring),
         ds.EnclosedVolume(),
         ds.ElasticEnergy(),
+        ds.Dissipation(),
+        ds.PlasticStrain(at="vertices"),
         ds.KineticEnergy(["xmax"]),
         ds.WorkOfLoads(),
         ds.CenterOfMass(),

@@ -9,6 +9,7 @@ from diffsim_ti.materials.fibre_reinforced import FibreReinforced
 from diffsim_ti.materials.gent import Gent
 from diffsim_ti.materials.grown import Grown
 from diffsim_ti.materials.initial_stress import InitialStress
+from diffsim_ti.materials.j2_plasticity import J2Plasticity
 from diffsim_ti.materials.kelvin_voigt import KelvinVoigt
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
@@ -28,6 +29,6 @@ from diffsim_ti.materials.yeoh import Yeoh
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
 __all__ = ["MATERIALS", "Corotated", "EnergyLaw", "FibreReinforced", "Gent", "Grown", "InitialStress", "InvariantLaw"]
-__all__ += ["KelvinVoigt", "Law", "Library", "LinearElastic", "Material", "Measured", "MooneyRivlin", "Ogden"]
-__all__ += ["Orthotropic", "Prony", "SmithNeoHookean", "StVenantKirchhoff", "StableNeoHookean", "StrainLaw"]
+__all__ += ["J2Plasticity", "KelvinVoigt", "Law", "Library", "LinearElastic", "Material", "Measured", "MooneyRivlin"]
+__all__ += ["Ogden", "Orthotropic", "Prony", "SmithNeoHookean", "StVenantKirchhoff", "StableNeoHookean", "StrainLaw"]
 __all__ += ["TensileTest", "Yeoh", "fit_rubber", "invariants", "library"]

@@ -63,6 +63,18 @@ class KelvinVoigtLaw(SumLaw):
         return self.base.initial_state
 
     @property
+    def plastic(self):
+        return self.base.plastic
+
+    @property
+    def stored(self):
+        return replace(self, base=self.base.stored)
+
+    @property
+    def dissipated(self):
+        return self.base.dissipated and replace(self, base=self.base.dissipated)
+
+    @property
     def reads(self):
         return self.added.reads
 

@@ -41,6 +41,7 @@ class Law(metaclass=Public):
     initial_state = ()  # one number for each of them, or none: zero
     reads: ClassVar[tuple[str, ...]] = ("H",)
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
+    plastic = False  # whether its state is a flow that keeps the volume, and moves on with the strain alone
     viscous = False  # whether it has a `viscous_differential`
     # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
     frozen_names: ClassVar[tuple[str, ...]] = ()
@@ -52,6 +53,16 @@ class Law(metaclass=Public):
         """Its name, and those of the laws within."""
         within = [x.title for x in vars(self).values() if isinstance(x, Law)]
         return type(self).__name__.removesuffix("Law") + (f"({within[0]})" if within else "")
+
+    @property
+    def stored(self) -> "Law":
+        """The law whose energy is what is stored, where the potential of a pass is more than that."""
+        return self
+
+    @property
+    def dissipated(self) -> "Law | None":
+        """The law whose energy is what has been dissipated; None where a potential has no part of that."""
+        return None
 
     fp = number_type
 

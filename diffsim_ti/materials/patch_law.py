@@ -1,6 +1,6 @@
 """A law whose resistance to a change of volume is averaged over patches of tetrahedra."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.materials.law import Law
@@ -12,8 +12,9 @@ class PatchLaw(Law):
     """psi(H; p) = psi(H; p') + lam/2 theta^2, where theta(H) is the law's own measure of the change of volume and p' its
     coefficients p with lam = 0, split: psi(H; p') stays in each tetrahedron, the patch's mean of theta takes the rest.
 
-    So a tetrahedron of a patch with pressure pi = lam theta_patch (positive in tension) [Pa] has the coefficients
-    q = [*p', pi], the stress P(H; p') + pi dtheta/dF and, as its share of the patch's energy, pi theta / 2.
+    So a tetrahedron of a patch with pressure pi = lam theta_patch (positive in tension) [Pa] has the numbers
+    q = [*p', *z, pi], z its state if the law has one, which theta does not read; the stress P(H; p') + pi dtheta/dF and, as
+    its share of the patch's energy, pi theta / 2.
     """
 
     base: Law
@@ -23,11 +24,6 @@ class PatchLaw(Law):
             raise ValueError(
                 f'volume="patches" averages energies, but {type(self.base).__name__} reads {", ".join(self.base.reads)}; '
                 'take volume="tetrahedra"'
-            )
-        if self.base.state_names:
-            raise ValueError(
-                f'volume="patches" averages energies of displacements, but {type(self.base).__name__} has a state '
-                f'({", ".join(self.base.state_names)}); take volume="tetrahedra"'
             )
         if not self.base.has_dilatation:
             name = type(self.base).__name__
@@ -39,6 +35,22 @@ class PatchLaw(Law):
     @property
     def coefficient_names(self) -> tuple:
         return self.base.coefficient_names
+
+    @property
+    def state_names(self) -> tuple:
+        return self.base.state_names
+
+    @property
+    def initial_state(self) -> tuple:
+        return self.base.initial_state
+
+    @property
+    def plastic(self) -> bool:
+        return self.base.plastic
+
+    @property
+    def stored(self) -> "PatchLaw":
+        return replace(self, base=self.base.stored)
 
     @property
     def lanes(self) -> bool:
@@ -78,3 +90,29 @@ class PatchLaw(Law):
     def stress_jvp(self, H, dH, q, dq):
         by_rest = self.base.stress_change(H, q[:-1], dq[:-1])
         return self.stress_differential(H, dH, q) + by_rest + self.base.dilatation_gradient(H) * dq[-1]
+
+    @traced
+    def stress_and_jvp_at(self, x, dx, q, dq):
+        P, dP = self.base.stress_and_jvp_at(x, dx, q[:-1], dq[:-1])
+        G, turned = self.base.dilatation_gradient(*x), self.base.dilatation_gradient_differential(*x, *dx)
+        return P + G * q[-1], dP + turned * q[-1] + G * dq[-1]
+
+    @traced
+    def stress_and_vjp_at(self, x, W, q):
+        """At a fixed pressure; the products are those of p' and z."""
+        P, (dP,), products = self.base.stress_and_vjp_at(x, W, q[:-1])
+        G, turned = self.base.dilatation_gradient(*x), self.base.dilatation_gradient_differential(*x, W)
+        return P + G * q[-1], [dP + turned * q[-1]], products
+
+    @traced
+    def next_state_at(self, H, q, h):
+        """q = [*p, *z]: no pressure moves the state on."""
+        return self.base.next_state_at(H, q, h)
+
+    @traced
+    def next_state_jvp(self, H, dH, q, dq, h):
+        return self.base.next_state_jvp(H, dH, q, dq, h)
+
+    @traced
+    def next_state_vjp(self, H, q, h, z_adj):
+        return self.base.next_state_vjp(H, q, h, z_adj)

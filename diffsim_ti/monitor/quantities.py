@@ -38,7 +38,7 @@ class ObserverKernels:
     def observe_points(self, e, scene, at, out):
         def see(q, H, p):
             self.observe_point(e * len(self.element.points) + q, H, self.law.stress(H, p), out)
-            assign(entry(out.energy, e * len(self.element.points) + q), self.law.energy_density(H, p))
+            assign(entry(out.energy, e * len(self.element.points) + q), self.law.stored.energy_density(H, p))
 
         self.element.each_seen(e, scene, at, 0, see)
 
@@ -97,7 +97,7 @@ def observer_kernels(law, features: Features) -> ObserverKernels:
 
 class Energy(float):
     """A total energy [J] that knows its parts: kinetic, elastic, gravity (zero at y = 0 for g along y), contact, springs,
-    foundations (cables are loads, and have none)."""
+    foundations (cables are loads, and have none); of plastic laws also what they have dissipated."""
 
     parts: dict[str, float]
 
@@ -146,7 +146,7 @@ def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
 
 
 def elastic_energy(workspace: Workspace) -> float:
-    """Energy of strains [J] in the current state."""
+    """Energy of strains [J] in the current state; of plastic laws their potential, with what they have dissipated."""
     a = workspace.arrays
 
     def bind():
@@ -190,6 +190,8 @@ def energy(workspace: Workspace) -> Energy:
     parts = {"kinetic": kinetic_energy(workspace.mass, v)}
     volumes = values.volumes if a.points == 1 else values.volumes.sum(1)
     parts["elastic"] = float((tetrahedron_fields(workspace).energy_density * volumes).sum())
+    if a.law.plastic:
+        parts["dissipated"] = elastic_energy(workspace) - parts["elastic"]
     features = a.features()
     if features.gravity >= 0:
         g = values.parameters[features.gravity :][:3]

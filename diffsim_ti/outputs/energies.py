@@ -24,7 +24,8 @@ class ElasticEnergy(Output):
     sets: tetrahedron sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it. The gradient is exact by all inputs.
     With volume="patches" a tetrahedron has pi theta / 2 of its patch's pressure pi in the place of lam theta^2 / 2.
-    Of a law with a state, such as `Prony`, it is what is stored in all its springs. Raises ValueError for laws with rates.
+    Of a law with a state, such as `Prony`, it is what is stored in all its springs; of a plastic one `Dissipation` has the
+    rest. Raises ValueError for laws with rates.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 6.1.
     """
 
@@ -43,7 +44,7 @@ class ElasticEnergy(Output):
         out = copy(self)
         out.scene, out.all = scene, np.arange(mesh.num_tetrahedra)
         out.patched = scene.volume == "patches"
-        out.law = law.base if out.patched else law
+        out.law = self._law_of(law.base if out.patched else law)
         masks = np.ones((1, mesh.num_tetrahedra))
         if self.sets is not None:
             masks = np.zeros((len(self.sets), mesh.num_tetrahedra))
@@ -52,6 +53,11 @@ class ElasticEnergy(Output):
         out.points = mesh.reference.num_points
         out.masks = np.repeat(masks, out.points, 1)  # of the points of all tetrahedra
         return out
+
+    @staticmethod
+    def _law_of(law):
+        """The law whose energy it is."""
+        return law.stored
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,) if self.sets is None else (num_frames, len(self.sets))
@@ -108,6 +114,29 @@ class ElasticEnergy(Output):
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         by_state = self.remembered_vjp(frames, scaled.reshape(by_z.shape[:3])[..., None] * by_z)
         return Change(positions=positions, inputs=inputs, law_state=by_state)
+
+
+class Dissipation(ElasticEnergy):
+    """Energy that plastic flow has dissipated since the start [J], the sum of V D(a): the integral of the flow stress over
+    the equivalent plastic strain a, isotropic hardening included, in each frame; it never falls. Shape (frames,).
+
+    sets, name: as of `ElasticEnergy`. The gradient is exact by all inputs. Raises ValueError for laws without plastic flow.
+    Simo, Hughes, Computational Inelasticity, 1998, sec. 9.2.
+    """
+
+    def __init__(self, sets: Sequence[SetOrIndices] | None = None, name: str = "dissipation"):
+        super().__init__(sets, name)
+
+    def settled(self, scene: "Scene") -> "Dissipation":
+        if not scene.law.plastic:
+            raise ValueError(f"Dissipation: {scene.law.title} has no plastic flow; take J2Plasticity as the material")
+        out = super().settled(scene)
+        out.patched = False  # no pressure does work on what keeps its volume
+        return out
+
+    @staticmethod
+    def _law_of(law):
+        return law.dissipated
 
 
 class KineticEnergy(Output):

@@ -30,8 +30,13 @@ class TetrahedronStress:
 
     def _numbers(self, coefficients: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Coefficients and what the law remembers of the points of all frames, (frames points, K + S)."""
-        out = np.tile(self._coefficients(coefficients), (len(z), 1))
-        return np.concatenate([out, z[:, self.read].reshape(len(out), z.shape[-1])], 1)
+        return self._with_state(self._coefficients(coefficients), z[:, self.read])
+
+    @staticmethod
+    def _with_state(p: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Coefficients of the points beside their state in all frames."""
+        out = np.tile(p, (len(z), 1))
+        return np.concatenate([out, z.reshape(len(out), z.shape[-1])], 1)
 
     def value(self, H, z, derived) -> np.ndarray:
         """P [Pa]; z: what the law remembers, as `Output.remembered` has it."""
@@ -82,13 +87,13 @@ class PatchStress(TetrahedronStress):
 
     def value(self, H, z, derived):
         at = PatchPressure.of(self.scene, derived, H)
-        own = self.law.stress(H.reshape(-1, 3, 3), np.tile(at.kept, (len(H), 1))).reshape(H.shape)
+        own = self.law.stress(H.reshape(-1, 3, 3), self._with_state(at.kept, z)).reshape(H.shape)
         return self.chosen_of(own + at.value[..., None, None] * at.G)
 
     def jvp(self, H, dH, z, dz, derived, change):
         at = PatchPressure.of(self.scene, derived, H, dH)
         dp = self._coefficients(change.coefficients)
-        p, moved = (np.tile(x, (len(H), 1)) for x in (at.kept, at.without_lam(dp)))
+        p, moved = self._with_state(at.kept, z), self._with_state(at.without_lam(dp), dz)
         own = self.law.jvp(H.reshape(-1, 3, 3), dH.reshape(-1, 3, 3), p, moved).reshape(H.shape)
         dpi = at.jvp(dH, dp, change.volumes.ravel())
         return self.chosen_of(own + dpi[..., None, None] * at.G + at.value[..., None, None] * at.turned)
@@ -96,10 +101,12 @@ class PatchStress(TetrahedronStress):
     def vjp(self, H, z, P_adj, derived, adjoint):
         W = self.chosen_vjp(P_adj)
         at = PatchPressure.of(self.scene, derived, H, W)
-        by_H, by_kept = self.law.vjp(H.reshape(-1, 3, 3), W.reshape(-1, 3, 3), np.tile(at.kept, (len(H), 1)))
+        p, S = self._with_state(at.kept, z), z.shape[-1]
+        by_H, by_p = self.law.vjp(H.reshape(-1, 3, 3), W.reshape(-1, 3, 3), p)
+        by_kept, by_z = np.split(by_p, [self.law.K - S], 1)
         by_theta, by_lam, by_V = at.vjp(at.theta_jvp(W))  # the work of dtheta/dF on W is the adjoint of pi
-        by_kept = by_kept.reshape(len(H), -1, self.law.K).sum(0)
+        by_kept = by_kept.reshape(len(H), -1, self.law.K - S).sum(0)
         self._add_coefficients(at.split_vjp(by_kept, by_lam), derived, adjoint)
         adjoint.volumes = adjoint.volumes + by_V.reshape(adjoint.volumes.shape)
         H_adj = by_H.reshape(H.shape) + at.value[..., None, None] * at.turned + by_theta[..., None, None] * at.G
-        return H_adj, np.zeros_like(z)  # a law of patches remembers nothing
+        return H_adj, by_z.reshape(z.shape)

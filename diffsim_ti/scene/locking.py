@@ -29,7 +29,12 @@ def warn_if_locking(scene: "Scene") -> None:
     remedy = "take mesh.quadratic(), " if linear else ""
     if _averages(scene):
         remedy += 'pass volume="patches" to the Scene, '
-    if nu > limit + 1e-12:
+    if scene.law.plastic and linear:
+        warn(
+            f"{scene.material.name}: linear tetrahedra lock (carry too much load) once they flow, which keeps the volume: "
+            f"{remedy.removesuffix(', ')}"
+        )
+    elif nu > limit + 1e-12:
         warn(
             f"{scene.material.name}: Poisson's ratio {nu:.6g} is above {limit}, where {kind} tetrahedra lock (bend too "
             f'little): {remedy}cut the cells of create_box with pattern="five", refine the mesh, or lower the ratio'

@@ -50,7 +50,7 @@ class StaticSolver(ImplicitSolver):
         for x in scene.interactions:
             if x.no_equilibrium:
                 raise ValueError(f"{x.no_equilibrium}; take a solver with inertia")
-        if scene.law.state_names:
+        if scene.law.state_names and not scene.law.plastic:
             raise ValueError(
                 f"{scene.law.title} has a state that moves on with time, and an equilibrium has none: take a solver with "
                 "inertia, or the law of what lasts when all has settled, which of Prony(material, shares, times) is the "

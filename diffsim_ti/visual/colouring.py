@@ -95,7 +95,8 @@ def field_of(simulator: Simulator, name: str) -> np.ndarray:
 
 
 def measured_fields(simulator: Simulator) -> dict[str, np.ndarray]:
-    """von Mises stress [Pa], energy density [J/m^3] and J [-] of a state, per tetrahedron; of ten nodes the first is that at
+    """von Mises stress [Pa], energy density [J/m^3] and J [-] of a state, and of a plastic law its equivalent plastic strain
+    [-] (of ten nodes its mean over the points), per tetrahedron; of ten nodes the first is that at
     vertices, as `Stress(at="vertices", von_mises=True)` has it."""
     measured, mesh = simulator.tetrahedron_fields(), simulator.scene.mesh
     fields = {name: getattr(measured, name) for name in ("von_mises", "energy_density", "J")}
@@ -103,4 +104,7 @@ def measured_fields(simulator: Simulator) -> dict[str, np.ndarray]:
         means = simulator.workspace.kept("means at vertices", lambda: PointMeans.of_vertices(mesh, []))
         stress = measured.stress.reshape(1, -1, 3, 3)
         fields["von_mises"] = von_mises(means.value(stress, np.ones(stress.shape[1])))[0]
+    if (law := simulator.scene.law).plastic:
+        at_points = simulator.law_state[..., law.state_names.index("plastic_strain")]
+        fields["plastic_strain"] = at_points.reshape(mesh.num_tetrahedra, -1).mean(1)
     return fields

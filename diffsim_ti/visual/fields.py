@@ -29,6 +29,7 @@ FIELDS = {
     "speed": Field("speed [m/s]"),
     "von_mises": Field("von Mises stress [Pa]"),
     "energy_density": Field("energy density [J/m^3]"),
+    "plastic_strain": Field("equivalent plastic strain [-]"),
     "J": Field("volume ratio J [-]", "PuOr", 1.0),
     "stiffness": Field("Young's modulus [Pa]"),
     "gradient": Field("size of the gradient"),

@@ -65,6 +65,17 @@ def accepted(kind, scene):
     return scene
 
 
+def plastic(kind, seed: int, law, mesh, E: float):
+    """A metal so soft that it flows, in a tenth of the structures behind those of golden.py, instead of the law."""
+    if kind.number < 60 or np.random.default_rng([41, kind.number]).random() > 0.1:
+        return law
+    own, rng = np.random.default_rng([42, kind.number]), np.random.default_rng([43, seed])
+    first = E * rng.uniform(0.002, 0.01) * (1 if kind.uniform else rng.uniform(1, 2, mesh.num_tetrahedra))
+    more = dict(saturation_stress=2.5 * first, saturation_exponent=rng.uniform(5, 50)) if own.random() < 0.5 else {}
+    more |= dict(kinematic_hardening=E * rng.uniform(0.01, 0.1)) if own.random() < 0.5 else {}
+    return ds.J2Plasticity(E, 0.3, first, E * rng.uniform(0, 0.1), **more)
+
+
 def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list[ds.Muscle]:
     """In a fifth of the structures."""
     if np.random.default_rng([26, kind.number]).random() > 0.2:

@@ -33,7 +33,7 @@ def functions_of(law, features, lanes: bool) -> Tetrahedron:
 
 @dataclass(frozen=True)
 class PatchedTetrahedron(Tetrahedron):
-    """The functions of `Tetrahedron`, with the same meaning. In all of them q = [*p', pi] (patch_law.py)."""
+    """The functions of `Tetrahedron`, with the same meaning. In all of them q = [*p', *z, pi] (patch_law.py)."""
 
     @property
     def is_short(self) -> bool:
@@ -111,12 +111,21 @@ class PatchedTetrahedron(Tetrahedron):
             dvolume, dstiff, dswollen = changes
             dlam_p, dtheta_p = (dstiff - lam_p * dvolume) / volume, (dswollen - theta_p * dvolume) / volume
             of_patch["dpi"] = let(dlam_p * theta_p + lam_p * dtheta_p)
-        return [SimpleNamespace(**vars(t), **of_patch, q=[*t.p, pressure]) for t in known]
+        return [SimpleNamespace(**vars(t), **of_patch, pressure=pressure) for t in known]
+
+    @traced
+    def _numbers_in(self, t, item, at, s, q) -> list:
+        """What the law takes at point q of a patch, of which t is a point."""
+        return [*t.p, *self.state_of(item, at.z, s, q), t.pressure] if self.has_state else [*t.p, t.pressure]
 
     @traced
     def each_seen(self, item, scene, at, s, body) -> None:
         known = self._patch_of(item, scene, at, s)
-        self.each_point([[t.H for t in known]], lambda q, H: body(q, H, known[0].q) or ((), ()), tensors=0)
+
+        def see(q, H):
+            return body(q, H, self._numbers_in(known[0], item, at, s, q)) or ((), ())
+
+        self.each_point([[t.H for t in known]], see, tensors=0)
 
     # ---- forces and their derivatives -------------------------------------------------------------------------------
 
@@ -125,7 +134,7 @@ class PatchedTetrahedron(Tetrahedron):
         known = self._patch_of(item, scene, at, s)
 
         def push(q, H, B):
-            P = self.law.stress(H, known[0].q)
+            P = self.law.stress(H, self._numbers_in(known[0], item, at, s, q))
             return [(P * self.volume_of(item, scene.volumes, q)) @ B.transpose()], ()
 
         self.store(item, corner, self.each_point([[t.H for t in known], [t.B for t in known]], push)[0][0])
@@ -142,7 +151,8 @@ class PatchedTetrahedron(Tetrahedron):
         known = self._patch_of(item, scene, at, s, at.w)
 
         def push(q, H, dH, gradient, B):
-            dP = self.law.stress_differential(H, dH, known[0].q) + gradient * known[0].dpi
+            numbers = self._numbers_in(known[0], item, at, s, q)
+            dP = self.law.stress_differential(H, dH, numbers) + gradient * known[0].dpi
             return [(dP * self.volume_of(item, scene.volumes, q)) @ B.transpose()], ()
 
         lists = [[getattr(t, name) for t in known] for name in ("H", "dH", "gradient", "B")]
@@ -150,31 +160,47 @@ class PatchedTetrahedron(Tetrahedron):
 
     @traced
     def forces_jvp(self, item, scene, at, s, change, corner, dots) -> None:
-        pushes = []
-        for t in self._patch_of(item, scene, at, s, change.u, dots):
-            dP = self.law.stress_jvp(t.H, t.dH, t.q, [*t.dp, t.dpi])
-            turned = t.B * t.dV + t.dB * t.V
-            pushes.append((dP * t.V) @ t.B.transpose() + self.law.stress(t.H, t.q) @ turned.transpose())
-        self.store(item, corner, pushes)
+        known = self._patch_of(item, scene, at, s, change.u, dots)
+
+        def push(q, H, dH, B, dB):
+            numbers = self._numbers_in(known[0], item, at, s, q)
+            dz = self.state_of(item, change.z, 0, q) if self.has_state else []
+            P, dP = self.law.stress_and_jvp_at([H], [dH], numbers, [*known[0].dp, *dz, known[0].dpi])
+            volume = self.volume_of(item, scene.volumes, q)
+            turned = B * self.volume_of(item, dots.volumes, q) + dB * volume
+            return [(dP * volume) @ B.transpose() + P @ turned.transpose()], ()
+
+        lists = [[getattr(t, name) for t in known] for name in ("H", "dH", "B", "dB")]
+        self.store(item, corner, self.each_point(lists, push)[0][0])
 
     @traced
     def forces_vjp(self, item, scene, at, s, w, corner, adjoint, shape: bool, add: bool = False) -> None:
         """The work of a patch's pressure on w is -W_p lam_p theta_p dtheta_p, with dtheta_p the change of theta_p for w."""
-        known, pushes = self._patch_of(item, scene, at, s, w), []
-        for q, t in enumerate(known):
-            dP, products = self.law.stress_differential_and_products(t.H, t.dH, t.q)
-            dP = dP + t.gradient * t.dpi
-            pushes.append((dP * t.V) @ t.B.transpose())
-            minus = let(ti.cast(-1, self.fp) * t.V)
-            by = self.law.split_vjp([let(minus * x) for x in products], let(minus * t.theta_p * t.dtheta_p))
-            self.items.add(adjoint.coefficients, len(products), item, by)
-            if shape:
-                self._shape_vjp(item, t, dP, adjoint, q)
-        self.store(item, corner, pushes, add)
+        known = self._patch_of(item, scene, at, s, w)
+        patch = known[0]
 
-    @traced
-    def _shape_vjp(self, item, t, dP, adjoint, q: int) -> None:
-        P, minus = self.law.stress(t.H, t.q), ti.cast(-1, self.fp)
-        by_B = (t.D.transpose() @ dP + t.W.transpose() @ P) * let(minus * t.V)
-        in_patch = t.dtheta_p * (t.theta_p * (t.lam - t.lam_p - t.lam_p) + t.lam_p * t.theta)
-        self._add_shape(item, adjoint, q, by_B, minus * (inner(P, t.dH) + in_patch))
+        def push(q, H, dH, gradient, B, D, W):
+            numbers, volume = self._numbers_in(patch, item, at, s, q), self.volume_of(item, scene.volumes, q)
+            both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
+            *P, (dP,), products = both([H], dH, numbers)  # the stress itself is felt by the rest shape alone
+            dP = dP + gradient * patch.dpi
+            minus = let(ti.cast(-1, self.fp) * volume)
+            by_p, by_z = self._parted([let(minus * x) for x in products])
+            if self.has_state:
+                before = self.state_of(item, adjoint.z, 0, q)
+                self.put_state(item, adjoint.z, 0, [a + b for a, b in zip(before, by_z)], q)
+            if shape:
+                (P,), theta = P, self.law.base.dilatation(H)
+                by_B = (D.transpose() @ dP + W.transpose() @ P) * minus
+                in_patch = patch.dtheta_p * (
+                    patch.theta_p * (patch.lam - patch.lam_p - patch.lam_p) + patch.lam_p * theta
+                )
+                self._add_shape(item, adjoint, q, by_B, ti.cast(-1, self.fp) * (inner(P, dH) + in_patch))
+            by = self.law.split_vjp(by_p, let(minus * patch.theta_p * patch.dtheta_p))
+            return [(dP * volume) @ B.transpose()], by
+
+        count = len(self.law.coefficient_names)
+        lists = [[getattr(t, name) for t in known] for name in ("H", "dH", "gradient", "B", "D", "W")]
+        (pushes,), by_p = self.each_point(lists, push, sums=count)
+        self.store(item, corner, pushes, add)
+        self.items.add(adjoint.coefficients, count, item, by_p)
