@@ -21,7 +21,7 @@ WORDS = {
     r"\brows? of (?:a|the|its) path": "samples, keyframes",
     r"\btwins?\b": "device counterpart, copy for another precision",
     r"\bwalls\b": "obstacle's pose or velocity; boundary of a cavity",
-    r"\bties?\b|\bfounded\b": "springs and cables; on an elastic foundation",
+    r"\bfounded\b": "on an elastic foundation",
     r"\bclamps\b": "supports, prescribed motion",
     r"\blaid on\b|\blays? .{1,20}\bon\b": "applied in steps, load stepping",
     r"\b(?:does|do) not know\b": "does not support",
@@ -40,7 +40,6 @@ EXCEPTIONS = {
     r"(Law|InvariantLaw|StrainLaw|EnergyLaw|UnequalSteps|SolveReport|\w*Solver)(\.\w+)?: .*pass": "what extends the package "
     "takes the word of its architecture: an explicit substep, or an implicit or static solve",
     r"residual %\.2g": "a format of a number",
-    r"name=\"tie\"": "a name that a user gives",
     r"inside from outside": "a law that does not know inside from outside",
 }
 

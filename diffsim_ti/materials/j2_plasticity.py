@@ -135,7 +135,7 @@ class J2Plasticity(Material):
 
     tau = J sigma Kirchhoff's stress, a the equivalent plastic strain. Plastic flow is in the direction of dev tau - back
     stress and keeps the volume; it is found by a return mapping with the exponential, which is exact for a proportional
-    strain however long the pass, and otherwise of first order in the strain of a pass. Y is linear without saturation_stress
+    strain however long the step, and otherwise of first order in the strain of a step. Y is linear without saturation_stress
     (Voce). kinematic_hardening k: a back stress 2/3 k times the integral of the rate of plastic strain, in the unloaded
     configuration, which has no spin (Prager).
 
@@ -144,7 +144,7 @@ class J2Plasticity(Material):
     yield_stress: what softens would flow in a band as narrow as the mesh lets it.
 
     A law with a state (law.py): F_p^-1 - I, the equivalent plastic strain, and with kinematic hardening the back strain, six
-    numbers. The stress of a pass has a potential, whose Hessian is the consistent tangent of implicit and static solves; the
+    numbers. The stress of a step has a potential, whose Hessian is the consistent tangent of implicit and static solves; the
     latter follow the steps of a run, whatever their dt. Gradients are exact but where a point just reaches its yield stress:
     there the slope jumps from that of elastic to that of plastic loading, and one of both is given.
     Linear tetrahedra lock in plastic flow: take mesh.quadratic() or volume="patches".

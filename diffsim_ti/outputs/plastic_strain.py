@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 class PlasticStrain(_Tensors):
     """Equivalent plastic strain [-], the integral of sqrt(2/3) |D_p| over time, as the law remembers it in each frame:
-    after implicit and static passes that of the frame, after explicit ones that of the pass before.
+    after implicit and static steps that of the frame, after explicit ones that of the substep before.
 
     at: "tetrahedra", (frames, num_tetrahedra), the means over their points; "vertices", (frames, num_vertices); or material
     points X [m], shape (k, 3). of, name: as of `Stress`. In pictures colour="plastic_strain".

@@ -34,7 +34,7 @@ class Reaction(Output):
     says of it.
 
     support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
-        Or a `Tie` of the scene: the force on its surface b, which the vertices there feel where no support holds them,
+        Or a `Tie` of the scene: the force on its surface b, which acts on the vertices there where no support holds them,
         without their inertia.
     about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
         `mesh.vertex_indices(support)`. name: how a loss calls it.

@@ -115,7 +115,7 @@ class MeshObstacle(Obstacle):
         return out
 
     def primitives_for(self, mesh, width):
-        """Those of its edges and corners that faces of the body are wide enough to feel between their own corners."""
+        """Those of its edges and corners that faces of the body are wide enough to meet between their own corners."""
         edges = self._made.sharp_edges(longest_edge(mesh), BOW * width)
         points = np.union1d(edges, self._made.one[self._made.points])
         return MeshPrimitives.of(points, edges, self._tree.x) if len(points) else None
