@@ -156,7 +156,6 @@ LEFT_OUT = {
         test_contact_crossing::test_thin_obstacles_are_not_jumped_over[cylinder-VelocityVerletSolver_force]
     """,
     "a plane; gaps in a bowl": """
-        test_curved_contact::test_energy_is_that_of_the_formula_and_all_solvers_feel_it[bowl]
     """,
     "BDF2 through the command line; the advice's own fall, by velocity Verlet": """
         test_cli::test_a_fall_of_the_battery[verlet]
