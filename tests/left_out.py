@@ -155,8 +155,6 @@ LEFT_OUT = {
         test_contact_crossing::test_thin_obstacles_are_not_jumped_over[cylinder-SemiImplicitSolver_force]
         test_contact_crossing::test_thin_obstacles_are_not_jumped_over[cylinder-VelocityVerletSolver_force]
     """,
-    "a plane; gaps in a bowl": """
-    """,
     "BDF2 through the command line; the advice's own fall, by velocity Verlet": """
         test_cli::test_a_fall_of_the_battery[verlet]
     """,

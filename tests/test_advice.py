@@ -152,10 +152,6 @@ FOLLOWED = {
         lambda: scene(law=ds.KelvinVoigt(LAW, time=0.1), volume="patches"),
         lambda: scene(law=ds.KelvinVoigt(LAW, time=0.1), volume="tetrahedra"),
     ),
-    ("materials/patch_law.py", "averages energies of displacements"): (
-        lambda: scene(law=ds.Prony(LAW, [0.5], [0.1]), volume="patches"),
-        lambda: scene(law=ds.Prony(LAW, [0.5], [0.1]), volume="tetrahedra"),
-    ),
     ("materials/grown.py", "does not support it"): (
         lambda: scene(terms=[ds.Growth(0.1)], volume="patches"),
         lambda: (scene(terms=[ds.Growth(0.1)]), scene(terms=[ds.Growth(0.1)], mesh=CUBE.quadratic())),
