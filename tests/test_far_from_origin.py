@@ -144,7 +144,7 @@ CASES = {
         *F32,
     ),
     "a turn": (lambda c: scene(ds.Box(BELOW, path=STILL, about=c, stiffness=1.0, width=0.01), mesh=THERE), None, BELOW),
-    "a shape of one's own": (lambda o: scene(Ring(BELOW, 0.1, 0.05, stiffness=1.0), mesh=THERE, **o), *F32),
+    "a shape of one's own": (lambda o: scene(Ring(BELOW, 0.1, 0.05, stiffness=1.0, by_pairs=False), mesh=THERE, **o), *F32),
     "a start": (lambda kind: scene(mesh=THERE, initial_positions=THERE.vertices.astype(kind)), *SINGLE),
     "a sphere": (
         lambda kind: scene(ds.Sphere(BELOW.astype(kind), 1.0, stiffness=1.0, width=0.01), mesh=THERE),
@@ -173,7 +173,7 @@ def test_an_obstacle_made_far_away_is_measured_from_there():
 
 
 def test_a_shape_of_ones_own_says_what_is_a_place():
-    ring = Ring(BELOW, 0.1, 0.05, stiffness=1.0).with_input("ring_center", axes="xyz")
+    ring = Ring(BELOW, 0.1, 0.05, stiffness=1.0, by_pairs=False).with_input("ring_center", axes="xyz")
     made = scene(ring, mesh=THERE)
     own = made.inputs.derive(made.inputs.values).parameters[made.inputs.parameters.of(made.term(Ring))]
     np.testing.assert_allclose(own[:5], [*(BELOW - made.origin), 0.1, 0.05], rtol=1e-12)

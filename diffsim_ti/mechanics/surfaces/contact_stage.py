@@ -8,6 +8,7 @@ surfaces apart. Vertices of no near pair keep what they had, bit by bit.
 
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from math import fsum
 from types import SimpleNamespace
 
 import numpy as np
@@ -403,7 +404,7 @@ class PairContact(Stage):
         )  # fmt: skip
         e_adj, b_adj = np.zeros((2, count, 3))
         e_adj[own], b_adj[own] = p[nodes], now.decay * q[nodes]
-        by_decay = float((q[nodes] * one.b[own]).sum())
+        by_decay = fsum((q[nodes] * one.b[own]).ravel())  # whatever other nodes the set has, which add zeros
         for part in one.parts[::-1]:
             e_adj, b_adj = one.solver.back(part, of, e_adj, b_adj, adj)
         self.by_rate += now.alpha_by_rate * adj.alpha + now.decay_by_rate * by_decay
