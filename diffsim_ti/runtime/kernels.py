@@ -117,8 +117,7 @@ class Repeated:
 
     parts: [(kernel, records)], as of `Kernel.bind`; an array that several of them take is one argument. The body of the
     first says whether the others are still wanted. On one thread of the processor it is asked each time; elsewhere the
-    others themselves do nothing once they are not wanted, in a list of tasks that names them so often
-    (repeated_loops.py) or, where there is none, in a launch each time.
+    others themselves do nothing once they are not wanted, in a list of tasks that names them so often (repeated_loops.py).
     """
 
     def __init__(self, name: str, parts: list, parallel: bool, vectorized: bool = False):
@@ -130,26 +129,23 @@ class Repeated:
                     known[id(array)] = f"k{k}_{b}_{a}"
                     arrays.append(array)
             names.append(tuple((place, known[id(array)]) for place, array in own.items()))
-        self._names = [kernel.numbers for kernel in kernels]
-        self._loop = "serial" if not parallel and runs_on_cpu() else "tasks" if can_repeat() else "launches"
-        made = _repeated_kernel(name, tuple(kernels), tuple(names), self._loop)
+        self._names, one_thread = [kernel.numbers for kernel in kernels], runs_on_cpu() and not parallel
+        made = _repeated_kernel(name, tuple(kernels), tuple(names), one_thread)
         of = next((found for k in kernels if (found := k.options["title"].partition(" of ")[2])), "")
-        options = dict(
-            title=f"the kernel {name}" + (f" of {of}" if of else ""), loops=-1 if self._loop == "tasks" else 0
-        )
+        options = dict(title=f"the kernel {name}" + (f" of {of}" if of else ""), loops=0 if one_thread else -1)
         self._launch = Launch(made, *arrays, vectorized=vectorized, **options)
 
+    @staticmethod
+    def is_possible(parallel: bool) -> bool:
+        """Whether this machine can: Vulkan's drivers lend a kernel too few arrays."""
+        return runs_on_cpu() and not parallel or can_repeat()
+
     def __call__(self, times: int, *numbers: dict) -> None:
-        values = [own[n] for names, own in zip(self._names, numbers, strict=True) for n in names]
-        if self._loop == "launches":
-            for _ in range(times):
-                self._launch(*values, 1)
-        else:
-            self._launch(*values, times)
+        self._launch(*(own[n] for names, own in zip(self._names, numbers, strict=True) for n in names), times)
 
 
 @lru_cache(maxsize=None)
-def _repeated_kernel(name: str, kernels: tuple, names: tuple, loop: str):
+def _repeated_kernel(name: str, kernels: tuple, names: tuple, one_thread: bool):
     """The first of the kernels says whether it goes on."""
     lines, calls, arrays, numbers, scope = [], [], {}, {}, {}
     for k, (kernel, own) in enumerate(zip(kernels, names)):
@@ -159,7 +155,7 @@ def _repeated_kernel(name: str, kernels: tuple, names: tuple, loop: str):
         numbers |= {a: kind for a, kind in arguments.items() if a in of_numbers}
         scope[f"body{k}"] = kernel.body
         lines, calls = lines + first, [*calls, call]
-    if loop == "serial":
+    if one_thread:
         inner = [f"    if {calls[0]}:", *(f"        {call}" for call in calls[1:])]
         lines += ["ti.loop_config(serialize=True)", "for _ in range(times):", *inner]
     else:

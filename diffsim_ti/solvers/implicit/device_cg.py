@@ -16,7 +16,7 @@ class DeviceCG:
 
     free: what vertices may do (free.py), not of sets that move by few numbers.
     cycle: the preconditioner, z = cycle(r) (cycle.py); None: `put_inverse` sets its blocks, one for each vertex.
-    An iteration is one kernel, unless surfaces meet, and a launch makes many.
+    An iteration is one kernel, unless surfaces meet or the backend is Vulkan, and a launch makes many.
     """
 
     most_chunks, shortest = 256, 32
@@ -41,7 +41,8 @@ class DeviceCG:
         if cycle is None:
             self.inverse = runtime.array(self._vector, 3, n)
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
-        whole = runs_on_cpu() and not parallel and potential.is_one_kernel
+        self._is_one_kernel = potential.is_one_kernel and Repeated.is_possible(parallel)
+        whole = runs_on_cpu() and not parallel and self._is_one_kernel
         # iterations between looks at the state; on a card so many as the solve before took
         self._look, self._last = self.many if whole else 1 if runs_on_cpu() else 0, 10
         self._iterations = {}  # (with a matrix, convex) -> iterate(times, rounding)
@@ -80,7 +81,7 @@ class DeviceCG:
         kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
         before = [*before, (kernels.turn, own, sizes)]
-        if potential.is_one_kernel:
+        if self._is_one_kernel:
             parts = [(kernels.wanted, own, {}), *before, (*potential.multiplying, None), (kernels.step, own, None)]
             repeated, sizes_before = (
                 Repeated("cg", [x[:2] for x in parts], self.parallel, lanes),
