@@ -46,7 +46,7 @@ class DeviceCG:
         # iterations between looks at the state; on a card so many as the solve before took
         self._look, self._last = self.many if whole else 1 if runs_on_cpu() else 0, 10
         self._iterations = {}  # (with a matrix, convex) -> iterate(times, rounding)
-        self._room = 0  # blocks of that matrix
+        self._room = -1  # blocks of that matrix
         self._filled: np.ndarray | None = None  # what `mass` holds
 
     def _columns(self, blocks: np.ndarray, room: int = 0):
@@ -68,7 +68,7 @@ class DeviceCG:
         """A matrix of blocks that joins the Hessian."""
         more = more.tobsr((3, 3))
         if len(more.data) > self._room:
-            self._room, self._iterations = 2 * len(more.data), {}
+            self._room, self._iterations = max(2 * len(more.data), 1), {}
             self.start, self.column = runtime.array(ti.i32, self.nodes + 1), runtime.array(ti.i32, self._room)
             self.blocks = self._columns(more.data, self._room)
         self._fill(self.blocks, more.data)
