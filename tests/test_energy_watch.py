@@ -87,7 +87,12 @@ WORK = {
     "a ball": lambda: body(
         [
             ds.Sphere(
-                [0.05, -0.04, 0.05], 0.05, stiffness=400.0, width=0.02, path=lambda t: [0, 0.05 * np.sin(30 * t), 0]
+                [0.05, -0.04, 0.05],
+                0.05,
+                stiffness=400.0,
+                width=0.02,
+                path=lambda t: [0, 0.05 * np.sin(30 * t), 0],
+                by_pairs=False,  # whose work is not counted
             )
         ],
         ABOVE,

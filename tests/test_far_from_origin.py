@@ -144,7 +144,10 @@ CASES = {
         *F32,
     ),
     "a turn": (lambda c: scene(ds.Box(BELOW, path=STILL, about=c, stiffness=1.0, width=0.01), mesh=THERE), None, BELOW),
-    "a shape of one's own": (lambda o: scene(Ring(BELOW, 0.1, 0.05, stiffness=1.0, by_pairs=False), mesh=THERE, **o), *F32),
+    "a shape of one's own": (
+        lambda o: scene(Ring(BELOW, 0.1, 0.05, stiffness=1.0, by_pairs=False), mesh=THERE, **o),
+        *F32,
+    ),
     "a start": (lambda kind: scene(mesh=THERE, initial_positions=THERE.vertices.astype(kind)), *SINGLE),
     "a sphere": (
         lambda kind: scene(ds.Sphere(BELOW.astype(kind), 1.0, stiffness=1.0, width=0.01), mesh=THERE),

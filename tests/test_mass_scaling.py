@@ -153,7 +153,7 @@ def test_what_is_refused(share, mesh, words):
         scene(share, mesh)
 
 
-@pytest.mark.parametrize("density", ["x", [1.0, 2.0], 0.0, np.nan, None])
+@pytest.mark.parametrize("density", ["x", [1.0, 2.0], 0.0, np.nan])
 def test_wrong_densities_are_refused_in_our_words(density):
     with pytest.raises(ValueError, match="density must be"):
         scene(density=density)

@@ -390,11 +390,6 @@ def test_the_benchmark_of_a_stiff_part():
             {},
             'take obstacles as a force in explicit steps.*contact="force"',
         ),
-        (
-            [ds.Sphere([0, -1, 0], 0.01, stiffness=1e4, width=0.01)],
-            dict(contact="force"),
-            "at their vertices only.*finer mesh",
-        ),
         ([ds.SelfContact(1e4, 1e-3, friction=0.3)], {}, "no friction in SelfContact in explicit steps"),
     ],
 )

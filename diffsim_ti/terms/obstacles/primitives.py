@@ -79,6 +79,9 @@ BOX = BoxPrimitives(
 )
 
 
+MOST_SIDES = 10_000  # of a cylinder whose radius is not small against anything
+
+
 @dataclass(frozen=True)
 class PrismPrimitives(Primitives):
     """Of a cylinder: start, end, radius; the edges of a prism of `sides` sides whose corners lie on it. across: a direction
@@ -90,7 +93,8 @@ class PrismPrimitives(Primitives):
     @classmethod
     def of(cls, axis: np.ndarray, radius: float, off: float) -> "PrismPrimitives":
         """Of a cylinder with an axis [m], from which it is off by so much at most [m]."""
-        n = max(8, int(np.ceil(np.pi / np.arccos(max(1 - off / radius, 0.0)))))
+        angle = np.arccos(max(1 - off / radius, 0.0))
+        n = int(np.clip(np.ceil(np.pi / max(angle, 1e-300)), 8, MOST_SIDES))
         ring, following = np.arange(n), np.roll(np.arange(n), -1)
         pairs = (ring, following), (n + ring, n + following), (ring, n + ring)
         edges = np.concatenate([np.stack(pair, 1) for pair in pairs])
