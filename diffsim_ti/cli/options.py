@@ -273,11 +273,11 @@ def print_summary(run: ForwardRun, setup: float, writing: float, files: list[str
     def row(name: str, line: str) -> None:
         table.add_row(name, Text(line))  # in which [m] is a unit, not markup
 
-    names = iter(("mesh", "material", "", "solver"))
+    names, named = iter(("mesh", "material", "", "solver")), ("terms", "fixed vertices", "chosen from weight and speed")
+    named += ("inputs", "built", "moving by few numbers", "by pairs, also between vertices")
     for line in sim.describe().splitlines():
         name, _, rest = line.partition(": ")
-        own = name in ("terms", "fixed vertices", "chosen from weight and speed", "inputs", "built")
-        row(*(name, rest) if own else (next(names, ""), line))
+        row(*(name, rest) if name in named else (next(names, ""), line))
     row("simulated", f"{sim.time:.4g} s in {len(seen.substeps)} frames")
     counts = f"{substeps}, from {min(seen.substeps)} to {max(seen.substeps)} a frame"
     row("substeps", f"{counts}, {seen.shortest:.3g} to {seen.longest:.3g} s each")

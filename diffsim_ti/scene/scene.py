@@ -379,7 +379,7 @@ class Scene(MadeAgain):
                 + (", moving" if self.motion is not None else ""),
                 *([f"moving by few numbers: {self.reduced.describe()}"] if self.reduced else []),
                 *chosen,
-                *([f"acting between vertices, by pairs: {', '.join(by_pairs)}"] if by_pairs else []),
+                *([f"by pairs, also between vertices: {', '.join(by_pairs)}"] if by_pairs else []),
                 "inputs: " + ", ".join(f"{name}{i.in_brackets}" for name, i in self.inputs.described.items()),
             ]
         )
