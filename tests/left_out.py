@@ -176,6 +176,21 @@ LEFT_OUT = {
     "ten nodes on patches by stable neo-Hookean; the law on tetrahedra": """
         test_quadratic::test_forces_and_stiffness_are_derivatives_of_the_energy[Corotated-patches]
     """,
+    "explicit transposes in `test_quadratic.py`; the same outputs in other solvers": """
+        test_quadratic_outputs::test_derivatives[verlet]
+    """,
+    "tetrahedra of ten nodes without patches, and patches in implicit steps": """
+        test_quadratic_solvers::test_adjoints_are_the_transposes_of_tangents[StaticSolver-patches]
+    """,
+    "Ogden without lanes, and other laws with them": """
+        test_open_laws::test_everything_follows_from_the_energy[ogden-f64-lanes]
+    """,
+    "the same beside other loads": """
+        test_loads_together::test_and_beside_patches_and_self_contact[ImplicitEulerSolver-True-options2]
+    """,
+    "one ball in semi-implicit steps": """
+        test_curved_contact::test_curved_faces_feel_a_ball_where_they_are[ImplicitEulerSolver]
+    """,
     "the same obstacles by velocity Verlet; the others of backward Euler": """
         test_contact_force::test_seeds_are_the_transpose_of_tangents[euler round]
     """,

@@ -125,7 +125,7 @@ def test_growth_of_ones_own_scene_by_the_command(tmp_path):
     (tmp_path / "hang.py").write_text(
         "from diffsim_ti.study.growth import GROWTH_SCENES\nscene = GROWTH_SCENES['clamped beam let go']('f64')\n"
     )
-    command = ["growth", str(tmp_path / "hang.py"), "--duration", "0.1", "--precision", "f64", "-o", str(tmp_path)]
+    command = ["growth", str(tmp_path / "hang.py"), "--duration", "0.03", "--precision", "f64", "-o", str(tmp_path)]
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
     assert "hang: gradients grow to" in done.output
