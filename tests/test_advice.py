@@ -348,6 +348,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("runtime/start.py", "was forked"): ANOTHER_MACHINE,
     ("runtime/start.py", "fast_math=True"): ANOTHER_MACHINE,
     ("runtime/start.py", "Vulkan has no float64"): ANOTHER_MACHINE,
+    ("solvers/explicit/solver.py", "lends a kernel too few arrays"): ANOTHER_MACHINE,
     ("solvers/implicit/closing.py", "but for contact {}"): "test_supports.py",
     ("solvers/implicit/newton.py", "pass max_iterations={}"): "test_implicit.py",
     ("mechanics/obstacles/blocked.py", "finds no room"): "test_swept.py, battery_of_impacts.py",

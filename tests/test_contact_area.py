@@ -244,6 +244,7 @@ def with_force(scene):
 
 
 @pytest.mark.backends
+@pytest.mark.usefixtures("vertices_alone")  # Vulkan knows no other stage
 @pytest.mark.parametrize("solver", [*EXPLICIT, FORCE[0]], ids=lambda s: s.__name__)
 def test_backend_transpose_of_areas(solver):
     rollout = sliding_rollout(solver, "f32")

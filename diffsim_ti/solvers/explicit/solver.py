@@ -104,6 +104,13 @@ class ExplicitSolver(Solver):
                 f"{' and reduced sets' if scene.reduced else ''}; leave stage out, or take an implicit solver"
             )
         super().__init__(scene, dt, substeps, parallel, allow_unstable, check_start)
+        by_pairs = (term and term.stage) or any(getattr(x, "primitives", None) is not None for x in scene.terms)
+        if by_pairs and contact == "stage" and not scene.reduced and runtime.arch_name() == "vulkan":
+            raise ValueError(
+                "surfaces that meet between vertices act as a stage of explicit steps, for which Vulkan lends a kernel too "
+                'few arrays: pass contact="force" (without SelfContact(stage=True)), give obstacles by_pairs=False, or take '
+                "an implicit solver or another backend"
+            )
 
     def check_contact_forces(self) -> None:
         if self.contact == "force" and any(term.acts_on_surface for term in self.scene.terms):
