@@ -100,6 +100,34 @@ def test_what_joins_products_on_the_device_is_what_joins_them_on_the_host(precis
         np.testing.assert_allclose(A(x), b, rtol=0, atol=1e-4 * np.abs(b).max() if precision == "f32" else 1e-9)
 
 
+@pytest.mark.parametrize("what", ["fixed", "floor", "slides", "foundation", "self-contact"])
+def test_all_preconditioners_and_threads_find_the_same_steps(what):
+    """Of bodies of random size, stiffness and step, across the rule that chooses: states and gradients."""
+    rng = np.random.default_rng([ord(letter) for letter in what])
+    for _ in range(2):
+        n = rng.integers(2, 6, 3)
+        mesh = ds.TetrahedralMesh.create_box(tuple(map(int, n)), tuple(0.1 * (n - 1))).translated((0, 0.012, 0))
+        more = {
+            "floor": [ds.Ground(friction=0.3, width=0.01)],
+            "foundation": [ds.ElasticFoundation(10 ** rng.uniform(4, 7), 1e4, "ymin")],
+            "self-contact": [ds.SelfContact()],
+        }.get(what, [])
+        fixed = dict(fixed="xmin", slides={"xmin": "x", "ymin": "y"}).get(
+            what, "xmin" if what == "self-contact" else None
+        )
+        law, dt = ds.StableNeoHookean(10 ** rng.uniform(3.5, 7), 0.4), 10 ** rng.uniform(-3.5, -1.3)
+        scene = ds.Scene(mesh, law, 1000.0, [ds.Gravity(), *more], fixed, precision="f64")
+        found = []
+        for options in (dict(), dict(parallel=True), dict(preconditioner="block_jacobi")):
+            rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt, tolerance=1e-9, **options), 2)
+            frames = rollout.forward()
+            gradient = rollout.vjp(frames, np.ones_like(frames.positions))["youngs_modulus"]
+            found.append((frames.displacements[-1], gradient))
+        for u, gradient in found[:2]:
+            assert np.abs(u - found[2][0]).max() < 1e-6 * np.abs(found[2][0]).max()
+            np.testing.assert_allclose(gradient, found[2][1], rtol=1e-4)
+
+
 def test_a_cycle_is_symmetric_and_positive_definite(static):
     u, rng = static.u_star, np.random.default_rng(0)
     M = preconditioner_at(static, u)

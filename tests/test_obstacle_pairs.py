@@ -204,3 +204,20 @@ def test_refusals_name_what_they_are_about():
         ds.Simulator(ds.ImplicitEulerSolver(cube(below("edge of a box", -1e-3)), dt=1e-3))
     with pytest.raises(ValueError, match="HalfSpace: by_pairs is for shapes of points and edges"):
         ds.HalfSpace(by_pairs=True)
+
+
+@pytest.mark.backends
+def test_vulkan_refuses_the_stage_and_takes_what_the_error_names():
+    if ds.runtime.arch_name() != "vulkan":
+        pytest.skip("kernels take so many arrays here")
+    mesh, law = ds.TetrahedralMesh.create_box(2, SIZE), ds.StableNeoHookean(5e4, 0.3)
+    ball, blind = (ds.Sphere((0.05, -0.03, 0.05), 0.01, **BARRIER, **how) for how in ({}, dict(by_pairs=False)))
+    scene = ds.Scene(mesh, law, 1000.0, [ball], precision="f32")
+    with pytest.raises(ValueError, match="Vulkan lends a kernel too few arrays"):
+        ds.SemiImplicitSolver(scene, dt=1e-4)
+    for solver in (
+        ds.SemiImplicitSolver(scene, dt=1e-4, contact="force"),
+        ds.SemiImplicitSolver(ds.Scene(mesh, law, 1000.0, [blind], precision="f32"), dt=1e-4),
+        ds.ImplicitEulerSolver(scene, dt=1e-3),
+    ):
+        assert np.isfinite(ds.Rollout(solver, 2).forward().positions).all()

@@ -40,7 +40,6 @@ EXCEPTIONS = {
     r"(Law|InvariantLaw|StrainLaw|EnergyLaw|UnequalSteps|SolveReport|\w*Solver)(\.\w+)?: .*pass": "what extends the package "
     "takes the word of its architecture: an explicit substep, or an implicit or static solve",
     r"residual %\.2g": "a format of a number",
-    r"inside from outside": "a law that does not know inside from outside",
 }
 
 

@@ -50,7 +50,7 @@ class StVenantKirchhoff(TwoModuli):
     """psi = mu |E|^2 + lam/2 tr(E)^2 with E = (F^T F - I) / 2 [J/m^3]; P = F (2 mu E + lam tr(E) I) [Pa].
 
     Good for large rotations with small strains. Under compression it softens and gives way (at 58 % of its length in one
-    direction), and it does not know inside from outside: take a neo-Hookean material for large compression.
+    direction), and its energy is that of the mirror image, too: take a neo-Hookean material for large compression.
 
     Arguments: see `Material`.
     Ciarlet, Mathematical Elasticity I, 1988, sec. 3.9.

@@ -71,7 +71,8 @@ class Kernel:
         self.arrays, self.numbers, self.options = arrays, tuple(numbers), dict(loops=loops, polished=polished)
         owner = getattr(body, "__self__", None)
         law = getattr(owner, "law", None) or getattr(getattr(owner, "element", None), "law", None)
-        self.options["title"] = f"the kernel {name}" + (f" of {law.title}" if hasattr(law, "title") else "")
+        self.of_law = f" of {law.title}" if hasattr(law, "title") else ""
+        self.options["title"] = f"the kernel {name}{self.of_law}"
         self.body, self._types, self._kinds = body, array_types(precision), numbers
         first, call, arguments = self.call("body", {})
         self.kernel = _compiled(name, arguments, [*first, call], dict(body=body))
@@ -131,8 +132,8 @@ class Repeated:
             names.append(tuple((place, known[id(array)]) for place, array in own.items()))
         self._names, one_thread = [kernel.numbers for kernel in kernels], runs_on_cpu() and not parallel
         made = _repeated_kernel(name, tuple(kernels), tuple(names), one_thread)
-        of = next((found for k in kernels if (found := k.options["title"].partition(" of ")[2])), "")
-        options = dict(title=f"the kernel {name}" + (f" of {of}" if of else ""), loops=0 if one_thread else -1)
+        title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
+        options = dict(title=title, loops=0 if one_thread else -1)
         self._launch = Launch(made, *arrays, vectorized=vectorized, **options)
 
     @staticmethod

@@ -1,10 +1,10 @@
 """Taylor's bar: a copper rod hits a smooth rigid wall at 227 m/s, and how short and how wide it has become after 80 us.
 
 A quarter of the rod, in explicit steps of linear tetrahedra with patches, or of ten-node ones; the wall holds z of its end,
-which stays in contact for that long. With the same numbers other codes end at lengths of 21.42 to 21.47 mm and radii of 7.0
-to 7.2 mm: Zhu, Cescotto 1995, Unified and mixed formulation of the four-node quadrilateral elements,
-doi:10.1002/nme.1620380411; Camacho, Ortiz 1997, Adaptive Lagrangian modelling of ballistic penetration of metallic targets,
-doi:10.1016/S0045-7825(96)01134-6.
+which stays in contact for that long. With the same numbers other codes are reported
+to end near lengths of 21.5 mm and radii of 7.0 to 7.2 mm; the problem stands, among others, in Zhu, Cescotto 1995,
+Unified and mixed formulation of the four-node quadrilateral elements, doi:10.1002/nme.1620380411; Camacho, Ortiz 1997,
+Adaptive Lagrangian modelling of ballistic penetration of metallic targets, doi:10.1016/S0045-7825(96)01134-6.
 
     python examples/plasticity/taylor_bar.py [--quick]
 """

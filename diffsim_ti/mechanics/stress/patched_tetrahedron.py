@@ -182,7 +182,7 @@ class PatchedTetrahedron(Tetrahedron):
         def push(q, H, dH, gradient, B, D, W):
             numbers, volume = self._numbers_in(patch, item, at, s, q), self.volume_of(item, scene.volumes, q)
             both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
-            *P, (dP,), products = both([H], dH, numbers)  # the stress itself is felt by the rest shape alone
+            *P, (dP,), products = both([H], dH, numbers)  # only the rest shape's adjoint reads the stress itself
             dP = dP + gradient * patch.dpi
             minus = let(ti.cast(-1, self.fp) * volume)
             by_p, by_z = self._parted([let(minus * x) for x in products])

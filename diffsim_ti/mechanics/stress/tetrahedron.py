@@ -305,7 +305,7 @@ class Tetrahedron(Growing):
             B, volume = self.gradients_of(item, scene.gradients, q), self.volume_of(item, scene.volumes, q)
             x, dH, numbers = [d @ B for d in D], W @ B, self.numbers_at(item, scene, at, s, q)
             both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
-            *P, by_x, products = both(x, dH, numbers)  # the stress itself is felt by the rest shape alone
+            *P, by_x, products = both(x, dH, numbers)  # only the rest shape's adjoint reads the stress itself
             pushes = [(by * volume) @ B.transpose() for by in by_x]
             minus = let(ti.cast(-1, self.fp) * volume)
             own, by_z = self._parted([minus * product for product in products])

@@ -20,7 +20,7 @@ class Primitives:
     points: np.ndarray
     edges: np.ndarray
 
-    whole = False  # whether they are all of the obstacle, so that nothing of it is felt by its distance alone
+    whole = False  # whether they are all of the obstacle, so that nothing of it acts by its distance alone
 
     def at(self, p: np.ndarray) -> tuple[np.ndarray, float]:
         raise NotImplementedError
