@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import taichi as ti
 from test_cli import fails
 
 import diffsim_ti as ds
@@ -256,6 +257,7 @@ def test_threads_take_turns(tmp_path):
 
 def test_fields_after_a_restart_of_taichi_say_so():
     simulator = ds.Simulator(ds.VelocityVerletSolver(ds.Scene(CUBE, ds.StableNeoHookean(1e4, 0.3)), dt=1e-3))
+    ti.reset()
     ds.init()
     with pytest.raises(RuntimeError, match="ti.init was called again"):
         simulator.tetrahedron_fields()

@@ -114,6 +114,7 @@ def test_arrays_of_an_earlier_program_leave_those_of_the_next_alone():
 
         ds.init()
         before = some(1)
+        ti.reset()
         ds.init()
         kept = some(2)
         before.clear()
@@ -156,6 +157,8 @@ def test_second_init_is_noticed():
         frames = rollout.forward()
         rollout.field("initial_velocities")
         ds.init("cpu", precision="f64")
+        simulator.step()  # the same settings: nothing was dropped
+        ds.init("cpu", precision="f64", threads=1)
         for use in (simulator.step, simulator.reset, lambda: simulator.positions, lambda: simulator.compute_energy(),
                     lambda: simulator.set_state(velocities=mesh.vertices), rollout.forward, lambda: rollout.vjp(frames),
                     rollout.run, lambda: rollout.positions):

@@ -79,7 +79,8 @@ def init(
     `default_fp` stays f64 so that both precisions can live in one process.
 
     Used before `init`, the library calls `init()` itself: CPU, f32. A `ti.init` of the host program is respected.
-    Calling it again drops every array of earlier scenes; they say so when used.
+    Called again with the same settings it sets the precision alone; with others it starts anew, which drops every array
+    of earlier scenes: they say so when used.
     Raises ValueError for an unknown name, TypeError for an unknown option, RuntimeError for a backend that is not available.
     """
     if backend not in _ARCHS:
@@ -104,6 +105,14 @@ def init(
                 f"init has no argument {name!r}, and neither has ti.init{meant}: pass "
                 f"backend={', '.join(map(repr, _ARCHS))}, precision, threads, or an option of ti.init such as debug=True"
             )
+    asked = backend, threads, options.copy(), {name: x for name, x in os.environ.items() if name.startswith("TI_")}
+    if (
+        _settings.get("asked") == asked
+        and current_program() is not None
+        and _settings["started"]() is current_program()
+    ):
+        set_precision(precision)
+        return
     options.setdefault("log_level", ti.ERROR)
     if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):
         # Taichi makes the folder even then, and crashes at exit if it cannot
@@ -118,6 +127,7 @@ def init(
     with LOCK, contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=_ARCHS[backend], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
         materialize()  # in this thread, so that others can compile
+    _settings["asked"], _settings["started"] = asked, weakref.ref(current_program())
 
 
 def _can_write_cache(path: str | None) -> bool:
