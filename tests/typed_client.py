@@ -109,6 +109,7 @@ def parts() -> int:
         ds.CenterOfMass("xmax"),
         ds.ContactForce("ball", part="friction", on="xmin"),
         ds.ContactTraction(ball),
+        ds.ContactSlip(ball, "share"),
         ds.SelfContactForce("xmin", part="normal"),
         ds.Stress(kind="first_piola"),
         ds.Strain(principal=True),

@@ -3,6 +3,7 @@
 from diffsim_ti.outputs.center_of_mass import CenterOfMass
 from diffsim_ti.outputs.chamber_pressure import ChamberPressure
 from diffsim_ti.outputs.contact_force import ContactForce
+from diffsim_ti.outputs.contact_slip import ContactSlip
 from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.enclosed_volume import EnclosedVolume
 from diffsim_ti.outputs.energies import Dissipation, ElasticEnergy, KineticEnergy
@@ -16,7 +17,15 @@ from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
 from diffsim_ti.outputs.work import WorkOfLoads
 
-__all__ = ["CenterOfMass", "ChamberPressure", "Change", "ContactForce", "ContactTraction", "Displacements"]
+__all__ = [
+    "CenterOfMass",
+    "ChamberPressure",
+    "Change",
+    "ContactForce",
+    "ContactSlip",
+    "ContactTraction",
+    "Displacements",
+]
 __all__ += ["Dissipation", "PlasticStrain"]
 __all__ += [
     "ElasticEnergy",
