@@ -110,6 +110,7 @@ def parts() -> int:
         ds.ContactForce("ball", part="friction", on="xmin"),
         ds.ContactTraction(ball),
         ds.ContactSlip(ball, "share"),
+        ds.TactilePad(ball, "palm", size=(8, 8)),
         ds.SelfContactForce("xmin", part="normal"),
         ds.Stress(kind="first_piola"),
         ds.Strain(principal=True),

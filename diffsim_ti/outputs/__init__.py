@@ -14,6 +14,7 @@ from diffsim_ti.outputs.plastic_strain import PlasticStrain
 from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.self_contact_force import SelfContactForce
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
+from diffsim_ti.outputs.tactile_pad import TactilePad
 from diffsim_ti.outputs.tensors import Strain, Stress
 from diffsim_ti.outputs.work import WorkOfLoads
 
@@ -37,4 +38,4 @@ __all__ += [
     "Positions",
     "Reaction",
 ]
-__all__ += ["SelfContactForce", "Strain", "Stress", "Tension", "Velocities", "WorkOfLoads"]
+__all__ += ["SelfContactForce", "Strain", "Stress", "TactilePad", "Tension", "Velocities", "WorkOfLoads"]
