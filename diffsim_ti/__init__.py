@@ -62,6 +62,7 @@ from diffsim_ti.outputs import (
     KineticEnergy,
     Length,
     MaterialPoints,
+    PixelTracks,
     PlasticStrain,
     Reaction,
     SelfContactForce,
@@ -134,7 +135,7 @@ __all__ += ["BatchFrames", "Ensemble", "UnequalSteps", "adaptive_steps", "SolveR
 __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPoints", "ContactForce"]
 __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactSlip", "ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
-__all__ += ["TactilePad"]
+__all__ += ["PixelTracks", "TactilePad"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
 __all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]

@@ -10,6 +10,7 @@ from diffsim_ti.outputs.energies import Dissipation, ElasticEnergy, KineticEnerg
 from diffsim_ti.outputs.lines import Length, Tension
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.pixel_tracks import PixelTracks
 from diffsim_ti.outputs.plastic_strain import PlasticStrain
 from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.self_contact_force import SelfContactForce
@@ -27,7 +28,7 @@ __all__ = [
     "ContactTraction",
     "Displacements",
 ]
-__all__ += ["Dissipation", "PlasticStrain"]
+__all__ += ["Dissipation", "PixelTracks", "PlasticStrain"]
 __all__ += [
     "ElasticEnergy",
     "EnclosedVolume",
