@@ -13,7 +13,7 @@ NEAREST = 1e-9  # [m], the least depth a point is projected with
 
 @dataclass(frozen=True)
 class Camera(metaclass=Public):
-    """A pinhole at `position` [m] that looks at `look_at` [m]; field_of_view [degrees] is that of the picture's height.
+    """A pinhole at `position` [m] that points to `look_at` [m]; field_of_view [degrees] is that of the picture's height.
 
     intrinsics: focal lengths and principal point (f_x, f_y, c_x, c_y) as shares of the picture's (width, height, width,
     height), in place of the field of view; `calibrated` makes them of a camera matrix.
@@ -93,7 +93,7 @@ class Camera(metaclass=Public):
         return self.intrinsics[0] * size[0], self.intrinsics[1] * size[1]
 
     def middle(self, size: tuple[int, int]) -> tuple[float, float]:
-        """The pixel that it looks at."""
+        """Its principal point [pixels]."""
         x, y = (0.5, 0.5) if self.intrinsics is None else self.intrinsics[2:]
         return x * size[0], y * size[1]
 
@@ -112,7 +112,7 @@ class Camera(metaclass=Public):
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def orbited(self, azimuth: float, elevation: float) -> "Camera":
-        """Turned about what it looks at by these angles [degrees]; stops short of straight up and down."""
+        """Turned about `look_at` by these angles [degrees]; stops short of straight up and down."""
         offset = self.position - self.look_at
         distance = np.linalg.norm(offset)
         a = np.arctan2(offset[0], offset[2]) + np.radians(azimuth)
@@ -121,5 +121,5 @@ class Camera(metaclass=Public):
         return replace(self, position=self.look_at + distance * back)
 
     def zoomed(self, factor: float) -> "Camera":
-        """So many times nearer to what it looks at."""
+        """So many times nearer to `look_at`."""
         return replace(self, position=self.look_at + (self.position - self.look_at) / factor)
