@@ -54,6 +54,7 @@ from diffsim_ti.outputs import (
     CenterOfMass,
     ChamberPressure,
     ContactForce,
+    ContactSlip,
     ContactTraction,
     Dissipation,
     ElasticEnergy,
@@ -61,11 +62,13 @@ from diffsim_ti.outputs import (
     KineticEnergy,
     Length,
     MaterialPoints,
+    PixelTracks,
     PlasticStrain,
     Reaction,
     SelfContactForce,
     Strain,
     Stress,
+    TactilePad,
     Tension,
     WorkOfLoads,
 )
@@ -131,7 +134,8 @@ __all__ += ["ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator",
 __all__ += ["BatchFrames", "Ensemble", "UnequalSteps", "adaptive_steps", "SolveReport", "Divergence", "Crossing"]
 __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPoints", "ContactForce"]
 __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
-__all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
+__all__ += ["ContactSlip", "ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
+__all__ += ["PixelTracks", "TactilePad"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
 __all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]

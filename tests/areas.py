@@ -27,7 +27,7 @@ AREAS = {
     "contact_corpus",
     "PyTorch, optimisations": "ensemble torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",
     "charts, maps, advice": "sweep study study_stability peers",
-    "pictures, films, the window": "picture_drawing picture_film marks "
+    "pictures, films, the window": "picture_drawing picture_film camera marks "
     "optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "types release reference words examples environment contact_examples static_examples "
     "torch_examples readme",

@@ -10,7 +10,9 @@ from contact_scenes import points, tetrahedron
 
 import diffsim_ti as ds
 from diffsim_ti import verify
+from diffsim_ti.common import rotations
 from diffsim_ti.diff_simulator import rollout_frames
+from diffsim_ti.terms.pose import brought_back, carried
 
 G = 9.81
 EXPLICIT = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
@@ -88,6 +90,9 @@ def rollout_of(case: str) -> ds.Rollout:
         "verlet": lambda: ds.VelocityVerletSolver(scene, dt=2e-3, substeps=2),
     }[kind]()
     named = outputs() if len(scene.obstacles) > 1 else outputs()[:2]
+    named += [ds.ContactSlip("floor"), ds.ContactSlip("floor", "share", name="share")]
+    sole = scene.mesh.surface_where(lambda X, n: X[:, 1] < 0.01)
+    named.append(ds.TactilePad("floor", sole, size=(2, 3)))
     if kind == "static":  # which depends on the floor, too
         named.append(ds.Reaction("ymax"))
     return ds.Rollout(solver, 4, save_every=2, outputs=named, gradients="all")
@@ -126,6 +131,78 @@ def test_seeds_are_the_transpose_of_tangents(case):
             terms = tangents[name] * seed
             pushed, pulled = terms.sum(), (gradients[name][key] * direction).sum()
             assert abs(pushed - pulled) <= gate * max(abs(pushed), np.linalg.norm(terms), 1e-12), (key, name)
+
+
+def test_a_pad_reads_the_same_however_it_is_turned():
+    """An even pressure on a slope, from a block that leans on it: turned with slope and gravity, its readings stay."""
+    turn, read = rotations.quaternion(np.array([0.4, 0.3, -0.8])), []
+    for q in (np.array([1.0, 0, 0, 0]), turn):
+        mesh = ds.TetrahedralMesh.create_box((4, 2, 3), (0.12, 0.03, 0.08))
+        sole = mesh.surface_where(lambda X, n: X[:, 1] < 1e-9)
+        X = rotations.turned(q, mesh.vertices + [0, 0.004, 0])
+        mesh = ds.TetrahedralMesh(X, mesh.tetrahedra)
+        up, aside = rotations.turned(q, np.eye(3)[1]), rotations.turned(q, np.eye(3)[0])
+        slope = ds.HalfSpace(normal=up, stiffness_per_area=1e7, width=0.005, friction=0.6, name="slope")
+        terms = [ds.Gravity(-9.81 * up + 2.0 * aside), slope]
+        scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.0), 1e3, terms, precision="f64")
+        pad = ds.TactilePad("slope", sole, size=(3, 4))
+        solver = ds.ImplicitEulerSolver(scene, dt=0.02, tolerance=1e-10)
+        frames = ds.Rollout(solver, 40, save_every=40, outputs=[pad, ds.ContactForce("slope")]).forward()
+        read.append(frames["tactile_pad"][-1])
+        weight = 1e3 * mesh.volume
+        assert frames["contact_force"][-1] @ up == pytest.approx(9.81 * weight, rel=1e-3)
+    area = 0.12 * 0.08
+    assert read[0].shape == (3, 4, 3) and read[0][..., 0].mean() == pytest.approx(9.81 * weight / area, rel=0.1)
+    assert abs(read[0][..., 1].mean()) == pytest.approx(2.0 * weight / area, rel=0.1)  # shear along the longer side
+    signs = np.sign(read[0][..., 1:].mean((0, 1))) * np.sign(read[1][..., 1:].mean((0, 1)))
+    np.testing.assert_allclose(read[1][..., 0], read[0][..., 0], rtol=1e-5)
+    np.testing.assert_allclose(np.abs(signs), 1)
+
+
+def on_a_turntable(dt=1e-3, **options) -> ds.Scene:
+    """A cube on a disc that turns about a point beside it, and goes up and sideways."""
+    turn = lambda t: [0.3 * t, 0.05 * t, 0.1 * t, 0.2 * t, 5 * t, 0.1 * t]  # noqa: E731
+    disc = ds.Box((0.05, -0.25, 0.05), (1, 0.5, 1), stiffness_per_area=3e5, width=0.01, name="disc", path=turn,
+                  about=(0.2, 0, 0), by_pairs=False, **options)  # fmt: skip
+    return ds.Scene(cube(), ds.StableNeoHookean(2e5, 0.3), terms=[ds.Gravity(), disc], precision="f64")
+
+
+def test_slip_on_a_turntable():
+    """v - u - w x (x - c), in frames and in a simulator; and its derivatives, by the path and the point, too."""
+    solver = ds.VelocityVerletSolver(on_a_turntable(friction=0.3), dt=1e-3, substeps=4)
+    named = [ds.ContactSlip("disc"), ds.ContactForce("disc", "normal", name="push", per_vertex=True)]
+    rollout = ds.Rollout(
+        solver, 8, save_every=1, outputs=[*named, ds.ContactSlip("disc", "share", name="share")], gradients="all"
+    )
+    frames, simulator = rollout.forward(), ds.Simulator(solver, contact_forces=True)
+    simulator.run(8)
+    x, v, push = frames.positions[-1], frames.velocities[-1], frames["push"][-1]
+    pressed_on = np.linalg.norm(push, axis=1) > 0
+    assert pressed_on.sum() == 4 and not frames["contact_slip"][-1][~pressed_on].any()
+    h, row = 1e-6, lambda t: np.array([0.3 * t, 0.05 * t, 0.1 * t, 0.2 * t, 5 * t, 0.1 * t])
+    term = solver.scene.obstacles[0]
+    own = [carried(brought_back(x, row(0.008), term.about), row(0.008 + s * h), term.about) for s in (-1, 1)]
+    w = (v - (own[1] - own[0]) / (2 * h))[pressed_on]
+    n = push[pressed_on] / np.linalg.norm(push[pressed_on], axis=1, keepdims=True)
+    np.testing.assert_allclose(frames["contact_slip"][-1][pressed_on], w - n * (n * w).sum(1, keepdims=True), atol=1e-6)
+    np.testing.assert_allclose(simulator.output(ds.ContactSlip("disc")), frames["contact_slip"][-1], atol=1e-9)
+    np.testing.assert_allclose(
+        frames["share"][-1][pressed_on], 1.0, atol=1e-4
+    )  # it slides; directions turn within a step
+    slip = ds.Rollout(solver, 3, outputs=named[:1], gradients="all")
+
+    def loss(frames):
+        out = frames["contact_slip"]
+        seed = np.random.default_rng(5).normal(size=out.shape)
+        return float((seed * out).sum()), np.zeros(frames.positions.shape), None, {"contact_slip": seed}
+
+    inputs = [
+        name for name in slip.inputs if name.startswith("disc.") or name in ("rest_positions", "initial_velocities")
+    ]
+    report = verify.check_gradients(slip, loss, inputs, verbose=False)
+    assert report.passed, str(report)
+    with pytest.raises(ValueError, match="has no friction; pass friction="):
+        ds.ContactSlip("disc", "share").settled(on_a_turntable())
 
 
 KEYS = ("youngs_modulus", "poissons_ratio", "floor.friction", "floor.stiffness_per_area", "rest_positions", "density")

@@ -1,6 +1,8 @@
 """What comes in and goes out: surfaces, Abaqus files, objects of meshio and PyVista, animated glTF."""
 
 import builtins
+import contextlib
+import importlib.util
 import json
 from types import SimpleNamespace
 
@@ -10,9 +12,10 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti.cli import app
 from diffsim_ti.mesh import filling
-from diffsim_ti.writers import Frame, open_writer
+from diffsim_ti.writers import Frame, View, open_writer
 
 BOX = ds.TetrahedralMesh.create_box((4, 3, 3), (0.3, 0.2, 0.2))
+USD = importlib.util.find_spec("pxr") is not None
 MESH = BOX.with_tetrahedron_set("core", BOX.centroids[:, 0] < 0.1)
 
 
@@ -203,18 +206,72 @@ def animated(path) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def test_gltf_moves_as_the_run_does(tmp_path):
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """(folder, places of the surface, times): a run beside a moving ball and a wall, gravity along -z, in each format."""
+    folder = tmp_path_factory.mktemp("animated")
     ball = ds.Sphere((0.5, 0.1, 0.1), 0.08, stiffness=1.0, width=0.01, path=lambda t: [0, t, 0])
     wall = ds.Box((-0.5, 0.1, 0.1), (0.1, 0.1, 0.1), stiffness=1.0, width=0.01)
-    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), terms=[ds.Gravity(), ball, wall], fixed="xmin")
-    simulator, places = ds.Simulator(ds.SemiImplicitSolver(scene, dt=0.02, substeps=20)), []
-    with open_writer(tmp_path / "run.glb", scene) as out:
+    terms = [ds.Gravity(up="z"), ball, wall]
+    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), terms=terms, fixed="xmin")
+    simulator, places, times = ds.Simulator(ds.SemiImplicitSolver(scene, dt=0.02, substeps=20)), [], []
+    (folder / "run_0009.ply").touch()  # of a longer sequence
+    names = ["run.glb", "run.ply", "run.usda", "run.usdc"] if USD else ["run.glb", "run.ply"]
+    with contextlib.ExitStack() as stack:
+        view = View(colour="displacement", fps=25.0)
+        out = [stack.enter_context(open_writer(folder / name, scene, view)) for name in names]
         for _ in range(4):
-            out.write(Frame.of(simulator))
+            for writer in out:
+                writer.write(Frame.of(simulator))
             places.append(simulator.positions[MESH.surface_vertices])
+            times.append(simulator.time)
             simulator.step()
-    body, ball, wall = animated(tmp_path / "run.glb")
+    return folder, np.array(places), np.array(times)
+
+
+def test_gltf_moves_as_the_run_does(written):
+    folder, places, _ = written
+    body, ball, wall = animated(folder / "run.glb")
     np.testing.assert_allclose(body[0], places, atol=1e-6)
     np.testing.assert_allclose(body[1], [0, 0.02, 0.04, 0.06], atol=1e-7)
     np.testing.assert_allclose(np.ptp(ball[0], axis=0).max(0), [0, 0.06, 0], atol=1e-6)
     assert len(wall[0]) == 1  # what stands has no targets
+
+
+@pytest.mark.skipif(not USD, reason="usd-core is not installed")
+@pytest.mark.parametrize("suffix", ["usda", "usdc"])
+def test_usd_is_read_back_equal(written, suffix):
+    from pxr import Usd, UsdGeom
+
+    folder, places, times = written
+    stage = Usd.Stage.Open(str(folder / f"run.{suffix}"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert stage.GetDefaultPrim().GetPath() == "/run" and stage.GetTimeCodesPerSecond() == 25
+    body, ball, wall = (UsdGeom.Mesh.Get(stage, f"/run/{name}") for name in ("body", "obstacle_1", "obstacle_2"))
+    codes = body.GetPointsAttr().GetTimeSamples()
+    np.testing.assert_allclose(np.array(codes) / stage.GetTimeCodesPerSecond(), times, atol=1e-12)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (codes[0], codes[-1])
+    read = np.array([body.GetPointsAttr().Get(code) for code in codes])
+    np.testing.assert_array_equal(read, places.astype(np.float32))
+    corners = np.array(body.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    np.testing.assert_array_equal(MESH.surface_vertices[corners], MESH.surface_triangles)  # outwards, right-handed
+    moved = np.array(ball.GetPointsAttr().Get(codes[-1])) - ball.GetPointsAttr().Get(codes[0])
+    np.testing.assert_allclose(moved, np.broadcast_to([0, 0.06, 0], moved.shape), atol=1e-6)
+    assert not wall.GetPointsAttr().GetTimeSamples()  # stands
+    colours = np.array([body.GetDisplayColorPrimvar().Get(code) for code in codes])
+    assert colours.shape == places.shape and np.ptp(colours[-1], axis=0).max() > 0.3
+    low, high = body.GetExtentAttr().Get(codes[-1])
+    np.testing.assert_allclose([low, high], [places[-1].min(0), places[-1].max(0)], atol=1e-6)
+
+
+def test_sequences_of_ply_are_read_back_equal(written):
+    import meshio
+
+    folder, places, _ = written
+    assert len(list(folder.glob("run_*.ply"))) == len(places)
+    for k, x in enumerate(places):
+        read = meshio.read(folder / f"run_{k:04d}.ply")
+        np.testing.assert_array_equal(read.points[: len(x)], x)
+        triangles = read.cells_dict["triangle"][: len(MESH.surface_triangles)]
+        np.testing.assert_array_equal(MESH.surface_vertices[triangles], MESH.surface_triangles)
+        assert all(read.point_data[name].dtype == np.uint8 for name in ("red", "green", "blue"))

@@ -8,6 +8,7 @@ from typing_extensions import assert_type
 
 import diffsim_ti as ds
 from diffsim_ti.outputs import Output
+from diffsim_ti.picture import Camera
 from diffsim_ti.terms import Term
 
 
@@ -109,6 +110,9 @@ def parts() -> int:
         ds.CenterOfMass("xmax"),
         ds.ContactForce("ball", part="friction", on="xmin"),
         ds.ContactTraction(ball),
+        ds.ContactSlip(ball, "share"),
+        ds.PixelTracks(Camera.framing(mesh.vertices), [[0.0, 0.0, 0.0]]),
+        ds.TactilePad(ball, "palm", size=(8, 8)),
         ds.SelfContactForce("xmin", part="normal"),
         ds.Stress(kind="first_piola"),
         ds.Strain(principal=True),

@@ -9,7 +9,7 @@ import numpy as np
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
-from diffsim_ti.terms import ExternalForce
+from diffsim_ti.terms import ExternalForce, Obstacle
 from diffsim_ti.terms.pose import Pose
 
 HELD = "held, by indices"  # the set of what a scene holds so
@@ -31,7 +31,7 @@ def on_ten_nodes(scene: Scene, mesh: TetrahedralMesh | None = None) -> Scene:
     """
     given, base, terms = dict(scene.arguments), scene.mesh if mesh is None else mesh, []
     for k, term in enumerate(given["terms"]):
-        surface, own = getattr(term, "surface", None), copy(term)
+        surface, own = None if isinstance(term, Obstacle) else getattr(term, "surface", None), copy(term)
         if isinstance(term, ExternalForce):
             own.vertices, terms = term.indices(scene.mesh), [*terms, own]
             continue

@@ -16,6 +16,7 @@ from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
+from diffsim_ti.terms import Gravity
 from diffsim_ti.terms.marks import Mark
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.colouring import measured_fields
@@ -28,7 +29,7 @@ class Setting(metaclass=Public):
     """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand.
 
     held: of fixed vertices the projectors onto the directions in which each is fixed, shape (len(fixed), 3, 3), where some
-    are fixed in some directions only; else None.
+    are fixed in some directions only; else None. up: 0, 1 or 2, the axis that gravity acts along; 1 without gravity.
     """
 
     mesh: TetrahedralMesh
@@ -36,6 +37,7 @@ class Setting(metaclass=Public):
     fixed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     obstacles: list[Triangles] = field(default_factory=list)
     held: np.ndarray | None = None
+    up: int = 1
 
     __repr__ = brief_fields
 
@@ -43,7 +45,9 @@ class Setting(metaclass=Public):
     def of(cls, scene: Scene) -> "Setting":
         """A scene's."""
         held = scene.supports.held if len(scene.supports.partly_fixed) else None
-        return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene), held)
+        gravity = scene.term(Gravity)
+        up = 1 if gravity is None else int(np.argmax(np.abs(gravity.values["gravity"])))
+        return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene), held, up)
 
 
 @dataclass(repr=False)
@@ -74,6 +78,13 @@ class Frame(metaclass=Public):
     def colours(self) -> dict[str, np.ndarray]:
         """The fields that pictures can be coloured by."""
         return {name: values for name, values in self.fields.items() if name in FIELDS}
+
+    def colour_values(self, name: str) -> np.ndarray:
+        """The field that is called so. Raises ValueError for one that the frame does not hold, naming those that it does."""
+        if name not in self.colours:
+            known = ", ".join(self.colours)
+            raise ValueError(f"colour: the frame must hold {name}, it holds {known}; choose one of these")
+        return np.asarray(self.fields[name])
 
     @classmethod
     def of_run(cls, scene: Scene, frames: Frames, k: int = -1) -> "Frame":

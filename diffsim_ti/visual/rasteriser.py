@@ -67,7 +67,8 @@ class SoftwarePainter:
         triangle, row, first, end = spans(corners, (width, height))
         if not len(triangle):
             return np.array(background)
-        planes = _planes(corners, soup)
+        inverse = 1 / soup.corners[..., 2:]  # which, as colour / depth, is linear over the picture
+        planes = planes_of(corners, np.concatenate([inverse, soup.colours * inverse], 2))
         span, along = enumerated(end - first)
         at_start = np.einsum("nk,nk->n", planes[triangle, 0], np.stack([first + 0.5, row + 0.5, np.ones(len(row))], 1))
         nearness = at_start[span] + planes[triangle, 0, 0][span] * along
@@ -90,17 +91,15 @@ class SoftwarePainter:
         """Nothing is held."""
 
 
-def _planes(corners: np.ndarray, soup: Soup) -> np.ndarray:
-    """1 / depth and colour / depth, which are linear over the picture, as a x + b y + c of each triangle: (n, 4, 3)."""
+def planes_of(corners: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values at the corners of triangles, (n, 3, k), as a x + b y + c over the picture: (n, k, 3) of each triangle."""
     (x0, y0), (x1, y1), (x2, y2) = corners.transpose(1, 2, 0)
     area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
     area = np.where(np.abs(area) > 1e-12, area, np.inf)
-    inverse = 1 / soup.corners[..., 2:]
-    shares = np.concatenate([inverse, soup.colours * inverse], 2)
-    d1, d2 = (shares[:, k] - shares[:, 0] for k in (1, 2))
+    d1, d2 = (values[:, k] - values[:, 0] for k in (1, 2))
     a = (d1 * (y2 - y0)[:, None] - d2 * (y1 - y0)[:, None]) / area[:, None]
     b = (d2 * (x1 - x0)[:, None] - d1 * (x2 - x0)[:, None]) / area[:, None]
-    return np.stack([a, b, shares[:, 0] - a * x0[:, None] - b * y0[:, None]], 2)
+    return np.stack([a, b, values[:, 0] - a * x0[:, None] - b * y0[:, None]], 2)
 
 
 def _averaged(colour, row, column, background) -> np.ndarray:

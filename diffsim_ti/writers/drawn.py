@@ -26,11 +26,8 @@ class DrawnWriter(Writer):
     def write(self, frame: Frame) -> None:
         if self.colour is None:
             self.colour = "von_mises" if "von_mises" in frame.colours else "displacement"
-        if self.colour not in frame.colours:
-            known = ", ".join(frame.colours)
-            raise ValueError(f"colour: the frame must hold {self.colour}, it holds {known}; choose one of these")
+        values = frame.colour_values(self.colour)
         self._extent = self._extent or Extent(self.setting.mesh, self.colour)
-        values = np.asarray(frame.fields[self.colour])
         marks = [*frame.marks, *results_as_arrows(frame, self.setting.mesh, self.view.arrows)]
         self._extent.add(frame.positions, values, marks)
         points = [x for x, _ in self.setting.obstacles] if frame.obstacles is None else frame.obstacles

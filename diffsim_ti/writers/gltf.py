@@ -5,16 +5,15 @@ import json
 import numpy as np
 
 from diffsim_ti.common.origin import middle_far_part
-from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.writers.writer import Writer, register
+from diffsim_ti.writers.surfaces import BODY, OBSTACLE, SurfacesWriter
+from diffsim_ti.writers.writer import register
 
-BODY, OBSTACLE = (0.33, 0.55, 0.80), (0.68, 0.68, 0.70)
 FLOAT, UNSIGNED, ARRAY, ELEMENTS = 5126, 5125, 34962, 34963  # numbers of glTF
 TYPES = {1: "SCALAR", 3: "VEC3"}
 
 
 @register
-class GltfWriter(Writer):
+class GltfWriter(SurfacesWriter):
     """Writes the body's surface and the obstacles when it is closed; until then their places are kept in memory.
 
     Each frame is a morph target, whose weight the animation brings to 1 at the frame's time [s] and leads linearly to the
@@ -25,32 +24,15 @@ class GltfWriter(Writer):
 
     suffixes = (".glb",)
 
-    def open(self, setting: Setting) -> None:
-        self.setting, self._times, self._places, self.count = setting, [], [], 0
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-
-    def write(self, frame: Frame) -> None:
-        standing = [points for points, _ in self.setting.obstacles]
-        places = [frame.positions[self.setting.mesh.surface_vertices], *(frame.obstacles or standing)]
-        self._times.append(frame.time)
-        self._places.append([np.asarray(x, np.float64) for x in places])
-        self.count += 1
-
     def close(self) -> None:
         if self._places:
             self.path.write_bytes(self._file())
 
     def _file(self) -> bytes:
-        mesh, content = self.setting.mesh, Content()
-        surfaces = [np.searchsorted(mesh.surface_vertices, mesh.surface_triangles)]
-        surfaces += [triangles for _, triangles in self.setting.obstacles]
-        names = ["body", *(f"obstacle {k}" for k in range(1, len(surfaces)))]
-        times = np.array(self._times) - self._times[0]
+        content, times = Content(), np.array(self._times) - self._times[0]
         at = content.add(times, limits=True) if len(times) > 1 else None
-        for k, (name, triangles) in enumerate(zip(names, surfaces)):
-            places = [frame[k] for frame in self._places]
-            moves = any(np.any(x != places[0]) for x in places[1:])
-            content.add_surface(name, triangles, places if moves else places[:1], at, OBSTACLE if k else BODY)
+        for name, triangles, places, _ in self.surfaces():
+            content.add_surface(name, triangles, places, at, BODY if name == "body" else OBSTACLE)
         return content.packed()
 
 

@@ -1,0 +1,152 @@
+"""What a tactile sensor reads: pressure and shear on a grid of a surface, in axes that go with it."""
+
+from copy import copy
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+from diffsim_ti.mesh.named_sets import SetOrIndices
+from diffsim_ti.outputs.contact_traction import ContactTraction
+from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.terms import Term
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout.frames import Frames
+    from diffsim_ti.scene import Scene
+
+
+class TactilePad(Output):
+    """Pressure and shear [Pa] of an obstacle on a grid of a surface set, shape (frames, rows, columns, 3):
+
+        (-t . n, t . a, t . b),    t = sum over a triangle's corners of w_i t_i
+
+    t_i: `ContactTraction` of the obstacle, w_i: where the grid's point lies in the triangle, in the mesh as it was made. The
+    grid spans the set's extent there, along its principal axes (columns along the longer one); points beside the set read 0,
+    `inside` says which. n, a, b go with the set: n is the mean of its triangles' normals, outwards, a along the columns, b
+    along the rows. So turning the pad as a rigid body does not change what it reads.
+
+    obstacle: its name, or the term as the scene lists it. on: a surface set's name, indices of surface triangles or a mask.
+    size: (rows, columns). The resultant is `ContactForce(obstacle, on=...)`, its moment that with about=.
+    The gradient is exact by all inputs; that by rest_positions leaves the weights w_i as they are.
+    Raises ValueError as `ContactTraction` does, for a set that there is not or is empty, and for no rows or columns.
+    Yuan, Dong, Adelson 2017, GelSight, doi:10.3390/s17122762.
+    """
+
+    reads_contact_forces, unit = True, "Pa"
+
+    def __init__(
+        self, obstacle: Term | str, on: SetOrIndices, size: tuple[int, int] = (16, 16), name: str = "tactile_pad"
+    ):
+        if len(size) != 2 or min(size) < 1:
+            raise ValueError(f"TactilePad: size must be (rows, columns), at least 1 of each, got {size}")
+        self._given, self.on, self.name = ContactTraction(obstacle), on, name
+        self.size = int(size[0]), int(size[1])
+
+    def __repr__(self) -> str:
+        return f"TactilePad({self._given._given.obstacle!r}, {self.on!r}, {self.size}, name={self.name!r})"
+
+    def settled(self, scene: "Scene") -> "TactilePad":
+        out, mesh = copy(self), scene.mesh
+        out.traction, rows = self._given.settled(scene), mesh.surface_indices(self.on)
+        if not len(rows):
+            raise ValueError(f"{self!r}: the surface set has no triangles; choose one that has")
+        out.triangles = mesh.surface_triangles[rows]
+        X = mesh.vertices
+        corners = np.unique(out.triangles)
+        middle = X[corners].mean(0)
+        normal = triangle_normals(X, out.triangles).sum(0)
+        normal /= np.linalg.norm(normal)
+        flat = X - middle - np.outer((X - middle) @ normal, normal)
+        a = np.linalg.svd(flat[corners], full_matrices=False)[2][0]
+        a *= np.sign(a[np.argmax(np.abs(a))])
+        b = np.cross(normal, a)
+        p = flat @ np.stack([a, b], 1)  # in the plane
+        low, high = p[corners].min(0), p[corners].max(0)
+        shares = [(np.arange(k) + 0.5) / k for k in self.size[::-1]]
+        x, y = np.meshgrid(*(l + s * (h - l) for l, h, s in zip(low, high, shares)))
+        out.corners, out.weights = _within(np.stack([x, y], -1).reshape(-1, 2), p, out.triangles)
+        out.inside = (out.weights.sum(1) > 0).reshape(self.size)
+        lever = p[corners, 0] - p[corners, 0].mean()
+        out.along = np.zeros(mesh.num_vertices)
+        out.along[corners] = lever / (lever @ lever)  # of places: how much the set's coordinate along a leads them on
+        return out
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        return (num_frames, *self.size, 3)
+
+    def _axes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, float]:
+        """(rows -n, a, b; N and g of which they are made; their lengths): n = N / |N|, a along g less what is along n."""
+        N, g = triangle_normals(x, self.triangles).sum(0), self.along @ x
+        n = N / np.linalg.norm(N)
+        flat = g - n * (n @ g)
+        size = np.linalg.norm(flat)
+        a = flat / size
+        return np.stack([-n, a, np.cross(n, a)]), N, g, np.linalg.norm(N), size
+
+    def _axes_jvp(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:
+        (n, a, _), _, g, length, size = self._axes(x)
+        n = -n
+        dn = triangle_normals_jvp(x, self.triangles, dx).sum(0) / length
+        dn = dn - n * (n @ dn)
+        dflat = self.along @ dx
+        dflat = dflat - n * (n @ dflat) - dn * (n @ g) - n * (dn @ g)
+        da = (dflat - a * (a @ dflat)) / size
+        return np.stack([-dn, da, np.cross(dn, a) + np.cross(n, da)])
+
+    def _axes_vjp(self, x: np.ndarray, axes_adj: np.ndarray) -> np.ndarray:
+        (n, a, _), _, g, length, size = self._axes(x)
+        n, (n_adj, a_adj, b_adj) = -n, axes_adj
+        n_adj, a_adj = -n_adj + np.cross(a, b_adj), a_adj + np.cross(b_adj, n)
+        flat_adj = (a_adj - a * (a @ a_adj)) / size
+        n_adj = n_adj - flat_adj * (n @ g) - g * (n @ flat_adj)
+        g_adj = flat_adj - n * (n @ flat_adj)
+        N_adj = (n_adj - n * (n @ n_adj)) / length
+        by_x = triangle_normals_vjp(x, self.triangles, np.broadcast_to(N_adj, (len(self.triangles), 3)))
+        return by_x + np.outer(self.along, g_adj)
+
+    def _sampled(self, t: np.ndarray) -> np.ndarray:
+        """Of vectors of vertices those of the grid's points."""
+        return np.einsum("pc,fpcd->fpd", self.weights, t[:, self.corners])
+
+    def value(self, frames: "Frames") -> np.ndarray:
+        t = self._sampled(self.traction.value(frames))
+        axes = np.stack([self._axes(x)[0] for x in frames.positions.astype(np.float64)])
+        return np.einsum("fpd,fkd->fpk", t, axes).reshape(self.shape(len(t)))
+
+    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+        t, dt = (self._sampled(y) for y in (self.traction.value(frames), self.traction.jvp(frames, change)))
+        x = frames.positions.astype(np.float64)
+        dx = np.zeros(x.shape) if change.positions is None else change.positions
+        axes, daxes = np.stack([self._axes(p)[0] for p in x]), np.stack([self._axes_jvp(*at) for at in zip(x, dx)])
+        out = np.einsum("fpd,fkd->fpk", dt, axes) + np.einsum("fpd,fkd->fpk", t, daxes)
+        return out.reshape(self.shape(len(t)))
+
+    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+        t, x = self._sampled(self.traction.value(frames)), frames.positions.astype(np.float64)
+        seed = np.reshape(seed, (len(x), -1, 3))
+        axes = np.stack([self._axes(p)[0] for p in x])
+        by_t, of_points = np.zeros((len(x), x.shape[1], 3)), np.einsum("fpk,fkd->fpd", seed, axes)
+        for k in range(3):
+            np.add.at(by_t, (slice(None), self.corners[:, k]), self.weights[:, k, None] * of_points)
+        by_axes = np.einsum("fpk,fpd->fkd", seed, t)
+        out = self.traction.vjp(frames, by_t)
+        out.add(Change(positions=np.stack([self._axes_vjp(*at) for at in zip(x, by_axes)])))
+        return out
+
+
+def _within(points: np.ndarray, p: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each point of a plane (corners of the triangle around it, weights there); weights of 0 where there is none."""
+    A, B, C = (p[triangles[:, k]] for k in range(3))
+    level = np.abs((B - A)[:, 0] * (C - A)[:, 1] - (B - A)[:, 1] * (C - A)[:, 0]) > 0  # seen from above not as a line
+    A, B, C, triangles = A[level], B[level], C[level], triangles[level]
+    wide = (B - A)[:, 0] * (C - A)[:, 1] - (B - A)[:, 1] * (C - A)[:, 0]
+    corners, weights = np.zeros((len(points), 3), np.int64), np.zeros((len(points), 3))
+    for k, q in enumerate(points):
+        u = ((q - A)[:, 0] * (C - A)[:, 1] - (q - A)[:, 1] * (C - A)[:, 0]) / wide
+        v = ((B - A)[:, 0] * (q - A)[:, 1] - (B - A)[:, 1] * (q - A)[:, 0]) / wide
+        w = np.stack([1 - u - v, u, v], 1)
+        best = np.argmax(w.min(1))
+        if w[best].min() > -1e-9:
+            corners[k], weights[k] = triangles[best], w[best]
+    return corners, weights
