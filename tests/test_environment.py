@@ -1,22 +1,76 @@
 """Environments of Gymnasium over a batch: the single one's contract, many as one by one, ends, training."""
 
+import ast
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from example_files import EXAMPLES, example
 
 gym = pytest.importorskip("gymnasium")
+TASKS = ["Jumper", "Crawler", "Grasp"]
 
 
 @pytest.fixture(scope="module")
 def jumper():
-    return example("control/jumper")
+    from diffsim_ti.envs import jumper
+
+    return jumper
+
+
+def test_registering_starts_nothing():
+    code = (
+        "import diffsim_ti.envs, gymnasium; from diffsim_ti.runtime.current_program import current_program; "
+        "assert current_program() is None; "
+        "print(sorted(name for name in gymnasium.registry if name.startswith('diffsim_ti/')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ast.literal_eval(done.stdout.splitlines()[-1]) == sorted(f"diffsim_ti/{task}-v0" for task in TASKS), (
+        done.stderr
+    )
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space")
-def test_one_passes_gymnasiums_checks(jumper):
+@pytest.mark.parametrize("task", TASKS)
+def test_tasks_pass_gymnasiums_checks(task):
+    """One, and that one of many made by name is the same."""
     from gymnasium.utils.env_checker import check_env
 
-    check_env(jumper.SoftJumper(), skip_render_check=True)
+    import diffsim_ti.envs  # noqa: F401
+
+    one, many = gym.make(f"diffsim_ti/{task}-v0"), gym.make_vec(f"diffsim_ti/{task}-v0", num_envs=2)
+    check_env(one.unwrapped, skip_render_check=True)
+    assert many.num_envs == 2 and many.single_observation_space == one.observation_space
+    seen, _ = many.reset(seed=3)
+    again, _ = many.reset(seed=3)
+    np.testing.assert_array_equal(seen, again)
+    action = many.action_space.sample()
+    first = many.step(action)
+    many.reset(seed=3)
+    np.testing.assert_array_equal(many.step(action)[0], first[0])
+
+
+def test_pads_lift_a_cube():
+    """Closed, then raised: the cube comes along by friction, and the force that is observed is that of the pads."""
+    from diffsim_ti.envs.grasp import HEIGHT, SoftGrasps
+
+    envs = SoftGrasps(2)
+    envs.reset(seed=0)
+    height, total = envs.positions[..., 1].mean(1), np.zeros(2)
+    for k in range(envs.horizon - 1):
+        squeeze = 1.0 if k < 5 else 0.0
+        actions = np.tile([squeeze, 0.0 if k < 8 else 0.5], (2, 1))
+        observed, rewards, terminated, *_ = envs.step(actions)
+        total += rewards
+        assert not terminated.any()
+    assert (envs.positions[..., 1].mean(1) - height > HEIGHT).all() and (total > 10).all(), total
+    weight = 9.81 * 300.0 * envs.scene.mesh.volume
+    assert (observed[:, -2:] > 0.5 * weight / 0.5).all()  # each holds half of it, at a coefficient of 0.5
+    envs.reset(seed=0)
+    for _ in range(10):
+        idle = envs.step(np.tile([-1.0, 1.0], (2, 1)))[1]
+    assert (idle < 0.2).all()  # pads alone lift nothing
 
 
 def test_many_are_one_by_one(jumper):
@@ -31,7 +85,7 @@ def test_many_are_one_by_one(jumper):
         rows.append((observed, rewards))
     for b in range(3):
         one.reset(seed=1)
-        one.positions[:], one.highest[:] = starts[b], starts[b, :, 1].mean()
+        one.positions[:], one.best[:] = starts[b], starts[b, :, 1].mean()
         for a, (together, reward) in zip(actions, rows):
             alone, own, *_ = one.step(a[b : b + 1])
             np.testing.assert_array_equal(alone[0], together[b])
@@ -41,7 +95,7 @@ def test_many_are_one_by_one(jumper):
 def test_an_end_starts_anew_and_shows_its_last_observation(jumper):
     envs = jumper.SoftJumpers(2)
     first, _ = envs.reset(seed=0)
-    envs.steps[:] = [jumper.HORIZON - 1, 3]
+    envs.steps[:] = [envs.horizon - 1, 3]
     observed, _, terminated, truncated, info = envs.step(np.zeros((2, 2)))
     assert truncated.tolist() == [True, False] and not terminated.any()
     assert info["_final_obs"].tolist() == [True, False] and info["final_obs"][0, -1] == 0
@@ -55,14 +109,11 @@ def against_ppo(monkeypatch):
     return example("control/against_ppo")
 
 
-@pytest.mark.filterwarnings("ignore:.*A Box observation space")
-def test_a_crawler_passes_them_too_and_pushes_nothing_but_itself(against_ppo):
-    import crawler
-    from gymnasium.utils.env_checker import check_env
+def test_a_crawler_pushes_nothing_but_itself():
+    from diffsim_ti.envs.crawler import SoftCrawlers
 
-    one = crawler.SoftCrawler()
-    check_env(one, skip_render_check=True)
-    pulls, X = one.all.pressing, one.all.scene.mesh.vertices
+    envs = SoftCrawlers(1)
+    pulls, X = envs.pressing, envs.scene.mesh.vertices
     np.testing.assert_allclose(pulls.sum(1), 0, atol=1e-12)
     np.testing.assert_allclose(np.cross(X, pulls).sum(1), 0, atol=1e-12)
 
@@ -76,8 +127,8 @@ def test_a_crawler_learns_by_gradients_and_ppo_takes_as_many_samples(against_ppo
 
 
 @pytest.mark.filterwarnings("error:scenes")
-def test_cubes_learn_to_jump_by_gradients(jumper, capsys):
-    found = jumper.main(8, 3, 12)
+def test_cubes_learn_to_jump_by_gradients(capsys):
+    found = example("control/jumper").main(8, 3, 12)
     assert found["jumped"] > found["rest"] + 0.01
     assert found["best"] > found["first"] + 0.03
     assert "at once" in capsys.readouterr().out

@@ -22,7 +22,7 @@ class TactilePad(Output):
         (-t . n, t . a, t . b),    t = sum over a triangle's corners of w_i t_i
 
     t_i: `ContactTraction` of the obstacle, w_i: where the grid's point lies in the triangle, in the mesh as it was made. The
-    grid spans the set's extent there, along its principal axes (columns along the longer one); points beside the set read 0,
+    grid spans the smallest rectangle around the set there (columns along its longer side); points beside the set read 0,
     `inside` says which. n, a, b go with the set: n is the mean of its triangles' normals, outwards, a along the columns, b
     along the rows. So turning the pad as a rigid body does not change what it reads.
 
@@ -58,8 +58,7 @@ class TactilePad(Output):
         normal = triangle_normals(X, out.triangles).sum(0)
         normal /= np.linalg.norm(normal)
         flat = X - middle - np.outer((X - middle) @ normal, normal)
-        a = np.linalg.svd(flat[corners], full_matrices=False)[2][0]
-        a *= np.sign(a[np.argmax(np.abs(a))])
+        a = _longer_side(flat[corners], normal)
         b = np.cross(normal, a)
         p = flat @ np.stack([a, b], 1)  # in the plane
         low, high = p[corners].min(0), p[corners].max(0)
@@ -133,6 +132,26 @@ class TactilePad(Output):
         out = self.traction.vjp(frames, by_t)
         out.add(Change(positions=np.stack([self._axes_vjp(*at) for at in zip(x, by_axes)])))
         return out
+
+
+def _longer_side(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Unit vector along the longer side of the smallest rectangle around points of a plane through the origin: a side of it
+    lies on one of their convex hull."""
+    from scipy.spatial import ConvexHull
+
+    first = np.linalg.svd(points, full_matrices=False)[2][0]
+    plane = np.stack([first, np.cross(normal, first)])
+    p = points @ plane.T
+    hull = p[ConvexHull(p).vertices]
+    sides = np.roll(hull, -1, 0) - hull
+    sides = sides[np.linalg.norm(sides, axis=1) > 1e-9 * np.abs(p).max()]
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    across = np.stack([-sides[:, 1], sides[:, 0]], 1)
+    wide, high = np.ptp(p @ sides.T, axis=0), np.ptp(p @ across.T, axis=0)
+    areas = wide * high
+    best = np.flatnonzero(areas <= areas.min() * (1 + 1e-9))[0]
+    a = (sides if wide[best] > high[best] * (1 + 1e-9) else across)[best] @ plane
+    return a * np.sign(a[np.argmax(np.abs(a))])
 
 
 def _within(points: np.ndarray, p: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

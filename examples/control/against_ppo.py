@@ -1,6 +1,6 @@
 """Jumping and crawling learnt by the simulator's gradient, and by PPO from as many samples: returns, and time.
 
-One network of 64 x 64 neurons sees what the environments show (jumper.py, crawler.py) and gives the actions. By gradients,
+One network of 64 x 64 neurons sees what the environments show (`diffsim_ti.envs`) and gives the actions. By gradients,
 it is trained through the steps of all scenes at once, `span` of them before states are cut off; by PPO, from rewards alone.
 Every iteration of either takes one episode of all scenes. Returns are those of the networks' mean actions.
 
@@ -15,12 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from crawler import SoftCrawlers
-from jumper import HORIZON, OBSERVED, SoftJumpers
 from torch import nn
 
 import diffsim_ti as ds
+from diffsim_ti.envs.crawler import SoftCrawlers
+from diffsim_ti.envs.jumper import SoftJumpers
 
+HORIZON = SoftJumpers.horizon
 TASKS = {"jumper": (SoftJumpers, HORIZON), "crawler": (SoftCrawlers, 10)}  # steps before states are cut off
 SCENES, GAMMA, LAMBDA, CLIP, EPOCHS, BATCHES = 16, 0.99, 0.95, 0.2, 10, 4
 
@@ -32,12 +33,14 @@ class Policy(nn.Module):
         super().__init__()
         self.register_buffer("centre", torch.tensor(seen.mean(0), dtype=torch.float32))
         self.register_buffer("scale", torch.tensor(seen.std(0) + 1e-3, dtype=torch.float32))
-        self.mean, self.value = self._layers(num_actions, 0.01), self._layers(1, 1.0)
+        self.mean, self.value = self._layers(seen, num_actions, 0.01), self._layers(seen, 1, 1.0)
         self.log_std = nn.Parameter(torch.full((num_actions,), -0.5))
 
     @staticmethod
-    def _layers(outputs: int, gain: float) -> nn.Sequential:
-        out = nn.Sequential(nn.Linear(OBSERVED, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs))
+    def _layers(seen: np.ndarray, outputs: int, gain: float) -> nn.Sequential:
+        out = nn.Sequential(
+            nn.Linear(seen.shape[1], 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs)
+        )
         nn.init.orthogonal_(out[-1].weight, gain)
         nn.init.zeros_(out[-1].bias)
         return out
