@@ -7,10 +7,10 @@ import pytest
 from scipy.optimize import least_squares
 
 import diffsim_ti as ds
+from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
 from diffsim_ti.identification.picture import save_picture
 from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem
-from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
 
 identify = partial(ds.identify, check_mesh=False)  # data are of the mesh that is fitted
 MESH = ds.TetrahedralMesh.create_box([4, 2, 2], [0.6, 0.2, 0.2], pattern="five")

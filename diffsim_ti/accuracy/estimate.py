@@ -24,14 +24,19 @@ if TYPE_CHECKING:
 
 LARGE = 0.2  # of the value: beyond it an estimate to first order gives way to the solution that it is about
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
-PER_VERTEX = "positions", "velocities", "displacements"  # outputs that count the vertices, of which a finer mesh has more
+PER_VERTEX = (
+    "positions",
+    "velocities",
+    "displacements",
+)  # outputs that count the vertices, of which a finer mesh has more
 
 
 @dataclass(repr=False)
 class Accuracy(metaclass=Public):
     """How accurate a number of a run is; what `Rollout.accuracy` returns. Errors are those of `value`: value less truth.
 
-    value: the number on the rollout's own mesh, in its own steps and precision; size: of its change since the first frame.
+    value: the number on the rollout's own mesh, in its own steps and precision; size: how much the corrected value differs
+        from that of the first frame.
     mesh: what the mesh costs; the number of elements of ten nodes, or of halved edges, is taken for the truth.
     step: what steps of this length cost (NaN: not known; zero of equilibria). solver: what the solver's tolerance leaves.
     rounding: what rounding may cost: of float32 the distance from float64, of float64 a bound without sign.
@@ -182,7 +187,8 @@ def estimated(
         rounding = value - number.of(frames)[0]
     else:
         rounding = exact["rounding"]
-    step, size = _of_steps(own, frames, number, values), abs(value - number.start(frames))
+    step = _of_steps(own, frames, number, values)
+    size = abs(value - np.nansum([mesh, step, solver]) - number.start(frames))
     errors = dict(mesh=mesh, step=step, solver=solver, rounding=rounding)
     found = Accuracy(number.output, value, size or abs(value), **errors, shares=shares, by=by, cost=cost)
     found.notes = tuple(_doubts(rollout.scene, found, exact))
@@ -220,22 +226,21 @@ def on_finer_mesh(rollout: "Rollout", finer: Callable, values: dict) -> tuple:
 
 
 def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer: Callable) -> tuple:
-    """(error of the mesh, of the solver's tolerance, shares of the first by tetrahedron, how it was found, further numbers)"""
+    """(error of the mesh, of the solver's tolerance, shares of the first by tetrahedron, how it was found, other numbers)"""
     fine, there, P, parents = on_finer_mesh(own.rollout, finer, values)
-    value = number.of(frames)[0]
-    given = [P @ u for u in own.each("places")]
-    replay = Replay(fine, given)
+    value, seed = number.of(frames)
+    own.rollout.vjp(frames, **{number.output: seed})
+    replay = Replay(fine, [P @ u for u in own.each("places")])
     at = fine.forward(**there)
     carried_value, seed = number.of(at)
     fine.vjp(at, **{number.output: seed})
-    n, mesh = own.rollout.scene.mesh.num_vertices, fine.scene.mesh
-    nodal, of_solver, rounding = np.zeros(mesh.num_vertices), 0.0, np.finfo(float).eps * abs(value)
-    for R, z, R_own, sizes in zip(*(replay.each(k) for k in ("residuals", "weights")), own.each("residuals"), own.each("sizes")):
-        z_own = z[:n]
+    n, mesh, eps = own.rollout.scene.mesh.num_vertices, fine.scene.mesh, np.finfo(float).eps
+    nodal, of_solver, rounding = np.zeros(mesh.num_vertices), own.estimate(), eps * abs(value)
+    of_own = (own.each(kind) for kind in ("residuals", "weights", "sizes"))
+    for R, z, R_own, z_own, sizes in zip(replay.each("residuals"), replay.each("weights"), *of_own):
         nodal += (R * (z - P @ z_own)).sum(1)
         nodal[:n] += ((P.T @ R - R_own) * z_own).sum(1)
-        of_solver += float((R_own * z_own).sum())
-        rounding += np.finfo(float).eps * float((np.reshape(sizes, (n, -1)) * np.abs(z_own)).sum())
+        rounding += eps * float((np.reshape(sizes, (n, -1)) * np.abs(z_own)).sum())
     total = value - carried_value - nodal.sum() - of_solver
     by, exact = "adjoint", value - total
     contact = bool(own.rollout.scene.obstacles or own.rollout.scene.term(SelfContact))
@@ -247,8 +252,8 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
         total = value - exact
     error = total + of_solver
     shares = _by_element(mesh, -nodal, parents, own.rollout.scene.mesh.num_tetrahedra)
-    if abs(shares.sum()) > 1e-3 * np.abs(shares).sum():
-        shares = shares * (error / shares.sum())
+    sizes = np.abs(shares) if shares.any() else own.rollout.scene.mesh.volumes
+    shares = shares + (error - shares.sum()) * sizes / sizes.sum()  # what is of no place, and not of first order
     return error, -of_solver, shares, by, dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact)
 
 
@@ -281,14 +286,17 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
     matters = abs(found.mesh) > 1e-6 * found.size
     if matters and len(sizes) >= 1 / FEW and sizes[:few].sum() > MOST * sizes.sum():
         notes.append(
-            f"{few} of {len(sizes)} tetrahedra have more than half of the error: near what is singular, such as corners that "
-            "point inwards and ends of supports, errors fall slowly, and this one may be larger than estimated; refine there"
+            f"{few} of {len(sizes)} tetrahedra have more than half of the error: near what is singular, such as corners "
+            "that point inwards and ends of supports, errors fall slowly, and this one may be larger than estimated: refine "
+            "there, as ds.refine does"
         )
     if exact["contact"]:
         notes.append("parts in contact: the estimate is of the finer mesh's own contacts, and jumps where these change")
     locks = scene.mesh.order == 1 and scene.volume == "tetrahedra"
     if matters and locks and scene.largest_poissons_ratio() > LOCKING_RATIO + 1e-12:
-        notes.append("the mesh locks (Poisson's ratio above 0.45), and ten nodes do so a little: the error may be larger")
+        notes.append(
+            "the mesh locks (Poisson's ratio above 0.45), and ten nodes do so a little: the error may be larger"
+        )
     if abs(found.mesh) > 0.5 * found.size:
         notes.append("the mesh is too coarse for this number: its error is more than half of it")
     return notes

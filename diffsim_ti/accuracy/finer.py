@@ -31,7 +31,8 @@ def on_ten_nodes(scene: Scene) -> Scene:
 
 
 def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) -> Scene:
-    """The same scene on a finer mesh of the body, `TetrahedralMesh.quadratic` or `refined`, whose first vertices are its own.
+    """The same scene on a finer mesh of the body, `TetrahedralMesh.quadratic` or `refined`, whose first vertices are its
+    own.
 
     What is chosen by indices becomes a set, which new vertices on its sides join; forces on single vertices stay there.
     Raises ValueError for what cannot be carried over.

@@ -46,7 +46,9 @@ class Refined(metaclass=Public):
         return self.history[-1][1]
 
     def __str__(self) -> str:
-        rows = [f"{unknowns:>9} unknowns: {a.value:.7g}, bar {a.bar:.2g} ({a.relative:.2g})" for unknowns, a in self.history]
+        rows = [
+            f"{unknowns:>9} unknowns: {a.value:.7g}, bar {a.bar:.2g} ({a.relative:.2g})" for unknowns, a in self.history
+        ]
         return "\n".join(rows + ([] if self.reached else ["the tolerance was not reached"]))
 
 
@@ -56,7 +58,7 @@ def refine(
     output: str,
     tolerance: float,
     weights: ArrayLike | Callable | None = None,
-    rounds: int = 12,
+    rounds: int = 20,
     most: int = 300_000,
     onto: Callable[[np.ndarray], ArrayLike] | None = None,
     values: dict | None = None,
@@ -68,8 +70,8 @@ def refine(
     most: unknowns of the finer mesh that says the error, beyond which no round begins.
     onto: as in `TetrahedralMesh.refined`. values: of inputs, as in `Rollout.forward`.
 
-    In each round the fewest tetrahedra that have half of the error by size are halved at their edges, states are carried to
-    the new mesh and Newton's method begins there. What the steps cost is not refined.
+    In each round the fewest tetrahedra that have half of the error by size are cut in two at their longest edges, states are
+    carried to the new mesh and Newton's method begins there. What the steps cost is not refined.
     Doerfler 1996, A convergent adaptive algorithm for Poisson's equation, doi:10.1137/0733054.
     """
     tolerance, rounds = number("tolerance", tolerance), whole("rounds", rounds, 0)
@@ -81,7 +83,7 @@ def refine(
         if reached or len(history) > rounds or 3 * found.cost["finer unknowns"] > most:
             return Refined(problem, history, reached, values)
         where = largest(found.shares)
-        problem, values, P, _ = on_finer_mesh(problem, lambda mesh: mesh.refined(where, onto), values)
+        problem, values, P, _ = on_finer_mesh(problem, lambda mesh: mesh.refined(where, "longest", onto), values)
         given = [P @ u for u in run.each("places")]
 
 

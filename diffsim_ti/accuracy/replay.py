@@ -24,8 +24,8 @@ class Replay:
 
     given: displacements u of each pass [m], shape (num_vertices, 3), where passes are to be; None: they are solved.
     solves: begin Newton's method there, instead of staying.
-    After a run `places` and `residuals` [N] have u and R of each pass, and `sizes` those of the forces that meet at vertices;
-    after a reverse sweep `weights` has lambda [1/N times the number].
+    After a run `places` and `residuals` [N] have u and R of each pass, `sizes` those of the forces that meet at vertices.
+    After a reverse sweep `weights` has lambda [1/N times the number].
     """
 
     def __init__(self, rollout, given: Sequence[np.ndarray] | None = None, solves: bool = False):

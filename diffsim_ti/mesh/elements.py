@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -97,13 +97,17 @@ class Elements:
         return self._with_nodes(vertices, elements, self._volumes, vertex_sets, surface_sets)
 
     def refined(
-        self, where: "SetOrIndices | None" = None, onto: Callable[[np.ndarray], ArrayLike] | None = None
+        self,
+        where: "SetOrIndices | None" = None,
+        edges: Literal["all", "longest"] = "all",
+        onto: Callable[[np.ndarray], ArrayLike] | None = None,
     ) -> "TetrahedralMesh":
-        """A mesh in which all edges of some tetrahedra, by default of all, are halved, and those of others so that edges fit
-        and no element becomes slender: where an edge is halved, the longest of each tetrahedron there is, too.
+        """A mesh in which edges of some tetrahedra, by default of all, are halved, and those of others so that edges fit and
+        no element becomes slender: where an edge is halved, the longest of each tetrahedron there is, too.
 
-        where: tetrahedra, as in `tetrahedron_indices`. Vertices keep their indices, new ones follow; sets stay on their
-        places, and curved ten-node elements keep their shape exactly.
+        where: tetrahedra, as in `tetrahedron_indices`. edges: "all" six of them, which makes eight of a tetrahedron, or the
+        "longest" alone, two. Vertices keep their indices, new ones follow; sets stay on their places, and curved ten-node
+        elements keep their shape exactly.
         onto: function of the places of new vertices [m], shape (k, 3), that returns where they are to be, such as on a round
         surface that edges are chords of. `refinement` of the mesh says whose parts its
         tetrahedra are, and has the matrix that carries fields: `fine.refinement.from_coarse @ displacements`.
@@ -116,7 +120,7 @@ class Elements:
         >>> mesh.num_tetrahedra, fine.num_tetrahedra, mesh.refined([0]).num_tetrahedra
         (6, 48, 27)
         """
-        return refined(self, where, onto)
+        return refined(self, where, edges, onto)
 
     def linear(self) -> "TetrahedralMesh":
         """Linear tetrahedra of the same corners; a mesh of order 1 is returned as it is.

@@ -31,15 +31,17 @@ class Refinement:
     from_coarse: "csr_matrix"
 
 
-def refined(mesh: "TetrahedralMesh", where=None, onto: Callable | None = None) -> "TetrahedralMesh":
+def refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable | None) -> "TetrahedralMesh":
     """See TetrahedralMesh.refined."""
-    n, corners = mesh.num_vertices, mesh.tetrahedra
+    if edges not in ("all", "longest"):
+        raise ValueError(f'edges to be halved must be "all" of the chosen tetrahedra or their "longest", got {edges!r}')
+    n, corners, every = mesh.num_vertices, mesh.tetrahedra, edges == "all"
     chosen = np.arange(len(corners)) if where is None else mesh.tetrahedron_indices(where)
     edges, place = edges_of(corners, n)
     lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
     rank = np.empty(len(edges), np.int64)
     rank[np.argsort(np.round(lengths / lengths.max(), 9), kind="stable")] = np.arange(len(edges))
-    halved = _closed(place, rank, chosen)
+    halved = _closed(place, rank, chosen, every)
     middle = np.full(len(edges), -1)
     if mesh.order == 1:
         middle[halved] = n + np.arange(halved.sum())
@@ -82,11 +84,11 @@ def refined(mesh: "TetrahedralMesh", where=None, onto: Callable | None = None) -
     return out._changed(refinement=Refinement(cut.parents, P), **sets)
 
 
-def _closed(place: np.ndarray, rank: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Which edges are halved: all of the chosen tetrahedra, and the longest of each that has a halved one."""
+def _closed(place: np.ndarray, rank: np.ndarray, chosen: np.ndarray, every: bool) -> np.ndarray:
+    """Which edges are halved: every one of the chosen tetrahedra, or the longest, and that of each that has a halved one."""
     halved = np.zeros(len(rank), bool)
-    halved[place[chosen]] = True
     longest = place[np.arange(len(place)), rank[place].argmax(1)]
+    halved[place[chosen] if every else longest[chosen]] = True
     while True:
         more = longest[halved[place].any(1) & ~halved[longest]]
         if not len(more):
@@ -151,7 +153,9 @@ def _new_vertices(mesh, cut: _Cut, edges, middle, halved) -> tuple:
 def _joined(mesh, element: np.ndarray, L: np.ndarray):
     """A function of the members of a vertex set: which new vertices join it, as the middles of edges do in `quadratic()`."""
     n, on = mesh.num_vertices, L > 0
-    ids = np.sort(np.where(on, mesh.tetrahedra[element], -1), 1)  # of the edge, face or tetrahedron that one lies within
+    ids = np.sort(
+        np.where(on, mesh.tetrahedra[element], -1), 1
+    )  # of the edge, face or tetrahedron that one lies within
     count = on.sum(1)
 
     def joined(members: np.ndarray) -> np.ndarray:
@@ -173,7 +177,9 @@ def _surface_sets(mesh, fine, cut: _Cut) -> dict[str, np.ndarray]:
     at = places_of_triangles(fine.surface_faces[:, :3], fine.tetrahedra[:, FACES].reshape(-1, 3))
     tetrahedron, opposite = np.divmod(at, 4)
     outside = (cut.L[tetrahedron[:, None], FACES[opposite]] == 0).all(1).argmax(1)
-    face = places_of_triangles(mesh.tetrahedra[cut.parents[tetrahedron[:, None]], FACES[outside]], mesh.surface_faces[:, :3])
+    face = places_of_triangles(
+        mesh.tetrahedra[cut.parents[tetrahedron[:, None]], FACES[outside]], mesh.surface_faces[:, :3]
+    )
     each = len(mesh.surface_triangles) // len(mesh.surface_faces)
     out = {}
     for name, rows in mesh.surface_sets.items():

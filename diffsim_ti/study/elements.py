@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.accuracy.finer import on_finer, on_ten_nodes
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.accuracy.finer import on_finer, on_ten_nodes
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import VelocityVerletSolver
 from diffsim_ti.study.coarser import halved_grid, on_coarser
