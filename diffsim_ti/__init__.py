@@ -13,7 +13,8 @@ interrupts.guard_import()
 
 import diffsim_ti.runtime  # noqa: F401  before anything imports taichi: it chooses which
 from diffsim_ti import notebook  # noqa: F401  gives classes their form there
-from diffsim_ti.accuracy.refine import refine
+from diffsim_ti.accuracy.estimate import Accuracy
+from diffsim_ti.accuracy.refine import Refined, refine
 from diffsim_ti.batch import Batch, BatchFrames
 from diffsim_ti.identification import (
     Identification,
@@ -135,7 +136,16 @@ __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
-__all__ += ["refine", "compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]
+__all__ += [
+    "Accuracy",
+    "Refined",
+    "refine",
+    "compare",
+    "identifiability",
+    "taylor_test",
+    "dot_product_test",
+    "check_gradients",
+]
 
 sys.meta_path.append(deprecated.MovedModules())
 if TYPE_CHECKING:  # type checkers report old names

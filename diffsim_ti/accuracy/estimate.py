@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.accuracy.finer import carried, rollout_on_finer
+from diffsim_ti.accuracy.finer import interpolation, rollout_on_finer
 from diffsim_ti.accuracy.replay import Replay
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.checked import as_numbers
@@ -169,7 +169,7 @@ def estimated(
     """(the accuracy of a number, the run that it is of, in float64); given: displacements of each pass to begin with."""
     if rollout.solver.explicit:
         raise ValueError(
-            f"accuracy is of equilibria and implicit steps: take StaticSolver, or BDF2Solver in place of {rollout.solver!r}"
+            f"accuracy is of equilibria and implicit steps, not of {rollout.solver!r}: take StaticSolver or BDF2Solver"
         )
     if rollout.scene.holds_volumes or rollout.scene.reduced:
         raise ValueError(
@@ -211,17 +211,14 @@ def on_finer_mesh(rollout: "Rollout", finer: Callable, values: dict) -> tuple:
     tolerance = max(0.01 * rollout.solver.tolerance, 1e-12)  # so that its own is not felt
     fine = rollout_on_finer(rollout, finer, values, tolerance=tolerance)
     mesh, coarse = fine.scene.mesh, rollout.scene.mesh
-    P, parents = carried(mesh), np.arange(coarse.num_tetrahedra)
+    P, parents = interpolation(mesh), np.arange(coarse.num_tetrahedra)
     if mesh.refinement is not None:
         parents = mesh.refinement.parents
     there = {}
     for name, x in values.items():
-        x = np.asarray(x) if not isinstance(x, dict) else x
-        if name in ("initial_positions", "initial_velocities", "rest_positions") and np.ndim(x) == 2:
-            x = P @ x
-        elif mesh.refinement is not None and np.ndim(x) and len(x) == coarse.num_tetrahedra:
-            x = x[parents]
-        there[name] = x
+        if name in ("initial_positions", "initial_velocities", "rest_positions", "shape") and np.ndim(x) == 2:
+            x = P @ np.asarray(x)
+        there[name] = x if mesh.refinement is None else mesh.refinement.spread(x)
     return fine, there, P, parents
 
 
@@ -247,7 +244,7 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     size = abs(exact - number.start(frames)) or abs(exact)
     if contact or not number.linear or not abs(total) <= LARGE * size:
         by = "solution"
-        replay.solves, fine.sweep._loaded = True, None
+        replay.solves = True
         exact = number.of(fine.forward(**there))[0]
         total = value - exact
     error = total + of_solver

@@ -52,27 +52,20 @@ def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) 
     mesh = finer(base)
     for name in ("initial_positions", "initial_velocities"):
         if np.ndim(given[name]) == 2:
-            given[name] = carried(mesh) @ np.asarray(given[name], np.float64)
+            given[name] = interpolation(mesh) @ np.asarray(given[name], np.float64)
     if given["motion"] is not None:
         given["motion"] = _motion(scene, mesh, given["fixed"])
     if mesh.order > scene.mesh.order:
         given["volume"] = "tetrahedra"
     else:
-        given["density"] = _of_parents(given["density"], scene.mesh, mesh)
-        given["material"] = own = copy(scene.material)
-        own._numbers = {name: _of_parents(x, scene.mesh, mesh) for name, x in own._numbers.items()}
+        given["density"] = mesh.refinement.spread(given["density"])
+        given["material"] = scene.material.spread(mesh.refinement)
     return Scene(**given | dict(mesh=mesh, terms=terms))
 
 
-def carried(fine: TetrahedralMesh):
+def interpolation(fine: TetrahedralMesh):
     """The matrix from what vertices of the mesh have that a finer one was made of to what its own have."""
     return fine.from_corners if fine.refinement is None else fine.refinement.from_coarse
-
-
-def _of_parents(number, coarse: TetrahedralMesh, fine: TetrahedralMesh):
-    """A number, or one for each tetrahedron, which those within it have, too."""
-    each = not isinstance(number, Mapping) and np.ndim(number) and len(number) == coarse.num_tetrahedra
-    return np.asarray(number)[fine.refinement.parents] if each else number
 
 
 def _motion(scene: Scene, nodes: TetrahedralMesh, fixed):
@@ -85,7 +78,7 @@ def _motion(scene: Scene, nodes: TetrahedralMesh, fixed):
                 return x
             every = np.zeros((*x.shape[:-2], scene.mesh.num_vertices, 3))
             every[..., old, :] = x
-            return np.moveaxis(np.tensordot(carried(nodes)[new].toarray(), every, (1, -2)), 0, -2)
+            return np.moveaxis(np.tensordot(interpolation(nodes)[new].toarray(), every, (1, -2)), 0, -2)
 
         if callable(motion):
             return lambda t: rows(motion(t))

@@ -31,8 +31,8 @@ class Replay:
     def __init__(self, rollout, given: Sequence[np.ndarray] | None = None, solves: bool = False):
         self.rollout, self.given, self.solves, sweep = rollout, given, solves, rollout.sweep
         self.places, self.residuals, self.sizes, self.weights = {}, {}, {}, {}
-        sweep._make_workspace = lambda derived: _Workspace(self, sweep.solver, derived)
-        sweep._make_adjoint = lambda density, shape: _Adjoint(self, sweep.workspace, density, shape)
+        sweep.make_workspace = lambda derived: _Workspace(self, sweep.solver, derived)
+        sweep.make_adjoint = lambda density, shape: _Adjoint(self, sweep.workspace, density, shape)
 
     def each(self, kind: str) -> list[np.ndarray]:
         """One of these, pass by pass."""

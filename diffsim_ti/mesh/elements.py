@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.mesh import checks
 from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes
 from diffsim_ti.mesh.reference_element import ReferenceElement, reference_element
-from diffsim_ti.mesh.refinement import Refinement, refined
+from diffsim_ti.mesh.refinement import Refinement, parts_of_refined
 from diffsim_ti.mesh.sets import checked_sets, frozen
 from diffsim_ti.mesh.ten_nodes import middles_in_set, middles_of, triangles_of, with_middles
 
@@ -120,7 +120,13 @@ class Elements:
         >>> mesh.num_tetrahedra, fine.num_tetrahedra, mesh.refined([0]).num_tetrahedra
         (6, 48, 27)
         """
-        return refined(self, where, edges, onto)
+        parts, refinement, sets = parts_of_refined(self, where, edges, onto)
+        out = self._with_nodes(*parts, {})
+        tetrahedra, surfaces = sets(out)
+        out._tetrahedron_sets = checked_sets(tetrahedra, len(refinement.parents), "tetrahedron")
+        out._surface_sets = checked_sets(surfaces, len(out._surface_triangles), "surface")
+        out.refinement = refinement
+        return out
 
     def linear(self) -> "TetrahedralMesh":
         """Linear tetrahedra of the same corners; a mesh of order 1 is returned as it is.

@@ -1,6 +1,6 @@
 """Meshes whose elements are halved at their edges, where that is asked for."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,7 @@ from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh import checks
 from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes
 from diffsim_ti.mesh.reference_element import MID_EDGES
-from diffsim_ti.mesh.sets import checked_sets, places_of_triangles
+from diffsim_ti.mesh.sets import places_of_triangles
 from diffsim_ti.mesh.ten_nodes import edges_of
 
 if TYPE_CHECKING:
@@ -30,9 +30,15 @@ class Refinement:
     parents: np.ndarray
     from_coarse: "csr_matrix"
 
+    def spread(self, number):
+        """A number, or one for each coarse tetrahedron, which those within it have, too; others as they are."""
+        each = not isinstance(number, Mapping) and np.ndim(number) and len(number) == self.parents[-1] + 1
+        return np.asarray(number)[self.parents] if each else number
 
-def refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable | None) -> "TetrahedralMesh":
-    """See TetrahedralMesh.refined."""
+
+def parts_of_refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable | None) -> tuple:
+    """What TetrahedralMesh.refined is made of: (vertices, elements, volumes, vertex sets), its Refinement, and a function of
+    the mesh that says its tetrahedron sets and surface sets."""
     if edges not in ("all", "longest"):
         raise ValueError(f'edges to be halved must be "all" of the chosen tetrahedra or their "longest", got {edges!r}')
     n, corners, every = mesh.num_vertices, mesh.tetrahedra, edges == "all"
@@ -75,13 +81,12 @@ def refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable | None) -
         volumes = checks.checked_volumes(vertices, elements[:, :4])
         checks.oriented(elements, volumes, fix_orientation=False)
         volumes = checks.checked_curved_volumes(vertices, elements, volumes)
-    out = mesh._with_nodes(vertices, elements, volumes, vertex_sets, {})
-    members = {name: np.isin(cut.parents, rows) for name, rows in mesh.tetrahedron_sets.items()}
-    sets = dict(
-        _tetrahedron_sets=checked_sets(members, out.num_tetrahedra, "tetrahedron"),
-        _surface_sets=checked_sets(_surface_sets(mesh, out, cut), len(out.surface_triangles), "surface"),
-    )
-    return out._changed(refinement=Refinement(cut.parents, P), **sets)
+
+    def sets(fine: "TetrahedralMesh") -> tuple[dict, dict]:
+        within = {name: np.isin(cut.parents, rows) for name, rows in mesh.tetrahedron_sets.items()}
+        return within, _surface_sets(mesh, fine, cut)
+
+    return (vertices, elements, volumes, vertex_sets), Refinement(cut.parents, P), sets
 
 
 def _closed(place: np.ndarray, rank: np.ndarray, chosen: np.ndarray, every: bool) -> np.ndarray:
