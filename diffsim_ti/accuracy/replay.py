@@ -9,6 +9,7 @@ lambda being what the reverse sweep solves for in each pass.
 Becker, Rannacher 2001, An optimal control approach to a posteriori error estimation, doi:10.1017/S0962492901000010.
 """
 
+import weakref
 from collections.abc import Sequence
 
 import numpy as np
@@ -31,8 +32,31 @@ class Replay:
     def __init__(self, rollout, given: Sequence[np.ndarray] | None = None, solves: bool = False):
         self.rollout, self.given, self.solves, sweep = rollout, given, solves, rollout.sweep
         self.places, self.residuals, self.sizes, self.weights = {}, {}, {}, {}
-        sweep.make_workspace = lambda derived: _Workspace(self, sweep.solver, derived)
+        sweep.make_workspace = lambda derived: self._joined(sweep.solver.workspace(derived))
         sweep.make_adjoint = lambda density, shape: _Adjoint(self, sweep.workspace, density, shape)
+
+    def _joined(self, workspace: ImplicitWorkspace) -> ImplicitWorkspace:
+        """A workspace whose passes are solved here."""
+        proxy = weakref.proxy(workspace)  # no circle
+        workspace.solve_pass = lambda *arguments: self._solve_pass(proxy, *arguments)
+        return workspace
+
+    def _solve_pass(self, ws, j: int, u, held, starts: list, problem: tuple, stage) -> np.ndarray:
+        """See ImplicitWorkspace.solve_pass."""
+        there = None
+        if self.given is not None:
+            there = held_as(ws.free, held, ws.rigid.nearest(self.given[j]))
+        if there is not None and self.solves:
+            try:
+                there = ws.newton.solve(there, *problem, leave_saddles=stage.static)
+            except NotConverged:
+                there = None
+        if there is None:
+            there = ImplicitWorkspace.solve_pass(ws, j, u, held, starts, problem, stage)
+        ws.potential.place(there)
+        self.places[j], self.residuals[j] = there, ws.newton.residual_of(problem)
+        self.sizes[j] = ws.potential.forces()[1]
+        return there
 
     def each(self, kind: str) -> list[np.ndarray]:
         """One of these, pass by pass."""
@@ -42,28 +66,6 @@ class Replay:
     def estimate(self) -> float:
         """sum of lambda . R."""
         return float(sum((R * z).sum() for R, z in zip(self.each("residuals"), self.each("weights"))))
-
-
-class _Workspace(ImplicitWorkspace):
-    def __init__(self, replay: Replay, solver, derived):
-        self.replay = replay
-        super().__init__(solver, derived)
-
-    def _solve(self, j, u, held, starts, problem, stage):
-        replay, there = self.replay, None
-        if replay.given is not None:
-            there = held_as(self.free, held, self.rigid.nearest(replay.given[j]))
-        if there is not None and replay.solves:
-            try:
-                there = self.newton.solve(there, *problem, leave_saddles=stage.static)
-            except NotConverged:
-                there = None
-        if there is None:
-            there = super()._solve(j, u, held, starts, problem, stage)
-        self.potential.place(there)
-        replay.places[j], replay.residuals[j] = there, self.newton.residual_of(problem)
-        replay.sizes[j] = self.potential.forces()[1]
-        return there
 
 
 class _Adjoint(ImplicitAdjoint):
