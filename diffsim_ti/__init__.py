@@ -136,16 +136,8 @@ __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
-__all__ += [
-    "Accuracy",
-    "Refined",
-    "refine",
-    "compare",
-    "identifiability",
-    "taylor_test",
-    "dot_product_test",
-    "check_gradients",
-]
+__all__ += ["Accuracy", "Refined", "refine", "compare", "identifiability", "taylor_test", "dot_product_test"]
+__all__ += ["check_gradients"]
 
 sys.meta_path.append(deprecated.MovedModules())
 if TYPE_CHECKING:  # type checkers report old names

@@ -228,9 +228,14 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     value, seed = number.of(frames)
     own.rollout.vjp(frames, **{number.output: seed})
     replay = Replay(fine, [P @ u for u in own.each("places")])
-    at = fine.forward(**there)
-    carried_value, seed = number.of(at)
-    fine.vjp(at, **{number.output: seed})
+    carried_value, linear = value, number.linear
+    try:
+        at = fine.forward(**there)
+        carried_value, seed = number.of(at)
+        fine.vjp(at, **{number.output: seed})
+    except FloatingPointError:  # no state of the finer mesh, such as one in an obstacle, or beyond a limit point
+        replay.residuals, linear = {}, False
+    placed = bool(replay.residuals)
     n, mesh, eps = own.rollout.scene.mesh.num_vertices, fine.scene.mesh, np.finfo(float).eps
     nodal, of_solver, rounding = np.zeros(mesh.num_vertices), own.estimate(), eps * abs(value)
     of_own = (own.each(kind) for kind in ("residuals", "weights", "sizes"))
@@ -242,7 +247,7 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     by, exact = "adjoint", value - total
     contact = bool(own.rollout.scene.obstacles or own.rollout.scene.term(SelfContact))
     size = abs(exact - number.start(frames)) or abs(exact)
-    if contact or not number.linear or not abs(total) <= LARGE * size:
+    if contact or not linear or not abs(total) <= LARGE * size:
         by = "solution"
         replay.solves = True
         exact = number.of(fine.forward(**there))[0]
@@ -251,7 +256,8 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     shares = _by_element(mesh, -nodal, parents, own.rollout.scene.mesh.num_tetrahedra)
     sizes = np.abs(shares) if shares.any() else own.rollout.scene.mesh.volumes
     shares = shares + (error - shares.sum()) * sizes / sizes.sum()  # what is of no place, and not of first order
-    return error, -of_solver, shares, by, dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact)
+    known = dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact, placed=placed)
+    return error, -of_solver, shares, by, known
 
 
 def _by_element(mesh: TetrahedralMesh, nodal: np.ndarray, parents: np.ndarray, count: int) -> np.ndarray:
@@ -286,6 +292,10 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
             f"{few} of {len(sizes)} tetrahedra have more than half of the error: near what is singular, such as corners "
             "that point inwards and ends of supports, errors fall slowly, and this one may be larger than estimated: refine "
             "there, as ds.refine does"
+        )
+    if not exact["placed"]:
+        notes.append(
+            "states of the run are none of the finer mesh, or have no adjoint there: shares are by volume alone"
         )
     if exact["contact"]:
         notes.append("parts in contact: the estimate is of the finer mesh's own contacts, and jumps where these change")

@@ -43,7 +43,7 @@ def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) 
         if isinstance(term, ExternalForce):
             own.vertices, terms = term.indices(scene.mesh), [*terms, own]
             continue
-        if not is_named(surface):
+        if not callable(surface) and not is_named(surface):
             own.surface = f"surface of term {k}"
             base, term = base.with_surface_set(own.surface, surface), own
         terms.append(term)
