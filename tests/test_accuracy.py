@@ -5,6 +5,8 @@ import pytest
 from example_files import example
 
 import diffsim_ti as ds
+from diffsim_ti.accuracy import estimate
+from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
 from diffsim_ti.mesh.reference_element import quadrature
 
 BARS = example("benchmarks/error_bars")
@@ -100,6 +102,32 @@ def block(order: int = 1, precision: str = "f64", tolerance: float = 1e-8) -> ds
 def test_a_mesh_without_an_error_has_a_bar_as_small_as_the_tolerance():
     found, true = BARS.measured("uniaxial", 1, 2)
     assert found.relative < 1e-8 and abs(found.error - true) < 1e-12 and not found.notes
+
+
+UNEQUAL = ds.UnequalSteps([0.01, 0.02, 0.01], 2)
+RUNS = [(ds.StaticSolver, 1), (ds.ImplicitEulerSolver, UNEQUAL), (ds.ImplicitMidpointSolver, UNEQUAL)]
+RUNS += [(kind, 5) for kind in (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)]
+
+
+@pytest.mark.parametrize("kind, steps", RUNS)
+def test_small_motions_have_the_exact_difference_of_two_meshes(kind, steps, monkeypatch):
+    """Where all is linear the first order is all there is, of every solver, whatever acts."""
+    monkeypatch.setattr(estimate, "LARGE", np.inf)
+    mesh = block().scene.mesh
+    terms = [ds.Traction((0, 0.1, -0.2), "xmax"), ds.Gravity((0, 1e-4, 2e-4))]
+    terms += [] if kind is ds.StaticSolver else [ds.Drag(3.0)]
+    start = dict(initial_velocities=1e-6 * np.sin(mesh.vertices * [1, 2, 3]))
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 900.0, terms, "xmin", precision="f64", **start)
+    outputs = ds.MaterialPoints([[2, 0.5, 0.5], [1.2, 0.3, 0.7]], "places")
+    rollout = ds.Rollout(kind(scene, dt=0.02, tolerance=1e-9), steps, outputs=outputs)
+    weights = np.array([[1.0, -2.0, 3.0], [0.5, 1.0, -1.0]])
+    found = rollout.accuracy("places", weights)
+    other = rollout_on_ten_nodes(rollout, {}).forward()["places"][-1]
+    difference = (weights * (rollout.forward()["places"][-1] - other)).sum()
+    assert found.by == "adjoint" and found.mesh + found.solver == pytest.approx(difference, rel=2e-3, abs=1e-14)
+    if steps == 5:
+        finer = rollout.on(rollout.solver.for_scene(scene, substeps=8)).forward()["places"][-1]
+        assert found.step == pytest.approx((weights * (rollout.forward()["places"][-1] - finer)).sum(), rel=0.4)
 
 
 def test_what_the_solver_and_rounding_leave():

@@ -4,6 +4,7 @@ Effectivity is the estimated error over the true one: 1 is perfect. Where the me
 the solver's tolerance.
 
     python examples/benchmarks/error_bars.py [names of problems]
+    python examples/benchmarks/error_bars.py refine     # meshes refined by the estimate, and uniformly
 """
 
 import sys
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.linalg import expm
 
 import diffsim_ti as ds
+from diffsim_ti.accuracy.finer import rollout_on_finer
 from diffsim_ti.study.problems import lame_mode, lame_omega, lame_scene
 
 
@@ -191,6 +193,38 @@ def measured(name: str, order: int, size: int) -> tuple:
     return found, found.value - exact
 
 
+def l_body(n, order):
+    """Where the foot of an L of 2 x 2 x 0.5 m goes that is held on its top and sheared at the foot, large strains: -0.380 m
+    (ds.refine and uniform refinement, extrapolated)."""
+    box = ds.TetrahedralMesh.create_box((2 * n + 1, 2 * n + 1, 2), (2, 2, 0.5))
+    kept = box.tetrahedra[(box.centroids[:, :2] < 1).any(1)]
+    used, corners = np.unique(kept, return_inverse=True)
+    mesh = ds.TetrahedralMesh(box.vertices[used], corners.reshape(-1, 4))
+    mesh = mesh.with_vertex_set("top", mesh.vertices[:, 1] == 2)
+    mesh = mesh.with_surface_set("side", lambda x, normal: (normal[:, 0] > 0.5) & (x[:, 0] > 1.9))
+    options = dict(terms=ds.Traction((0, -1e4, 0), "side"), fixed="top")
+    foot = ds.MaterialPoints([[2.0, 0.0, 0.25]], name="foot")
+    return *statics(mesh, ds.StableNeoHookean(1e6, 0.3), foot, order, **options), (0, 1, 0), -0.380
+
+
+def refine() -> None:
+    """Unknowns of ten nodes until the estimate, and the error itself of uniform meshes, is below a tolerance."""
+    for problem, tolerance in ((cook, 0.01), (l_body, 0.005)):
+        rollout, _, weights, exact = problem(2, 2)
+        begin = time.perf_counter()
+        print(f"{problem.__name__}, to {tolerance:g}:")
+        print(ds.refine(rollout, next(iter(rollout.computed)), tolerance, weights))
+        print(f"  in {time.perf_counter() - begin:.0f} s; uniformly:")
+        for _ in range(4):
+            frames = rollout.forward()
+            y = (frames[next(iter(rollout.computed))] * weights).sum((1, 2))
+            error = abs(y[-1] - exact) / abs(exact - y[0])
+            print(f"{3 * rollout.scene.mesh.num_vertices:>9} unknowns: {y[-1]:.7g}, error {error:.2g}", flush=True)
+            if error < tolerance:
+                break
+            rollout = rollout_on_finer(rollout, ds.TetrahedralMesh.refined)
+
+
 def main(names) -> None:
     print("| problem | nodes | mesh | value | bar | true error | effectivity | by | s |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
@@ -205,4 +239,4 @@ def main(names) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    refine() if sys.argv[1:] == ["refine"] else main(sys.argv[1:])
