@@ -208,14 +208,14 @@ def l_body(n, order):
 
 
 def refine() -> None:
-    """Unknowns of ten nodes until the estimate, and the error itself of uniform meshes, is below a tolerance."""
-    for problem, tolerance in ((cook, 0.01), (l_body, 0.005)):
-        rollout, _, weights, exact = problem(2, 2)
+    """Unknowns until the estimate, and the error itself of uniform meshes, is below a tolerance."""
+    for problem, order, tolerance in ((cook, 2, 0.01), (l_body, 2, 0.005)):
+        rollout, _, weights, exact = problem(2, order)
         begin = time.perf_counter()
-        print(f"{problem.__name__}, to {tolerance:g}:")
+        print(f"{problem.__name__}, {(4, 10)[order - 1]} nodes, to {tolerance:g}:")
         print(ds.refine(rollout, next(iter(rollout.computed)), tolerance, weights))
         print(f"  in {time.perf_counter() - begin:.0f} s; uniformly:")
-        for _ in range(4):
+        for _ in range(5):
             frames = rollout.forward()
             y = (frames[next(iter(rollout.computed))] * weights).sum((1, 2))
             error = abs(y[-1] - exact) / abs(exact - y[0])
