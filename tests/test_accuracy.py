@@ -184,6 +184,7 @@ def test_refinement_ends_below_the_tolerance_with_gradients_there():
     assert found.reached and found.accuracy.relative <= 0.4 < found.history[0][1].relative
     assert unknowns == sorted(unknowns) and 3 * found.mesh.num_vertices == unknowns[-1]
     frames = found.rollout.forward()
+    assert found.rollout.solver.tolerance == start.solver.tolerance
     assert frames["end"][-1, 0, 2] == pytest.approx(found.accuracy.value)
     seed = np.zeros((2, 1, 3))
     seed[-1, 0, 2] = 1.0

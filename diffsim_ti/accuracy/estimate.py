@@ -206,10 +206,10 @@ def _run(rollout: "Rollout", number: Number, values: dict, given: list | None) -
     return number.of(frames)[0] if value is None else value, replay, frames
 
 
-def on_finer_mesh(rollout: "Rollout", finer: Callable, values: dict) -> tuple:
-    """(the rollout on the finer mesh, values of inputs there, the matrix P that carries fields, parents of tetrahedra)"""
-    tolerance = max(0.01 * rollout.solver.tolerance, 1e-12)  # so that its own is not felt
-    fine = rollout_on_finer(rollout, finer, values, tolerance=tolerance)
+def on_finer_mesh(rollout: "Rollout", finer: Callable, values: dict, **solver) -> tuple:
+    """(the rollout on the finer mesh, values of inputs there, the matrix P that carries fields, parents of tetrahedra);
+    solver: arguments of the solver that are others there."""
+    fine = rollout_on_finer(rollout, finer, values, **solver)
     mesh, coarse = fine.scene.mesh, rollout.scene.mesh
     P, parents = interpolation(mesh), np.arange(coarse.num_tetrahedra)
     if mesh.refinement is not None:
@@ -218,13 +218,16 @@ def on_finer_mesh(rollout: "Rollout", finer: Callable, values: dict) -> tuple:
     for name, x in values.items():
         if name in ("initial_positions", "initial_velocities", "rest_positions", "shape") and np.ndim(x) == 2:
             x = P @ np.asarray(x)
-        there[name] = x if mesh.refinement is None else mesh.refinement.spread(x)
+        elif mesh.refinement is not None and name in (*rollout.scene.material.inputs, "density"):
+            x = mesh.refinement.spread(x)
+        there[name] = x
     return fine, there, P, parents
 
 
 def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer: Callable) -> tuple:
     """(error of the mesh, of the solver's tolerance, shares of the first by tetrahedron, how it was found, other numbers)"""
-    fine, there, P, parents = on_finer_mesh(own.rollout, finer, values)
+    tolerance = max(0.01 * own.rollout.solver.tolerance, 1e-12)  # so that its own is not felt
+    fine, there, P, parents = on_finer_mesh(own.rollout, finer, values, tolerance=tolerance)
     value, seed = number.of(frames)
     own.rollout.vjp(frames, **{number.output: seed})
     replay = Replay(fine, [P @ u for u in own.each("places")])
