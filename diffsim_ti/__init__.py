@@ -13,6 +13,8 @@ interrupts.guard_import()
 
 import diffsim_ti.runtime  # noqa: F401  before anything imports taichi: it chooses which
 from diffsim_ti import notebook  # noqa: F401  gives classes their form there
+from diffsim_ti.accuracy.estimate import Accuracy
+from diffsim_ti.accuracy.refine import Refined, refine
 from diffsim_ti.batch import Batch, BatchFrames
 from diffsim_ti.identification import (
     Identification,
@@ -138,7 +140,8 @@ __all__ += ["ContactSlip", "ContactTraction", "Reaction", "SelfContactForce", "S
 __all__ += ["PixelTracks", "TactilePad"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
-__all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]
+__all__ += ["Accuracy", "Refined", "refine", "compare", "identifiability", "taylor_test", "dot_product_test"]
+__all__ += ["check_gradients"]
 
 sys.meta_path.append(deprecated.MovedModules())
 if TYPE_CHECKING:  # type checkers report old names

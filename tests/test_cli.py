@@ -309,6 +309,17 @@ def test_simulate_free_fall(cube_file, tmp_path):
         assert said in done.stdout, done.stdout
 
 
+def test_simulate_says_how_accurate_the_end_is(cube_file, tmp_path, capsys):
+    out = tmp_path / "end.npz"
+    options = ["simulate", cube_file, "--duration", 0.02, "--fps", 50, "--fixed", "xmin", "-o", out, "--accuracy"]
+    assert "take --solver bdf2" in fails(capsys, *options)
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*map(str, options), "--solver", "bdf2"])
+    said = capsys.readouterr().out
+    assert stop.value.code == 0 and "center_of_mass: " in said and "  mesh +" in said and "rounding " in said
+    assert (tmp_path / "cube_accuracy.png").exists()
+
+
 def test_simulate_refuses_an_unstable_step_in_one_line(cube_file, tmp_path):
     done = command("simulate", cube_file, "-o", tmp_path, "--dt", 0.1)
     assert done.returncode == 2 and "exceeds the stable step" in done.stderr and len(done.stderr.splitlines()) == 1

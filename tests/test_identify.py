@@ -7,11 +7,10 @@ import pytest
 from scipy.optimize import least_squares
 
 import diffsim_ti as ds
+from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
 from diffsim_ti.identification.picture import save_picture
 from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem
-from diffsim_ti.rollout.finer import rollout_on_ten_nodes
-from diffsim_ti.study.elements import refined
 
 identify = partial(ds.identify, check_mesh=False)  # data are of the mesh that is fitted
 MESH = ds.TetrahedralMesh.create_box([4, 2, 2], [0.6, 0.2, 0.2], pattern="five")
@@ -146,7 +145,7 @@ def bar(mesh, terms=None, outputs=(), **options) -> ds.Rollout:
 def test_intervals_hold_the_error_of_the_mesh():
     """Data of a mesh that is finer twice: the noise's interval never holds E, although residuals fit."""
     end = COARSE.vertex_indices("xmax")
-    exact = bar(refined(COARSE).quadratic()).forward().positions[:, end]
+    exact = bar(COARSE.refined().quadratic()).forward().positions[:, end]
     noise, rollout, inside = 4e-4, bar(COARSE), []  # 4 % of the largest displacement
     for seed in range(6):
         seen = exact + noise * np.random.default_rng(seed).standard_normal(exact.shape)

@@ -15,7 +15,7 @@ from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.study import PROBLEMS, Problem, chart, charts, pareto_front, problem, problems, recommend
 from diffsim_ti.study.alternatives import stiff_sets
 from diffsim_ti.study.coarser import halved_grid
-from diffsim_ti.study.elements import ElementTrials, refined
+from diffsim_ti.study.elements import ElementTrials
 from diffsim_ti.study.work_precision import Point, choose_substeps, make_rollout, reference, run
 
 EXPLICIT = [kind for kind in SOLVERS if kind.explicit]
@@ -325,7 +325,7 @@ def test_ten_nodes_are_tried_on_half_the_cells():
 
 def test_a_refined_mesh_is_the_same_body():
     mesh = ds.TetrahedralMesh.create_cube(3).with_tetrahedron_set("some", [1, 5])
-    finer = refined(mesh)
+    finer = mesh.refined()
     assert finer.num_tetrahedra == 8 * mesh.num_tetrahedra and finer.volume == pytest.approx(mesh.volume, rel=1e-14)
     some = finer.volumes[finer.tetrahedron_sets["some"]].sum()
     assert some == pytest.approx(mesh.volumes[[1, 5]].sum(), rel=1e-14)

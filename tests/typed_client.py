@@ -169,6 +169,12 @@ if TYPE_CHECKING:  # what takes longer than types are worth: checked, and run by
         ds.identifiability(rollout, ["youngs_modulus"])
         assert_type(ds.dot_product_test(rollout, seed=3), float)
         ds.taylor_test(lambda x: float(x @ x), np.ones(3), 2 * np.ones(3))
+        bar = rollout.accuracy("pressure", weights=[1.0], finer=ds.TetrahedralMesh.refined, youngs_modulus=1e4)
+        assert_type(bar, ds.Accuracy)
+        assert_type(bar.corrected, float)
+        refined = ds.refine(rollout, "pressure", tolerance=0.01)
+        assert_type(refined, ds.Refined)
+        assert_type(refined.mesh, ds.TetrahedralMesh)
         ensemble = ds.Ensemble([1e4, 2e4], make=lambda E: ds.Rollout(solver, 4))
         report: ds.SolveReport = rollout.report
         errors: Iterable[type[Exception]] = (ds.Crossing, ds.Tunnelling, ds.EnergyGained, ds.Buckled)

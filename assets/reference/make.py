@@ -44,7 +44,7 @@ REFERENCE = {
     "Loads and supports": ("terms", "terms"),
     "Scenes and solvers": ("scene solvers state.schedule rollout.adaptive_steps", "solvers"),
     "Runs": ("rollout batch torch_bridge.ensemble", ""),
-    "Results": ("outputs", "outputs"),
+    "Results": ("outputs accuracy", "outputs"),
     "Gradients": ("verify common.differences", "verify"),
     "Identification": ("identification", ""),
     "Design and optimisation": ("designs", "designs optimization optimization_picture"),
@@ -58,7 +58,8 @@ REFERENCE = {
 GUIDES = (
     "first_steps meshes materials which_material loads_and_supports contact_and_friction solvers_and_steps gradients "
 )
-GUIDES += "identify design batches_and_cards results_and_pictures robots extend units_and_limits coming_from_others"
+GUIDES += "identify design batches_and_cards results_and_pictures accuracy robots extend units_and_limits "
+GUIDES += "coming_from_others"
 BOOST = {"examples": 3, "README": 2, "tests": 0.5, "CHANGELOG": 0.3}  # how much of it the search counts; else 1
 PAGES = {
     "Examples": ["examples/README.md", "examples/benchmarks/README.md"],

@@ -94,13 +94,13 @@ class BatchSweep(Sweep):
             values.derived = self.scene.inputs.derive_each(self.values_of(values, 0), changed)
         return values.derived
 
-    def _make_workspace(self, derived):
+    def make_workspace(self, derived):
         return BatchWorkspace(self.solver, derived)
 
     def _make_guard(self):
         return FrameByFrame(self.workspace)
 
-    def _make_adjoint(self, density: bool, shape: bool):
+    def make_adjoint(self, density: bool, shape: bool):
         return BatchAdjoint(self.workspace, density, shape)
 
     def _make_tangent(self, change):

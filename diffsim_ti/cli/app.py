@@ -174,6 +174,14 @@ def simulate(
     ground_friction: Annotated[float, typer.Option(help="Coulomb's coefficient of the floor")] = 0.0,
     azimuth: Annotated[float, typer.Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
     arrows: opt.Arrows = None,
+    accuracy: Annotated[
+        bool,
+        typer.Option(
+            "--accuracy",
+            help="also say what mesh, steps, solver and rounding cost the height of the centre of mass at the end, and draw "
+            "the share of each tetrahedron; of implicit solvers, without --dt in as many steps as were taken last",
+        ),
+    ] = False,
     backend: opt.Backend = "cpu",
     precision: opt.Precision = "f32",
     threads: opt.Threads = None,
@@ -189,6 +197,8 @@ def simulate(
     asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
     writers = [writer_for(path, view) for path in dict.fromkeys(asked)]
     kind = opt.solver_class(solver)
+    if accuracy and kind.explicit:
+        raise ValueError(f"--accuracy is of implicit solvers, not of {solver}: take --solver bdf2 or implicit-euler")
     law = opt.make_material(material, youngs_modulus, poissons_ratio)
     body = opt.load_body(mesh, size, up, fix_orientation, order)
     runtime.init(backend, precision, threads)
@@ -202,7 +212,13 @@ def simulate(
     opt.check_time_it_takes(run, duration)
     setup = time.perf_counter() - begin
     writing, files, _ = run_and_write(run, frames, writers)
+    said = ""
+    if accuracy:
+        files.append(str(asked[0].with_name(f"{mesh.stem}_accuracy.png")))
+        said = opt.accuracy_of(run, frames, files[-1])
     opt.print_summary(run, setup, writing, files)
+    if said:
+        print(said)
 
 
 @app.command()

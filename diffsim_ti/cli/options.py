@@ -18,7 +18,8 @@ from diffsim_ti.cli.config import read_options
 from diffsim_ti.materials import MATERIALS
 from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.outputs import ContactForce, Output, Reaction
+from diffsim_ti.outputs import CenterOfMass, ContactForce, Output, Reaction
+from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, Solver, VelocityVerletSolver
 from diffsim_ti.terms import Drag, Gravity, Ground, Term
@@ -102,6 +103,16 @@ def check_time_it_takes(run: ForwardRun, duration: float) -> None:
             f"--duration {duration:g} s takes about {steps:.3g} steps of {run.first_substep:.3g} s, more than "
             f"{seconds / 86400:.3g} days: shorten it, lower -E, or take --solver bdf2"
         )
+
+
+def accuracy_of(run: ForwardRun, frames: int, path: str) -> str:
+    """What the height of the centre of mass at the end of a run is off by; the shares of its tetrahedra are drawn."""
+    from diffsim_ti.picture import save_picture
+
+    solver = run.simulator.solver.for_scene(run.scene)
+    found = Rollout(solver, frames * run.parts, outputs=CenterOfMass()).accuracy("center_of_mass", (0.0, 1.0, 0.0))
+    save_picture(path, run.scene.mesh, run.simulator.positions, found.shares, "share of the error [m]")
+    return str(found)
 
 
 # ---- a scene from options ---------------------------------------------------------------------------------------------

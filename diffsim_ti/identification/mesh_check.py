@@ -4,12 +4,12 @@ import warnings
 
 import numpy as np
 
+from diffsim_ti.accuracy.finer import on_ten_nodes, rollout_on_ten_nodes
 from diffsim_ti.identification.measurements import Measurement
 from diffsim_ti.identification.modal_test import ModalTest
 from diffsim_ti.identification.problem import Experiment, Problem
 from diffsim_ti.identification.result import Information, MeshCheck
 from diffsim_ti.identification.search import FAILURES, Search
-from diffsim_ti.rollout.finer import on_ten_nodes, rollout_on_ten_nodes
 
 RUNS, USUAL = 12, 5  # on the finer mesh: at most, and usually
 # a step that is this share of the standard errors, or of the way from the first estimates, is the last

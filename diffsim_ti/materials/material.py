@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from copy import copy
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,7 @@ from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.materials import moduli
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.refinement import Refinement
 from diffsim_ti.mesh.sets import values_of_sets
 
 # one number, an array with one per tetrahedron, or {tetrahedron set: number}
@@ -114,6 +116,12 @@ class Material(metaclass=Public):
         values = {name: _on_mesh(name, number, mesh, self.shape_of(name)) for name, number in self._numbers.items()}
         self.check(values)
         return values
+
+    def spread(self, refinement: Refinement) -> "Material":
+        """The same on a finer mesh, whose tetrahedra have the numbers of those that they lie in."""
+        out = copy(self)
+        out._numbers = {name: refinement.spread(number) for name, number in self._numbers.items()}
+        return out
 
     def described(self, mesh: TetrahedralMesh) -> list[Input]:
         """The inputs of a body of this material: each number (or vector) is one, or one per tetrahedron."""

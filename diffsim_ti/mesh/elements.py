@@ -1,22 +1,28 @@
 """The nodes of a mesh's elements: four, or ten with the mid-edge vertices; and the way from the ones to the others."""
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import checks
 from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes
 from diffsim_ti.mesh.reference_element import ReferenceElement, reference_element
+from diffsim_ti.mesh.refinement import Refinement, parts_of_refined
 from diffsim_ti.mesh.sets import checked_sets, frozen
 from diffsim_ti.mesh.ten_nodes import middles_in_set, middles_of, triangles_of, with_middles
 
 if TYPE_CHECKING:
+    from diffsim_ti.mesh.named_sets import SetOrIndices
     from diffsim_ti.mesh.tetrahedral_mesh import TetrahedralMesh
 
 
 class Elements:
     """A part of TetrahedralMesh: its elements of four or ten nodes."""
+
+    refinement: Refinement | None = None  # of which coarser mesh `refined` made it
 
     @property
     def elements(self) -> np.ndarray:
@@ -89,6 +95,38 @@ class Elements:
         }
         surface_sets = {name: (4 * rows[:, None] + np.arange(4)).ravel() for name, rows in self._surface_sets.items()}
         return self._with_nodes(vertices, elements, self._volumes, vertex_sets, surface_sets)
+
+    def refined(
+        self,
+        where: "SetOrIndices | None" = None,
+        edges: Literal["all", "longest"] = "all",
+        onto: Callable[[np.ndarray], ArrayLike] | None = None,
+    ) -> "TetrahedralMesh":
+        """A mesh in which edges of some tetrahedra, by default of all, are halved, and those of others so that edges fit and
+        no element becomes slender: where an edge is halved, the longest of each tetrahedron there is, too.
+
+        where: tetrahedra, as in `tetrahedron_indices`. edges: "all" six of them, which makes eight of a tetrahedron, or the
+        "longest" alone, two. Vertices keep their indices, new ones follow; sets stay on their places, and curved ten-node
+        elements keep their shape exactly.
+        onto: function of the places of new vertices [m], shape (k, 3), that returns where they are to be, such as on a round
+        surface that edges are chords of. `refinement` of the mesh says whose parts its
+        tetrahedra are, and has the matrix that carries fields: `fine.refinement.from_coarse @ displacements`.
+        Rivara 1997, New longest-edge algorithms for the refinement of unstructured meshes,
+        doi:10.1002/(SICI)1097-0207(19970930)40:18<3313::AID-NME214>3.0.CO;2-#.
+
+        >>> import diffsim_ti as ds
+        >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+        >>> fine = mesh.refined()
+        >>> mesh.num_tetrahedra, fine.num_tetrahedra, mesh.refined([0]).num_tetrahedra
+        (6, 48, 27)
+        """
+        parts, refinement, sets = parts_of_refined(self, where, edges, onto)
+        out = self._with_nodes(*parts, {})
+        tetrahedra, surfaces = sets(out)
+        out._tetrahedron_sets = checked_sets(tetrahedra, len(refinement.parents), "tetrahedron")
+        out._surface_sets = checked_sets(surfaces, len(out._surface_triangles), "surface")
+        out.refinement = refinement
+        return out
 
     def linear(self) -> "TetrahedralMesh":
         """Linear tetrahedra of the same corners; a mesh of order 1 is returned as it is.

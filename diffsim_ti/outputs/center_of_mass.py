@@ -38,6 +38,8 @@ class CenterOfMass(Output):
 
     unit = "m"
 
+    linear = True
+
     def __init__(self, of: str | ArrayLike | None = None, name: str = "center_of_mass"):
         self.of, self.name = of, name
 

@@ -42,6 +42,8 @@ class MaterialPoints(Output):
     [1.0, 0.9614]
     """
 
+    linear = True
+
     def __init__(self, points: ArrayLike, name: str = "material_points", nearest: bool = False):
         self.points, self.name, self.nearest = numbers("MaterialPoints: points", points), name, bool(nearest)
 

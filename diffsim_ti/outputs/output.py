@@ -62,6 +62,7 @@ class Output(metaclass=Public):
 
     name: str
     unit = ""  # for pictures
+    linear = False  # whether it is linear in positions and velocities
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
     reads_chamber_pressures = False  # the same of frames.chamber_pressures

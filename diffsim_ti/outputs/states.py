@@ -8,6 +8,7 @@ from diffsim_ti.outputs.output import Change, Output
 class _States(Output):
     """Vectors of all vertices in all frames."""
 
+    linear = True
     num_vertices: int
     part = "positions"  # of a Change
 

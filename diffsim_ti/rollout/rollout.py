@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
 from diffsim_ti import runtime
+from diffsim_ti.accuracy.estimate import Accuracy, accuracy
 from diffsim_ti.common.checked import as_numbers, instance, listed, shape_of, shown
 from diffsim_ti.common.copies import made_again
 from diffsim_ti.common.names import no_such
@@ -16,6 +17,7 @@ from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Strain, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
@@ -326,6 +328,39 @@ class Rollout(metaclass=Public):
         derived = self.scene.inputs.derive_jvp(values, tangents)
         moved = self.sweep.push_forward(frames.run, derived)
         return Change(*moved, tangents, **self.sweep.noted_changes)
+
+    def accuracy(
+        self,
+        output: str,
+        weights: ArrayLike | Callable | None = None,
+        finer: Callable[[TetrahedralMesh], TetrahedralMesh] | None = None,
+        **values: InputValue,
+    ) -> Accuracy:
+        """The estimated error of a number of this run: what mesh, steps, solver and rounding cost (accuracy/estimate.py).
+
+        output: name of an output. weights: products with it add up to the number, in the last frame (its shape there) or in
+            all frames; default 1 where it is one number. Or a loss: a function of its values that returns a number and its
+            derivative by them.
+        finer: function from the mesh to the one whose solution stands for the truth, `TetrahedralMesh.quadratic` of linear
+            tetrahedra, `TetrahedralMesh.refined` of ten nodes by default.
+        values: of inputs, as in `forward`.
+
+        The run's states are put on the finer mesh. Forces that are out of balance there, times the adjoint of the number,
+        are its error to first order, and say the share of each tetrahedron; where that is more than a fifth of the number,
+        or the number is not linear in places, or parts are in contact, the finer mesh is solved. Steps of half the length
+        say what steps cost.
+        Raises ValueError for explicit solvers, and for what a finer mesh cannot have.
+        Becker, Rannacher 2001, doi:10.1017/S0962492901000010.
+
+        >>> import diffsim_ti as ds
+        >>> mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (2.0, 1.0, 1.0))
+        >>> scene = ds.Scene(mesh, ds.LinearElastic(1e6, 0.0), terms=ds.Gravity((9.81, 0, 0)), fixed="xmin", precision="f64")
+        >>> end = ds.MaterialPoints([[2.0, 0.5, 0.5]], name="end")
+        >>> found = ds.Rollout(ds.StaticSolver(scene), 1, outputs=end).accuracy("end", weights=(1.0, 0.0, 0.0))
+        >>> print(f"{found.value - 2:.5f} m, off by {found.error:.5f} m")  # rho g L^2 / (2 E) = 0.01962 m
+        0.01962 m, off by 0.00000 m
+        """
+        return accuracy(self, output, weights, finer, values)
 
     # ---- under ti.ad.Tape -------------------------------------------------------------------------------------------
 

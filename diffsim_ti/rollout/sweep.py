@@ -147,13 +147,13 @@ class Sweep:
     def _derive(self, values: dict):
         return self.scene.inputs.derive(values)
 
-    def _make_workspace(self, derived):
+    def make_workspace(self, derived):
         return self.solver.workspace(derived, self._bend)
 
     def _make_guard(self):
         return Guard(self.workspace)
 
-    def _make_adjoint(self, density: bool, shape: bool):
+    def make_adjoint(self, density: bool, shape: bool):
         return self.solver.adjoint(self.workspace, density, shape)
 
     def _make_tangent(self, change):
@@ -221,7 +221,7 @@ class Sweep:
         else:
             derived, self._loaded = self._derive(values), None
             if self.workspace is None:
-                self.workspace = self._make_workspace(derived)
+                self.workspace = self.make_workspace(derived)
                 self.workspace.make_frames(self.num_frames)
                 if self.contacts:
                     self.workspace.record_contacts()
@@ -348,7 +348,7 @@ class Sweep:
         if self._adjoint is None or not self._adjoint.fits(self.workspace):
             shape = "rest_positions" in self.wanted
             density = shape or "density" in self.wanted  # the rest shape makes masses
-            self._adjoint = self._make_adjoint(density, shape)
+            self._adjoint = self.make_adjoint(density, shape)
 
     def _reverse(self, seed: Seed, careful: bool) -> tuple[float, float]:
         """The reverse sweep; the norms of its seed."""

@@ -18,7 +18,7 @@ from diffsim_ti.runtime.start import is_alive
 
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 _TASK = 6 * _WORD  # a task: its name, a string of four words, the sizes of its grid and blocks, and padding
-_MOST_TASKS = 64  # of a kernel
+_MOST_TASKS = 1024  # of a kernel: an iteration with a deep hierarchy has hundreds
 
 
 def _word(address: int) -> int:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from diffsim_ti.accuracy.finer import HELD, is_named
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.grid import PATTERNS, box
-from diffsim_ti.rollout.finer import HELD, is_named
 from diffsim_ti.scene import Scene
 
 

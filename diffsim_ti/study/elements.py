@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.accuracy.finer import on_finer, on_ten_nodes
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.rollout.finer import on_ten_nodes
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import VelocityVerletSolver
 from diffsim_ti.study.coarser import halved_grid, on_coarser
@@ -27,23 +27,6 @@ class ElementTrial:
     def __str__(self) -> str:
         error = "error not known" if np.isnan(self.error) else f"error {self.error:.2g}"
         return f"{self.element} {error} in {self.seconds:.2g} s"
-
-
-def refined(mesh: TetrahedralMesh) -> TetrahedralMesh:
-    """Each linear tetrahedron cut into eight at the middles of its edges; sets as in `quadratic()`.
-
-    Bey 1995, Tetrahedral grid refinement, doi:10.1007/BF02238487.
-    """
-    e = mesh.quadratic().elements
-    m01, m12, m20, m03, m13, m23 = range(4, 10)
-    of_corners = [[0, m01, m20, m03], [m01, 1, m12, m13], [m20, m12, 2, m23], [m03, m13, m23, 3]]
-    within = [[m01, m12, m20, m13], [m01, m20, m03, m13], [m20, m23, m03, m13], [m20, m12, m23, m13]]
-    tetrahedra = e[:, of_corners + within].reshape(-1, 4)
-    of = {k: (8 * rows[:, None] + np.arange(8)).ravel() for k, rows in mesh.tetrahedron_sets.items()}
-    nodes = mesh.quadratic()
-    surface = {name: nodes.surface_triangles[rows] for name, rows in nodes.surface_sets.items()}
-    sets = dict(vertex_sets=nodes.vertex_sets, tetrahedron_sets=of, surface_sets=surface)
-    return TetrahedralMesh(nodes.vertices, tetrahedra, **sets)
 
 
 def own_element(scene: Scene) -> str:
@@ -114,11 +97,10 @@ class ElementTrials:
     def _finest(self, seconds: float) -> tuple:
         """(motion of ten-node tetrahedra on the mesh that is refined once, whether there is one); it takes some 16 times as
         long."""
-        uniform = all(np.ndim(self.scene.inputs.values[name]) == 0 for name in (*self.scene.material.inputs, "density"))
-        if 40 * seconds > self.budget or not uniform:
+        if 40 * seconds > self.budget:
             return None, False
         try:
-            return self._motion(on_ten_nodes(self.scene, refined(self.scene.mesh)))[0], True
+            return self._motion(on_ten_nodes(on_finer(self.scene, TetrahedralMesh.refined)))[0], True
         except (ValueError, FloatingPointError):
             return None, False
 

@@ -17,7 +17,6 @@ import numpy as np
 
 import diffsim_ti as ds
 from diffsim_ti.study.charts import draw_chart
-from diffsim_ti.study.elements import refined
 from diffsim_ti.study.problem import Problem
 from diffsim_ti.study.work_precision import Chart, Point
 
@@ -61,7 +60,7 @@ def main(mesh: ds.TetrahedralMesh, share: float, name: str, chart: str | None = 
     size = 0.1 / (high - low).max()
     mesh = mesh.scaled(size).translated([0, 0.005 - size * low[1], 0])
     plain, half, scaled = moved(dropped(mesh, None)), moved(dropped(mesh, None), 2), moved(dropped(mesh, share))
-    fine = moved(dropped(refined(mesh), share))[0][:, : mesh.num_vertices]
+    fine = moved(dropped(mesh.refined(), share))[0][:, : mesh.num_vertices]
     row = dict(
         tetrahedra=mesh.num_tetrahedra,
         longer=plain[1] / scaled[1],

@@ -224,7 +224,7 @@ class ImplicitWorkspace(PrescribedInPasses):
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
         try:
-            u_star = self._solve(j, u, held, starts, problem, stage)
+            u_star = self.solve_pass(j, u, held, starts, problem, stage)
         except NotConverged as error:
             raise self.collisions.explained(error, u) from None
         self.u_star = u_star
@@ -262,7 +262,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)
         return added - float((rate * (self.mass * way)).sum())
 
-    def _solve(self, j, u, held, starts: list, problem: tuple, stage: Stage) -> np.ndarray:
+    def solve_pass(self, j, u, held, starts: list, problem: tuple, stage: Stage) -> np.ndarray:
         """The minimum of the pass that descends from `held`, where the body was, with fixed vertices where they get.
 
         starts: where inertia leads, and where velocities do; problem: mass, inertial, loads of `Newton.solve`.

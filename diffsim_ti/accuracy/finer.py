@@ -1,16 +1,19 @@
-"""The same scene, and the same rollout, of ten-node tetrahedra."""
+"""The same scene, and the same rollout, on a finer mesh of the body: of ten-node tetrahedra, or refined."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import ExternalForce, Obstacle
 from diffsim_ti.terms.pose import Pose
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout import Rollout
 
 HELD = "held, by indices"  # the set of what a scene holds so
 SHARE = 0.5  # of the stable step, so that a body may be found four times as stiff
@@ -22,42 +25,47 @@ def is_named(chosen) -> bool:
     return by_name or all(isinstance(name, str) for name in np.ravel(chosen))
 
 
-def on_ten_nodes(scene: Scene, mesh: TetrahedralMesh | None = None) -> Scene:
-    """The same scene of ten-node tetrahedra; mesh: another linear mesh than the scene's, whose first vertices are its own
-    and whose others are middles of its edges.
+def on_ten_nodes(scene: Scene) -> Scene:
+    """The same scene of ten-node tetrahedra with the same corners; see `on_finer`."""
+    return on_finer(scene, TetrahedralMesh.quadratic)
 
-    What is chosen by indices becomes a set, which its sides' mid-edge vertices join; forces on single vertices stay there.
+
+def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) -> Scene:
+    """The same scene on a finer mesh of the body, `TetrahedralMesh.quadratic` or `refined`, whose first vertices are its
+    own.
+
+    What is chosen by indices becomes a set, which new vertices on its sides join; forces on single vertices stay there.
     Raises ValueError for what cannot be carried over.
     """
-    given, base, terms = dict(scene.arguments), scene.mesh if mesh is None else mesh, []
+    given, base, terms = dict(scene.arguments), scene.mesh, []
     for k, term in enumerate(given["terms"]):
         surface, own = None if isinstance(term, Obstacle) else getattr(term, "surface", None), copy(term)
         if isinstance(term, ExternalForce):
             own.vertices, terms = term.indices(scene.mesh), [*terms, own]
             continue
-        if not is_named(surface):
-            if mesh is not None:
-                raise ValueError(
-                    f"{term!r} acts on a surface by indices, which a finer mesh does not have: name it as a set"
-                )
+        if not callable(surface) and not is_named(surface):
             own.surface = f"surface of term {k}"
             base, term = base.with_surface_set(own.surface, surface), own
         terms.append(term)
     if not is_named(given["fixed"]):
-        if mesh is not None:
-            raise ValueError(
-                "vertices that are fixed by their indices are not those of a finer mesh: name them as a set"
-            )
         base, given["fixed"] = base.with_vertex_set(HELD, given["fixed"]), HELD
-    nodes = base.quadratic()
+    mesh = finer(base)
     for name in ("initial_positions", "initial_velocities"):
         if np.ndim(given[name]) == 2:
-            x = np.asarray(given[name], np.float64)
-            x = x if mesh is None else scene.mesh.quadratic().from_corners @ x
-            given[name] = nodes.from_corners @ x
-    if mesh is None and given["motion"] is not None:
-        given["motion"] = _motion(scene, nodes, given["fixed"])
-    return Scene(**given | dict(mesh=nodes, terms=terms, volume="tetrahedra"))
+            given[name] = interpolation(mesh) @ np.asarray(given[name], np.float64)
+    if given["motion"] is not None:
+        given["motion"] = _motion(scene, mesh, given["fixed"])
+    if mesh.order > scene.mesh.order:
+        given["volume"] = "tetrahedra"
+    else:
+        given["density"] = mesh.refinement.spread(given["density"])
+        given["material"] = scene.material.spread(mesh.refinement)
+    return Scene(**given | dict(mesh=mesh, terms=terms))
+
+
+def interpolation(fine: TetrahedralMesh):
+    """The matrix from what vertices of the mesh have that a finer one was made of to what its own have."""
+    return fine.from_corners if fine.refinement is None else fine.refinement.from_coarse
 
 
 def _motion(scene: Scene, nodes: TetrahedralMesh, fixed):
@@ -70,7 +78,7 @@ def _motion(scene: Scene, nodes: TetrahedralMesh, fixed):
                 return x
             every = np.zeros((*x.shape[:-2], scene.mesh.num_vertices, 3))
             every[..., old, :] = x
-            return np.moveaxis(np.tensordot(nodes.from_corners[new].toarray(), every, (1, -2)), 0, -2)
+            return np.moveaxis(np.tensordot(interpolation(nodes)[new].toarray(), every, (1, -2)), 0, -2)
 
         if callable(motion):
             return lambda t: rows(motion(t))
@@ -85,12 +93,17 @@ def _motion(scene: Scene, nodes: TetrahedralMesh, fixed):
     return carried(motion, scene.held, np.unique(np.concatenate([nodes.vertex_indices(name) for name in names])))
 
 
-def rollout_on_ten_nodes(rollout: Rollout, values: dict) -> Rollout:
+def rollout_on_ten_nodes(rollout: "Rollout", values: dict) -> "Rollout":
     """The same rollout of ten-node tetrahedra; an explicit solver takes as many substeps more as these ask for at the values
     of inputs. Raises ValueError for what cannot be carried over."""
-    scene, outputs = rollout.scene, []
-    if scene.mesh.order == 2:
+    if rollout.scene.mesh.order == 2:
         raise ValueError("the mesh has ten-node tetrahedra already; fit the data on a mesh of smaller ones as well")
+    return rollout_on_finer(rollout, TetrahedralMesh.quadratic, values)
+
+
+def rollout_on_finer(rollout: "Rollout", finer: Callable, values: dict | None = None, **more) -> "Rollout":
+    """The same rollout on a finer mesh, as in `on_finer`, with some arguments of its solver replaced."""
+    scene, outputs = rollout.scene, []
     for k, output in enumerate(rollout.given_outputs):
         if getattr(output, "per_vertex", False):
             raise ValueError(f"{output!r} is of each vertex, and forces on those of ten-node tetrahedra are others")
@@ -102,13 +115,12 @@ def rollout_on_ten_nodes(rollout: Rollout, values: dict) -> Rollout:
             own.support = name
             scene, output = scene.replace(mesh=scene.mesh.with_vertex_set(name, output.support)), own
         outputs.append(output)
-    fine, solver = on_ten_nodes(scene), rollout.solver
-    more = {}
+    fine, solver = on_finer(scene, finer), rollout.solver
     if solver.explicit:
         if solver.unequal_steps is not None:
             raise ValueError(
                 "its steps are of unequal lengths, which explicit steps of a finer mesh would have to divide"
             )
-        stable = solver.unchecked_for(fine.with_values(values)).stable_dt(tight=True).dt
-        more = dict(check_start=False, substeps=max(solver.substeps, math.ceil(solver.dt / (SHARE * stable))))
+        stable = solver.unchecked_for(fine.with_values(values or {})).stable_dt(tight=True).dt
+        more |= dict(check_start=False, substeps=max(solver.substeps, math.ceil(solver.dt / (SHARE * stable))))
     return rollout.on(solver.for_scene(fine, **more), outputs=outputs)

@@ -1,0 +1,312 @@
+"""The error of a number of a run, by what makes it: mesh, steps, solver, rounding."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.accuracy.finer import interpolation, rollout_on_finer
+from diffsim_ti.accuracy.replay import Replay
+from diffsim_ti.common.brief import brief_fields
+from diffsim_ti.common.checked import as_numbers
+from diffsim_ti.common.names import no_such
+from diffsim_ti.common.public import Public
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.scene.locking import LOCKING_RATIO
+from diffsim_ti.state.schedule import UnequalSteps
+from diffsim_ti.terms import SelfContact
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout import Frames, Rollout
+
+LARGE = 0.2  # of the value: beyond it an estimate to first order gives way to the solution that it is about
+FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
+PER_VERTEX = (
+    "positions",
+    "velocities",
+    "displacements",
+)  # outputs that count the vertices, of which a finer mesh has more
+
+
+@dataclass(repr=False)
+class Accuracy(metaclass=Public):
+    """How accurate a number of a run is; what `Rollout.accuracy` returns. Errors are those of `value`: value less truth.
+
+    value: the number on the rollout's own mesh, in its own steps and precision; size: how much the corrected value differs
+        from that of the first frame.
+    mesh: what the mesh costs; the number of elements of ten nodes, or of halved edges, is taken for the truth.
+    step: what steps of this length cost (NaN: not known; zero of equilibria). solver: what the solver's tolerance leaves.
+    rounding: what rounding may cost: of float32 the distance from float64, of float64 a bound without sign.
+    shares: of `mesh` by tetrahedron; their sum is `mesh`. `save_picture(path, mesh, positions, accuracy.shares)` shows them.
+    by: "adjoint", to first order from residuals and adjoint on the finer mesh; "solution", of that mesh.
+    cost: seconds of the run itself and of the finer mesh; unknowns of both.
+    notes: why the estimate may be off.
+    """
+
+    output: str
+    value: float
+    size: float
+    mesh: float
+    step: float
+    solver: float
+    rounding: float
+    shares: np.ndarray = field(repr=False)
+    by: str
+    cost: dict
+    notes: tuple[str, ...] = ()
+
+    __repr__ = brief_fields
+
+    @property
+    def error(self) -> float:
+        """What has a sign of the error, added up: value less truth."""
+        return float(np.nansum([self.mesh, self.step, self.solver]))
+
+    @property
+    def bar(self) -> float:
+        """Size of the error: that of `error` and rounding."""
+        return abs(self.error) + abs(self.rounding)
+
+    @property
+    def corrected(self) -> float:
+        """The value less its estimated error."""
+        return self.value - self.error
+
+    @property
+    def relative(self) -> float:
+        """The bar over the size of the number's change."""
+        return self.bar / max(self.size, np.finfo(float).tiny)
+
+    def __str__(self) -> str:
+        cost = self.cost
+        lines = [
+            f"{self.output}: {self.value:.6g}, off by {self.error:+.2g} ({self.relative:.2g} of its change); corrected "
+            f"{self.corrected:.6g}",
+            f"  mesh {self.mesh:+.2g} by the {self.by} on {cost['finer unknowns']} unknowns in {cost['finer']:.2g} s (the "
+            f"run: {cost['unknowns']} in {cost['run']:.2g} s)",
+            f"  step {self.step:+.2g}, solver {self.solver:+.2g}, rounding {self.rounding:.2g}",
+        ]
+        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+
+
+class Number:
+    """A number J of a run: sum of weights times an output in the last frame, or in all; or a loss of it.
+
+    weights: of the output's shape in a frame (or something that stretches to it), or of all frames; or a function of the
+    output's values that returns the loss and its derivative by them.
+    """
+
+    def __init__(self, rollout: "Rollout", output: str, weights: ArrayLike | Callable | None):
+        if output not in rollout.outputs:
+            raise ValueError(no_such("output", output, rollout.outputs, "this rollout"))
+        self.output, self.loss, self.count = output, None, None
+        shape = tuple(rollout.outputs[output].shape(rollout.num_frames))
+        self.linear = rollout.outputs[output].linear and not callable(weights)
+        self.count = rollout.scene.mesh.num_vertices if output in PER_VERTEX else None
+        if callable(weights):
+            self.loss = weights
+            return
+        if weights is None and int(np.prod(shape[1:])) != 1:
+            raise ValueError(
+                f"accuracy is of one number, and {output} has shape {shape[1:]} in a frame: pass weights of this shape, "
+                "whose products with it add up to the number"
+            )
+        w = np.ones(()) if weights is None else as_numbers("weights", weights)
+        try:
+            if w.shape == shape:
+                self.weights = w
+            else:
+                self.weights = np.zeros(shape)
+                self.weights[-1] = np.broadcast_to(w, shape[1:])
+        except ValueError:
+            raise ValueError(f"weights: expected shape {shape[1:]} or {shape}, got {w.shape}") from None
+
+    def _own(self, y: np.ndarray) -> np.ndarray:
+        """Of values on whatever mesh those that this mesh's have."""
+        return y if self.count is None else y[:, : self.count]
+
+    def start(self, frames: "Frames") -> float:
+        """J if all frames were the first."""
+        own = self._own(np.asarray(frames[self.output], np.float64))
+        own = np.broadcast_to(own[:1], own.shape)
+        return float(self.loss(own)[0] if self.loss else (self.weights * own).sum())
+
+    def of(self, frames: "Frames") -> tuple[float, np.ndarray]:
+        """(J, its derivative by the output) of frames on this mesh or a finer one, whose first vertices are its own."""
+        y = np.asarray(frames[self.output], np.float64)
+        seed = np.zeros_like(y)
+        own = self._own(y)
+        if self.loss is not None:
+            value, slope = self.loss(own)
+        else:
+            if own.shape != self.weights.shape:
+                raise ValueError(
+                    f"{self.output} has shape {own.shape} on a finer mesh: take an output of places or sets, such as "
+                    "MaterialPoints, or Stress at points"
+                )
+            value, slope = (self.weights * own).sum(), self.weights
+        self._own(seed)[...] = slope
+        return float(value), seed
+
+
+def accuracy(
+    rollout: "Rollout",
+    output: str,
+    weights: ArrayLike | Callable | None = None,
+    finer: Callable[[TetrahedralMesh], TetrahedralMesh] | None = None,
+    values: dict | None = None,
+) -> Accuracy:
+    """See Rollout.accuracy."""
+    return estimated(rollout, Number(rollout, output, weights), finer, dict(values or {}))[0]
+
+
+def estimated(
+    rollout: "Rollout", number: Number, finer: Callable | None, values: dict, given: list | None = None
+) -> tuple[Accuracy, Replay]:
+    """(the accuracy of a number, the run that it is of, in float64); given: displacements of each pass to begin with."""
+    if rollout.solver.explicit:
+        raise ValueError(
+            f"accuracy is of equilibria and implicit steps, not of {rollout.solver!r}: take StaticSolver or BDF2Solver"
+        )
+    if rollout.scene.holds_volumes or rollout.scene.reduced:
+        raise ValueError(
+            "accuracy does not support chambers that hold volumes, and vertices that move by few numbers or are tied: "
+            "compare runs on two meshes instead"
+        )
+    begin = time.perf_counter()
+    value, own, frames = _run(rollout, number, values, given)
+    seconds, begin = time.perf_counter() - begin, time.perf_counter()
+    finer = finer or (TetrahedralMesh.quadratic if rollout.scene.mesh.order == 1 else TetrahedralMesh.refined)
+    mesh, solver, shares, by, exact = _of_mesh(own, frames, number, values, finer)
+    cost = dict(run=seconds, finer=time.perf_counter() - begin, unknowns=3 * rollout.scene.mesh.num_vertices)
+    cost["finer unknowns"] = 3 * exact["vertices"]
+    if rollout.scene.precision == "f32":
+        rounding = value - number.of(frames)[0]
+    else:
+        rounding = exact["rounding"]
+    step = _of_steps(own, frames, number, values)
+    size = abs(value - np.nansum([mesh, step, solver]) - number.start(frames))
+    errors = dict(mesh=mesh, step=step, solver=solver, rounding=rounding)
+    found = Accuracy(number.output, value, size or abs(value), **errors, shares=shares, by=by, cost=cost)
+    found.notes = tuple(_doubts(rollout.scene, found, exact))
+    return found, own
+
+
+def _run(rollout: "Rollout", number: Number, values: dict, given: list | None) -> tuple:
+    """(J of the rollout, Replay of it in float64, its frames)"""
+    own, value = rollout.on(rollout.solver, gradients="initial_positions", runs=None), None
+    if rollout.scene.precision == "f32":
+        value = number.of(own.forward(**values))[0]
+        own = own.with_scene(precision="f64")
+    replay = Replay(own, given, solves=True)
+    frames = own.forward(**values)
+    return number.of(frames)[0] if value is None else value, replay, frames
+
+
+def on_finer_mesh(rollout: "Rollout", finer: Callable, values: dict, **solver) -> tuple:
+    """(the rollout on the finer mesh, values of inputs there, the matrix P that carries fields, parents of tetrahedra);
+    solver: arguments of the solver that are others there."""
+    fine = rollout_on_finer(rollout, finer, values, **solver)
+    mesh, coarse = fine.scene.mesh, rollout.scene.mesh
+    P, parents = interpolation(mesh), np.arange(coarse.num_tetrahedra)
+    if mesh.refinement is not None:
+        parents = mesh.refinement.parents
+    there = {}
+    for name, x in values.items():
+        if name in ("initial_positions", "initial_velocities", "rest_positions", "shape") and np.ndim(x) == 2:
+            x = P @ np.asarray(x)
+        elif mesh.refinement is not None and name in (*rollout.scene.material.inputs, "density"):
+            x = mesh.refinement.spread(x)
+        there[name] = x
+    return fine, there, P, parents
+
+
+def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer: Callable) -> tuple:
+    """(error of the mesh, of the solver's tolerance, shares of the first by tetrahedron, how it was found, other numbers)"""
+    tolerance = max(0.01 * own.rollout.solver.tolerance, 1e-12)  # so that its own is not felt
+    fine, there, P, parents = on_finer_mesh(own.rollout, finer, values, tolerance=tolerance)
+    value, seed = number.of(frames)
+    own.rollout.vjp(frames, **{number.output: seed})
+    replay = Replay(fine, [P @ u for u in own.each("places")])
+    carried_value, linear = value, number.linear
+    try:
+        at = fine.forward(**there)
+        carried_value, seed = number.of(at)
+        fine.vjp(at, **{number.output: seed})
+    except FloatingPointError:  # no state of the finer mesh, such as one in an obstacle, or beyond a limit point
+        replay.residuals, linear = {}, False
+    placed = bool(replay.residuals)
+    n, mesh, eps = own.rollout.scene.mesh.num_vertices, fine.scene.mesh, np.finfo(float).eps
+    nodal, of_solver, rounding = np.zeros(mesh.num_vertices), own.estimate(), eps * abs(value)
+    of_own = (own.each(kind) for kind in ("residuals", "weights", "sizes"))
+    for R, z, R_own, z_own, sizes in zip(replay.each("residuals"), replay.each("weights"), *of_own):
+        nodal += (R * (z - P @ z_own)).sum(1)
+        nodal[:n] += ((P.T @ R - R_own) * z_own).sum(1)
+        rounding += eps * float((np.reshape(sizes, (n, -1)) * np.abs(z_own)).sum())
+    total = value - carried_value - nodal.sum() - of_solver
+    by, exact = "adjoint", value - total
+    contact = bool(own.rollout.scene.obstacles or own.rollout.scene.term(SelfContact))
+    size = abs(exact - number.start(frames)) or abs(exact)
+    if contact or not linear or not abs(total) <= LARGE * size:
+        by = "solution"
+        replay.solves = True
+        exact = number.of(fine.forward(**there))[0]
+        total = value - exact
+    error = total + of_solver
+    shares = _by_element(mesh, -nodal, parents, own.rollout.scene.mesh.num_tetrahedra)
+    sizes = np.abs(shares) if shares.any() else own.rollout.scene.mesh.volumes
+    shares = shares + (error - shares.sum()) * sizes / sizes.sum()  # what is of no place, and not of first order
+    known = dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact, placed=placed)
+    return error, -of_solver, shares, by, known
+
+
+def _by_element(mesh: TetrahedralMesh, nodal: np.ndarray, parents: np.ndarray, count: int) -> np.ndarray:
+    """What vertices of the finer mesh have, in equal parts to the elements around, added up in coarse tetrahedra.
+
+    Richter, Wick 2015, Variational localizations of the dual weighted residual estimator, doi:10.1016/j.cam.2014.11.008.
+    """
+    around = np.bincount(mesh.elements.ravel(), minlength=mesh.num_vertices)
+    each = (nodal / np.maximum(around, 1))[mesh.elements].sum(1)
+    return np.bincount(parents, each, count)
+
+
+def _of_steps(own: Replay, frames: "Frames", number: Number, values: dict) -> float:
+    """Error of the steps: by as many steps of half the length, and the order of the solver."""
+    rollout, solver = own.rollout, own.rollout.solver
+    if not solver.order:
+        return 0.0
+    if rollout.schedule is not None:
+        finer = solver.on(UnequalSteps(rollout.schedule.lengths, 2 * np.asarray(rollout.schedule.substeps)))
+    else:
+        finer = solver.for_scene(rollout.scene, substeps=2 * solver.substeps)
+    return (number.of(frames)[0] - number.of(rollout.on(finer).forward(**values))[0]) / (1 - 0.5**solver.order)
+
+
+def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
+    """What may make an estimate of the mesh's error wrong, in words."""
+    notes, sizes = [], np.sort(np.abs(found.shares))[::-1]
+    few = max(1, int(FEW * len(sizes)))
+    matters = abs(found.mesh) > 1e-6 * found.size
+    if matters and len(sizes) >= 1 / FEW and sizes[:few].sum() > MOST * sizes.sum():
+        notes.append(
+            f"{few} of {len(sizes)} tetrahedra have more than half of the error: near what is singular, such as corners "
+            "that point inwards and ends of supports, errors fall slowly, and this one may be larger than estimated: refine "
+            "there, as ds.refine does"
+        )
+    if not exact["placed"]:
+        notes.append(
+            "states of the run are none of the finer mesh, or have no adjoint there: shares are by volume alone"
+        )
+    if exact["contact"]:
+        notes.append("parts in contact: the estimate is of the finer mesh's own contacts, and jumps where these change")
+    locks = scene.mesh.order == 1 and scene.volume == "tetrahedra"
+    if matters and locks and scene.largest_poissons_ratio() > LOCKING_RATIO + 1e-12:
+        notes.append(
+            "the mesh locks (Poisson's ratio above 0.45), and ten nodes do so a little: the error may be larger"
+        )
+    if abs(found.mesh) > 0.5 * found.size:
+        notes.append("the mesh is too coarse for this number: its error is more than half of it")
+    return notes

@@ -1,0 +1,194 @@
+"""Estimated errors against true ones, meshes that are refined, and the loop of both."""
+
+import numpy as np
+import pytest
+from example_files import example
+
+import diffsim_ti as ds
+from diffsim_ti.accuracy import estimate
+from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
+from diffsim_ti.mesh.reference_element import quadrature
+
+BARS = example("benchmarks/error_bars")
+
+
+# ---- refined meshes -----------------------------------------------------------------------------------------------------
+
+
+def curved_volume(mesh: ds.TetrahedralMesh) -> float:
+    xi, weights = quadrature(6)
+    D = np.einsum("eai,qaj->eqij", mesh.vertices[mesh.elements], mesh.reference.derivatives(xi))
+    return (np.linalg.det(D) * weights).sum() / 6
+
+
+def body(order: int) -> ds.TetrahedralMesh:
+    """A box, of ten nodes a bent one."""
+    mesh = ds.TetrahedralMesh.create_box((4, 3, 3), (3.0, 2.0, 2.0), "five").with_tetrahedron_set("left", [0, 1, 2, 7])
+    if order == 1:
+        return mesh
+    nodes = mesh.quadratic()
+    bent = nodes.vertices + 0.04 * np.sin(2 * nodes.vertices[:, [1, 2, 0]])
+    surfaces = {name: nodes.surface_triangles[rows] for name, rows in nodes.surface_sets.items()}
+    sets = dict(vertex_sets=dict(nodes.vertex_sets), tetrahedron_sets=dict(nodes.tetrahedron_sets))
+    return ds.TetrahedralMesh(bent, nodes.elements, surface_sets=surfaces, **sets)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("edges", ["all", "longest"])
+def test_refined_meshes_are_conforming_and_keep_the_body(order, edges):
+    mesh = body(order)
+    for where in (None, "left", np.random.default_rng(order).choice(mesh.num_tetrahedra, 9, replace=False)):
+        fine = mesh.refined(where, edges)
+        ds.TetrahedralMesh(fine.vertices, fine.elements)  # every check there is, of faces that do not fit, too
+        assert fine.num_tetrahedra == 8 * mesh.num_tetrahedra or where is not None or edges == "longest"
+        assert curved_volume(fine) == pytest.approx(curved_volume(mesh), rel=1e-13)
+        for name, rows in fine.surface_sets.items():
+            assert set(fine.vertex_sets[name]) == set(fine.surface_triangles[rows].ravel())
+        of_left = np.isin(fine.refinement.parents, mesh.tetrahedron_sets["left"])
+        np.testing.assert_array_equal(np.flatnonzero(of_left), fine.tetrahedron_sets["left"])
+        P, n = fine.refinement.from_coarse, mesh.num_vertices
+        np.testing.assert_array_equal(fine.vertices[:n], mesh.vertices)
+        np.testing.assert_allclose(P @ mesh.vertices, fine.vertices, atol=1e-14)
+        points = fine.vertices[n::7]
+        np.testing.assert_allclose(  # as the coarse elements interpolate
+            P[n::7] @ np.cos(mesh.vertices), mesh.locate(points, nearest=True).matrix @ np.cos(mesh.vertices), atol=1e-9
+        )
+
+
+def test_quality_is_bounded_where_a_mesh_is_refined_again_and_again():
+    mesh = ds.TetrahedralMesh.create_cube(3, pattern="five")
+    least = []
+    for _ in range(15):
+        near = np.argsort(np.linalg.norm(mesh.centroids - 0.5, axis=1))[:3]
+        mesh = mesh.refined(near, "longest")
+        least.append(mesh.quality.min())
+    assert mesh.volumes.min() < 1e-3 * mesh.volumes.max() and min(least) > 0.25 and least[-1] == pytest.approx(least[7])
+
+
+def test_new_vertices_go_onto_a_round_surface():
+    octahedron = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
+    faces = [[6, i, 1 + j, 2 + k] for i in (0, 3) for j in (0, 3) for k in (0, 3)]
+    mesh = ds.TetrahedralMesh(octahedron, faces, fix_orientation=True)
+    onto = lambda x: x * np.abs(x).sum(1, keepdims=True) / np.linalg.norm(x, axis=1, keepdims=True)  # noqa: E731
+    ball = mesh.refined(onto=onto)
+    assert np.linalg.norm(ball.vertices[ball.surface_vertices], axis=1) == pytest.approx(1, rel=1e-12)
+    assert mesh.volume == pytest.approx(4 / 3) and ball.volume > 2
+    with pytest.raises(ValueError, match="onto: expected places"):
+        mesh.refined(onto=lambda x: x[:2])
+    with pytest.raises(ValueError, match='"longest"'):
+        mesh.refined([0], edges="shortest")
+
+
+# ---- error bars ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name, order, size", [("cook", 1, 2), ("cook", 2, 2), ("lame", 1, 3)])
+def test_the_estimate_is_the_true_error(name, order, size):
+    """Effectivity 0.7 to 1.4, where the mesh is solved and by the adjoint, of equilibria and of implicit steps."""
+    found, true = BARS.measured(name, order, size)
+    assert 0.7 < found.error / true < 1.4
+    assert found.shares.sum() == pytest.approx(found.mesh, rel=1e-6)
+    assert abs(found.corrected - (found.value - true)) < 0.5 * abs(true)
+
+
+def block(order: int = 1, precision: str = "f64", tolerance: float = 1e-8) -> ds.Rollout:
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (2.0, 1.0, 1.0))
+    mesh = mesh.quadratic() if order == 2 else mesh
+    terms = ds.Traction((0, 0, -2e3), "xmax")
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), terms=terms, fixed="xmin", precision=precision)
+    return ds.Rollout(ds.StaticSolver(scene, tolerance=tolerance), 1, outputs=ds.MaterialPoints([[2, 0.5, 0.5]], "end"))
+
+
+def test_a_mesh_without_an_error_has_a_bar_as_small_as_the_tolerance():
+    found, true = BARS.measured("uniaxial", 1, 2)
+    assert found.relative < 1e-8 and abs(found.error - true) < 1e-12 and not found.notes
+
+
+UNEQUAL = ds.UnequalSteps([0.01, 0.02, 0.01], 2)
+RUNS = [(ds.StaticSolver, 1), (ds.ImplicitEulerSolver, UNEQUAL), (ds.ImplicitMidpointSolver, UNEQUAL)]
+RUNS += [(kind, 5) for kind in (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)]
+
+
+@pytest.mark.parametrize("kind, steps", RUNS)
+def test_small_motions_have_the_exact_difference_of_two_meshes(kind, steps, monkeypatch):
+    """Where all is linear the first order is all there is, of every solver, whatever acts."""
+    monkeypatch.setattr(estimate, "LARGE", np.inf)
+    mesh = block().scene.mesh
+    terms = [ds.Traction((0, 0.1, -0.2), "xmax"), ds.Gravity((0, 1e-4, 2e-4))]
+    terms += [] if kind is ds.StaticSolver else [ds.Drag(3.0)]
+    start = dict(initial_velocities=1e-6 * np.sin(mesh.vertices * [1, 2, 3]))
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 900.0, terms, "xmin", precision="f64", **start)
+    outputs = ds.MaterialPoints([[2, 0.5, 0.5], [1.2, 0.3, 0.7]], "places")
+    rollout = ds.Rollout(kind(scene, dt=0.02, tolerance=1e-9), steps, outputs=outputs)
+    weights = np.array([[1.0, -2.0, 3.0], [0.5, 1.0, -1.0]])
+    found = rollout.accuracy("places", weights)
+    other = rollout_on_ten_nodes(rollout, {}).forward()["places"][-1]
+    difference = (weights * (rollout.forward()["places"][-1] - other)).sum()
+    assert found.by == "adjoint" and found.mesh + found.solver == pytest.approx(difference, rel=2e-3, abs=1e-14)
+    if steps == 5:
+        finer = rollout.on(rollout.solver.for_scene(scene, substeps=8)).forward()["places"][-1]
+        assert found.step == pytest.approx((weights * (rollout.forward()["places"][-1] - finer)).sum(), rel=0.4)
+
+
+def test_what_the_solver_and_rounding_leave():
+    down = (0.0, 0.0, 1.0)
+    exact, loose, rough = block(), block(tolerance=0.5), block(precision="f32")
+    value = exact.forward()["end"][-1, 0, 2]
+    found = loose.accuracy("end", down)
+    assert abs(found.solver) > 1e-6 * found.size and found.solver == pytest.approx(found.value - value, rel=0.3)
+    assert abs(exact.accuracy("end", down).solver) < 1e-3 * abs(found.solver)
+    found = rough.accuracy("end", down)
+    assert found.rounding == pytest.approx(rough.forward()["end"][-1, 0, 2] - value, rel=0.2)
+    assert 0 < abs(found.rounding) < 1e-4 * found.size
+    assert exact.accuracy("end", down).rounding < 1e-12
+
+
+def test_a_loss_and_a_place_by_the_vertices_are_numbers_too():
+    rollout, n = block(), block().scene.mesh.num_vertices
+    end = rollout.scene.mesh.vertices == (2.0, 1.0, 1.0)
+    weights = end.all(1)[:, None] * [[0.0, 0.0, 1.0]]
+    by_vertices = rollout.accuracy("displacements", weights)
+    assert by_vertices.value == pytest.approx(rollout.forward().displacements[-1, end.all(1), 2].item())
+    target = 0.01
+    found = rollout.accuracy("end", lambda y: (0.5 * (y[-1, 0, 2] - target) ** 2, (y - target) * (y == y[-1, 0, 2])))
+    place = rollout.accuracy("end", (0.0, 0.0, 1.0))
+    assert found.by == "solution" and weights.shape == (n, 3)
+    assert found.corrected == pytest.approx(0.5 * (place.corrected - target) ** 2, rel=0.05)
+    said = str(place)
+    assert "end: " in said and "mesh +" in said and f"corrected {place.corrected:.6g}" in said
+
+
+def test_what_cannot_be_estimated_is_refused():
+    rollout = block()
+    with pytest.raises(ValueError, match="did you mean 'end'"):
+        rollout.accuracy("ende")
+    with pytest.raises(ValueError, match="pass weights of this shape"):
+        rollout.accuracy("end")
+    with pytest.raises(ValueError, match=r"weights: expected shape \(1, 3\)"):
+        rollout.accuracy("end", np.ones(4))
+    explicit = ds.Rollout(ds.SemiImplicitSolver(rollout.scene, dt=1e-3), 1, outputs=ds.CenterOfMass())
+    with pytest.raises(ValueError, match="take StaticSolver or BDF2Solver"):
+        explicit.accuracy("center_of_mass", (1, 0, 0))
+    stress = rollout.on(rollout.solver, outputs=ds.Stress(at="vertices"))
+    with pytest.raises(ValueError, match="Stress at points"):
+        stress.accuracy("stress", np.ones(stress.outputs["stress"].shape(2)[1:]))
+
+
+# ---- refinement by it ---------------------------------------------------------------------------------------------------
+
+
+def test_refinement_ends_below_the_tolerance_with_gradients_there():
+    start = block()
+    found = ds.refine(start, "end", 0.4, (0.0, 0.0, 1.0))
+    unknowns = [n for n, _ in found.history]
+    assert found.reached and found.accuracy.relative <= 0.4 < found.history[0][1].relative
+    assert unknowns == sorted(unknowns) and 3 * found.mesh.num_vertices == unknowns[-1]
+    frames = found.rollout.forward()
+    assert found.rollout.solver.tolerance == start.solver.tolerance
+    assert frames["end"][-1, 0, 2] == pytest.approx(found.accuracy.value)
+    seed = np.zeros((2, 1, 3))
+    seed[-1, 0, 2] = 1.0
+    gradients = found.rollout.vjp(frames, end=seed)  # twice as stiff under twice the load is as before
+    by_load = (gradients["traction"] * [0, 0, -2e3]).sum()
+    assert gradients["youngs_modulus"] * 1e6 == pytest.approx(-by_load, rel=1e-6)
+    assert not ds.refine(start, "end", 1e-9, (0.0, 0.0, 1.0), rounds=0).reached
