@@ -69,6 +69,7 @@ from diffsim_ti.outputs import (
     Tension,
     WorkOfLoads,
 )
+from diffsim_ti.outputs.load_path import CriticalPoint, LoadPath, load_path
 from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.rollout.adaptive_steps import adaptive_steps
@@ -133,6 +134,7 @@ __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPo
 __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
+__all__ += ["load_path", "LoadPath", "CriticalPoint"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
 __all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]
 

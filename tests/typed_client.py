@@ -37,11 +37,14 @@ def fall() -> float:
     passed: bool = report.passed
     found = ds.modes(scene, 3)
     assert_type(found, ds.Modes)
+    path = ds.load_path(scene, "gravity", steps=1)
+    assert_type(path, ds.LoadPath)
+    limits: list[ds.CriticalPoint] = path.critical
     try:
         ds.Rollout(ds.BDF2Solver(scene, dt=0.01, tolerance=1e-6), 2).forward()
     except (ds.Divergence, ds.NotConverged) as error:
         print(str(error))
-    return float(simulator.positions[:, 1].mean()) + sum(parts.values()) + float(number.sum()) + passed
+    return float(simulator.positions[:, 1].mean()) + sum(parts.values()) + float(number.sum()) + passed + len(limits)
 
 
 def parts() -> int:

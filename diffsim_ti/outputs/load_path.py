@@ -1,7 +1,7 @@
 """Equilibria beyond what a load can reach by growing: paths through limit points, and where they buckle, with gradients."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import brentq
@@ -10,6 +10,7 @@ from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.checked import number, shown
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.common.public import Public, public
+from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.outputs.applied_loads import AppliedLoads, at_end
@@ -190,7 +191,9 @@ class CriticalPoint(metaclass=Public):
     def _of_branch(self, e: Equilibria, w: np.ndarray) -> dict[str, np.ndarray]:
         """dg/dtheta, but for a factor: of w . df/du mode as it stands, and by the path's u."""
         step, found, by_u = 2e-3 * float(np.ptp(e.derived.rest)) / np.abs(self.mode).max(), {}, 0.0
-        step = min(step, 2e-3 / max(np.abs(e.scene.inputs.stress_points.displacement_gradients(self.mode)).max(), 1e-300))
+        step = min(
+            step, 2e-3 / max(np.abs(e.scene.inputs.stress_points.displacement_gradients(self.mode)).max(), 1e-300)
+        )
         for shift, weight in FOURTH_ORDER:
             e.place(self.displacements + shift * step * self.mode, self.factor)
             own, by = e.vjp(w)
@@ -227,6 +230,7 @@ def load_path(
     until: Callable[[float, np.ndarray], bool] | None = None,
     start: CriticalPoint | None = None,
     tolerance: float = 1e-9,
+    **values: InputValue,
 ) -> LoadPath:
     """Follow static equilibria while a load grows and, beyond limit points, falls again: through snap-through, and the
     greatest pressure of a balloon. Pseudo-arc-length continuation: each point is the solution of
@@ -242,13 +246,14 @@ def load_path(
     steps: points that follow the first; step: the first change of the factor; until: a function of (factor,
         displacements) that says True where the path ends sooner.
     start: a branch point, from which the path that crosses there is followed in the direction of its mode (a column beyond
-        its buckling load); else s = 0.
+        its buckling load); else s = 0. tolerance: of |R| over the size of the forces that meet at the vertices.
+    values: of the scene's inputs, instead of its own, such as youngs_modulus=2e5 or rest_positions=X.
 
     Raises ValueError for obstacles, self-contact, chambers, reduced sets, laws with a state or rates, and names that are
     no input; NotConverged where no step of the path, however short, converges.
     Riks 1979, doi:10.1016/0020-7683(79)90081-7; Crisfield 1981, doi:10.1016/0045-7949(81)90108-5.
     """
-    scene = _checked(scene)
+    scene = _checked(scene).with_values(values)
     load = [load] if isinstance(load, str) else list(load)
     known = scene.inputs.at_times([0.0, 1.0])
     for name in load:
@@ -274,8 +279,8 @@ def _checked(scene: Scene) -> Scene:
     others = [t for t in (*scene.obstacles, *scene.terms_of(SelfContact, Chamber))]
     if others:
         raise ValueError(
-            f"load_path does not support {type(others[0]).__name__}: leave it out, press by Pressure instead of a chamber, or "
-            "follow the motion by ImplicitEulerSolver with Drag"
+            f"load_path does not support {type(others[0]).__name__}: leave it out, press by Pressure instead of a "
+            "chamber, or follow the motion by ImplicitEulerSolver with Drag"
         )
     if any(body.kind != "tie" for body in scene.reduced.bodies):
         raise ValueError("load_path does not support sets that are reduced=; leave it out")
@@ -338,18 +343,19 @@ class _Follower:
             try:
                 there = self._at(here, t, rate, length)
                 onwards = self._tangent(there, t)
+                changed = there.A.negative != here.A.negative and not (start and len(points) == 1)
+                met = self._critical(here, t, rate, length, there) if changed else []
             except NotConverged as error:
                 length *= 0.5
                 if length < least:
-                    reached = f"load_path: the path ends at a factor of {here.s:.6g}: no step from there, however short, converges"
-                    raise NotConverged(reached, error.residuals) from None
+                    said = f"load_path: the path ends at a factor of {here.s:.6g}: no step from there converges"
+                    raise NotConverged(f"{said}, however short", error.residuals) from None
                 continue
             along = float((onwards[0] * t).sum())
             if along < 0.5 and length > least and start is None:  # too far round a bend
                 length *= 0.5
                 continue
-            if there.A.negative != here.A.negative and not (start and len(points) == 1):
-                critical += self._critical(here, t, rate, length, there)
+            critical += met
             points.append(there)
             here, (t, rate), start = there, onwards, None
             length *= np.clip(np.sqrt(self.usual_rounds / max(there.rounds, 1)), 0.5, 1.0 if along < 0.9 else 2.0)
@@ -382,7 +388,5 @@ class _Follower:
             f, _ = self.e.by_factor()
             kind = "limit" if abs(w @ f) > 1e-5 * np.linalg.norm(f) else "branch"
             v, w = v * np.sign(v @ (self.e.T.T @ t.ravel()) or 1.0), w * np.sign(w @ v)
-            found.append(
-                CriticalPoint(kind, point.s, point.u, self.e.field(v), count, self.e.field(w), self.e)
-            )
+            found.append(CriticalPoint(kind, point.s, point.u, self.e.field(v), count, self.e.field(w), self.e))
         return found
