@@ -63,7 +63,9 @@ from diffsim_ti.outputs import (
     MaterialPoints,
     PlasticStrain,
     Reaction,
+    SectionForce,
     SelfContactForce,
+    SmoothMaximum,
     Strain,
     Stress,
     Tension,
@@ -134,7 +136,7 @@ __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPo
 __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
-__all__ += ["load_path", "LoadPath", "CriticalPoint"]
+__all__ += ["load_path", "LoadPath", "CriticalPoint", "SectionForce", "SmoothMaximum"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
 __all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]
 

@@ -11,13 +11,15 @@ from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.plastic_strain import PlasticStrain
 from diffsim_ti.outputs.reaction import Reaction
+from diffsim_ti.outputs.section_force import SectionForce
 from diffsim_ti.outputs.self_contact_force import SelfContactForce
+from diffsim_ti.outputs.smooth_maximum import SmoothMaximum
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
 from diffsim_ti.outputs.work import WorkOfLoads
 
 __all__ = ["CenterOfMass", "ChamberPressure", "Change", "ContactForce", "ContactTraction", "Displacements"]
-__all__ += ["Dissipation", "PlasticStrain"]
+__all__ += ["Dissipation", "PlasticStrain", "SectionForce", "SmoothMaximum"]
 __all__ += [
     "ElasticEnergy",
     "EnclosedVolume",
