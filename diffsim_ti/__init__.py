@@ -107,9 +107,11 @@ from diffsim_ti.terms import (
     Growth,
     HalfSpace,
     MeshObstacle,
+    MultiPointConstraint,
     Muscle,
     Pose,
     Pressure,
+    RemoteLoad,
     RotatingFrame,
     SelfContact,
     Sphere,
@@ -137,6 +139,7 @@ __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["load_path", "LoadPath", "CriticalPoint", "SectionForce", "SmoothMaximum"]
+__all__ += ["RemoteLoad", "MultiPointConstraint"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
 __all__ += ["compare", "identifiability", "taylor_test", "dot_product_test", "check_gradients"]
 
