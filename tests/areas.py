@@ -17,7 +17,7 @@ AREAS = {
     "gradients": "gradients batch batch_tape gradient_clip gradient_faults checkpoints tape outputs "
     "contact_force reaction tensor_outputs work modes identification identify identify_experiments",
     "implicit steps and equilibria": "implicit implicit_cycle linear_solves implicit_gradients implicit_contact "
-    "swept solve_report load_path reduced reduced_explicit reduced_rigid tie",
+    "swept solve_report load_path couplings reduced reduced_explicit reduced_rigid tie",
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
     "quadratic_answers nafems curved_contact",
