@@ -37,7 +37,7 @@ def fall() -> float:
     passed: bool = report.passed
     found = ds.modes(scene, 3)
     assert_type(found, ds.Modes)
-    path = ds.load_path(scene, "gravity", steps=1)
+    path = ds.load_path(scene.replace(terms=ds.Gravity()), "gravity", steps=1)
     assert_type(path, ds.LoadPath)
     limits: list[ds.CriticalPoint] = path.critical
     try:

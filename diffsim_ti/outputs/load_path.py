@@ -161,8 +161,8 @@ class CriticalPoint(metaclass=Public):
     displacements: np.ndarray
     mode: np.ndarray
     negative: int
-    _left: np.ndarray = field(repr=False)
-    _equilibria: Equilibria = field(repr=False)
+    _left: np.ndarray = field(init=False, repr=False)
+    _equilibria: Equilibria = field(init=False, repr=False)
 
     __repr__ = brief_fields
 
@@ -228,7 +228,7 @@ def load_path(
     steps: int = 40,
     step: float = 0.1,
     until: Callable[[float, np.ndarray], bool] | None = None,
-    start: CriticalPoint | None = None,
+    branch: CriticalPoint | None = None,
     tolerance: float = 1e-9,
     **values: InputValue,
 ) -> LoadPath:
@@ -245,7 +245,7 @@ def load_path(
         at 1 s.
     steps: points that follow the first; step: the first change of the factor; until: a function of (factor,
         displacements) that says True where the path ends sooner.
-    start: a branch point, from which the path that crosses there is followed in the direction of its mode (a column beyond
+    branch: a branch point, from which the path that crosses there is followed in the direction of its mode (a column beyond
         its buckling load); else s = 0. tolerance: of |R| over the size of the forces that meet at the vertices.
     values: of the scene's inputs, instead of its own, such as youngs_modulus=2e5 or rest_positions=X.
 
@@ -266,8 +266,8 @@ def load_path(
     for name, value in (("step", step), ("tolerance", tolerance)):
         if not number(name, value) > 0:
             raise ValueError(f"load_path: {name} must be above zero, got {shown(value)}")
-    follower = _Follower(start._equilibria if start else Equilibria(scene, load), tolerance)
-    return follower.path(steps, step, until, start)
+    follower = _Follower(branch._equilibria if branch else Equilibria(scene, load), tolerance)
+    return follower.path(steps, step, until, branch)
 
 
 def _checked(scene: Scene) -> Scene:
@@ -388,5 +388,6 @@ class _Follower:
             f, _ = self.e.by_factor()
             kind = "limit" if abs(w @ f) > 1e-5 * np.linalg.norm(f) else "branch"
             v, w = v * np.sign(v @ (self.e.T.T @ t.ravel()) or 1.0), w * np.sign(w @ v)
-            found.append(CriticalPoint(kind, point.s, point.u, self.e.field(v), count, self.e.field(w), self.e))
+            found.append(CriticalPoint(kind, point.s, point.u, self.e.field(v), count))
+            found[-1]._left, found[-1]._equilibria = self.e.field(w), self.e
         return found

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.tensors import Stress
@@ -65,6 +66,7 @@ class SectionForce(Output):
             )
         on_cut = np.isin(mesh.elements, out.vertices)
         out.stress = Stress(kind="first_piola", of=np.flatnonzero(behind & on_cut.any(1))).settled(scene)
+        out.law, out.scene = out.stress.stresses, scene
         out.elements, out.num_vertices = mesh.elements[out.stress.chosen], mesh.num_vertices
         out.mask = on_cut[out.stress.chosen].astype(float)
         points = mesh.reference.points
@@ -86,7 +88,10 @@ class SectionForce(Output):
         return out[:, self.vertices]
 
     def _start(self, frames):
-        derived, deformation, z, P, _ = self.stress._start(frames)
+        derived = self.scene.inputs.derive(frames.inputs)
+        deformation = Deformation.of(frames, derived, self.scene.mesh, self.stress.read)
+        z = self.stress.remembered(frames, self.scene)
+        P = self.law.value(deformation.H, z, derived)
         V, B = self._by_points(derived.volumes, 0), self._by_points(derived.gradients, 2)
         P = P.reshape(len(P), *V.shape, 3, 3)
         G = np.einsum("qak,eqkj->eqaj", self.by_xi, B)
@@ -101,11 +106,11 @@ class SectionForce(Output):
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         derived, deformation, z, P, V, G, f = self._start(frames)
-        moved = self.stress.scene.inputs.derive_jvp(frames.inputs, change.inputs)
+        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dx = np.zeros(frames.positions.shape) if change.positions is None else change.positions
         dH = deformation.jvp(dx - moved.rest, moved.gradients[self.stress.read])
         dz = self.stress.remembered_jvp(change, z)
-        dP = self.stress._tensors_jvp(deformation, dH, z, dz, derived, moved).reshape(P.shape)
+        dP = self.law.jvp(deformation.H, dH, z, dz, derived, moved).reshape(P.shape)
         dV = self._by_points(moved.volumes, 0)
         dG = np.einsum("qak,eqkj->eqaj", self.by_xi, self._by_points(moved.gradients, 2))
         df = -np.einsum("eq,feqij,eqaj->feai", dV, P, G, optimize=True)
@@ -134,10 +139,10 @@ class SectionForce(Output):
         np.add.at(adjoint.volumes, chosen, by_V.reshape(-1, *adjoint.volumes.shape[1:]))
         np.add.at(adjoint.gradients, chosen, by_B.reshape(-1, *adjoint.gradients.shape[1:]))
         by_P = by_P.reshape(len(P), -1, 3, 3)
-        by_H, by_z = self.stress._tensors_vjp(deformation, z, derived, by_P, adjoint)
+        by_H, by_z = self.law.vjp(deformation.H, z, by_P, derived, adjoint)
         by_u, by_B = deformation.vjp(by_H, self.num_vertices)
         np.add.at(adjoint.gradients, self.stress.read, by_B)
         adjoint.rest = -by_u.sum(0)
-        inputs = self.stress.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
+        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         state = self.stress.remembered_vjp(frames, by_z)
         return Change(positions=positions + by_u, inputs=inputs, law_state=state)

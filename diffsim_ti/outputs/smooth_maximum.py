@@ -32,7 +32,7 @@ class SmoothMaximum(Output):
     >>> outputs = [stress, ds.SmoothMaximum(stress, sharpness=30)]
     >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=outputs).forward()
     >>> print(f"{frames['smooth_maximum'][-1] / frames['stress'][-1].max():.2f}")
-    1.08
+    1.07
     """
 
     def __init__(
