@@ -9,6 +9,7 @@ from scipy.integrate import solve_bvp
 import diffsim_ti as ds
 
 MU = 1e5
+LEFT = ds.TetrahedralMesh.create_box((3, 3, 3), (0.2, 0.1, 0.1))
 
 
 def balloon(outer=1.2) -> ds.TetrahedralMesh:
@@ -157,6 +158,21 @@ def test_the_load_may_be_a_motion():
     there = scene.replace(motion={"xmax": ([0.0, 1.0], [[0, 0, 0], [0.05 * share, 0, 0]])})
     u = ds.Rollout(ds.StaticSolver(there), 1).forward().displacements[-1]
     np.testing.assert_allclose(found.displacements[-1], u, atol=1e-8)
+
+
+def test_paths_go_through_ties_and_end_where_static_solves_do():
+    mesh = ds.TetrahedralMesh.joined({"left": LEFT, "right": LEFT.translated([0.2, 0, 0])})
+    loads = [
+        ds.Tie("left_xmax", "right_xmin", tolerance=0.01),
+        ds.Gravity((0, -400.0, 0)),
+        ds.Pressure(200.0, "right_ymax"),
+    ]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=loads, fixed="left_xmin", precision="f64")
+    found = ds.load_path(scene, ["gravity", "pressure"], steps=12, until=lambda s, u: s > 0.8)
+    share = found.factors[-1]
+    there = dict(gravity=share * np.array([0, -400.0, 0]), pressure=200.0 * share)
+    frames = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-11), 1).forward(**there)
+    np.testing.assert_allclose(found.displacements[-1], frames.displacements[-1], atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from diffsim_ti.terms import Chamber, SelfContact
 class Equilibria:
     """R(u, s) = T^T f(u, s) = 0, f: all forces on vertices [N] where the inputs named in `load` are s times their values.
 
-    u = T q + h(s): T is an orthonormal basis of what supports and ties leave free, h what is held or moved.
+    u = T q + h(s): T is a basis of what supports and ties leave free, h what is held or moved.
     """
 
     def __init__(self, scene: Scene, load: Sequence[str]):
@@ -34,6 +34,9 @@ class Equilibria:
         self._load(1.0)
         self.potential = Potential(self.body.arrays, scene.mesh.tetrahedra, False)
         self.T = free_directions(scene)
+        for tie in scene.reduced.bodies:
+            T = (tie.matrix @ self.T).tocsc()
+            self.T = T[:, np.diff(T.indptr) > 0]
         projectors = np.broadcast_to(np.eye(3), (scene.mesh.num_vertices, 3, 3)).copy()
         projectors[scene.held] -= scene.supports.held
         self.loads.hosts.restrict(projectors, self.derived.rest)
@@ -53,7 +56,8 @@ class Equilibria:
     def place(self, u: np.ndarray, s: float) -> None:
         """Go to a displacement [m], whose held part becomes that of the load factor s."""
         self._load(s)
-        self.u = self.field(self.T.T @ u.ravel()) + self.h
+        at, self.u = self.scene.held, np.array(u)
+        self.u[at] += self.h[at] - np.einsum("kij,kj->ki", self.scene.supports.held, u[at])
         self.x = self.derived.rest + self.u
         self.body.place(self.u, np.zeros_like(self.u))
         self.potential.place(self.u)
@@ -161,7 +165,7 @@ class CriticalPoint(metaclass=Public):
     displacements: np.ndarray
     mode: np.ndarray
     negative: int
-    _left: np.ndarray = field(init=False, repr=False)
+    _null: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
     _equilibria: Equilibria = field(init=False, repr=False)
 
     __repr__ = brief_fields
@@ -178,12 +182,9 @@ class CriticalPoint(metaclass=Public):
         factor falls with the power 2/3, or 1/2, of an imperfection.
         Wu 1995, Sensitivity of critical loads; Koiter 1945, On the stability of elastic equilibrium.
         """
-        e, w = self._equilibria, self._left
+        e, w = self._equilibria, self._equilibria.field(self._null[1])
         e.place(self.displacements, self.factor)
-        if self.kind == "limit":
-            found, _ = e.vjp(w)
-        else:
-            found = self._of_branch(e, w)
+        found = e.vjp(w)[0] if self.kind == "limit" else self._of_branch(e, w)
         along = e.along(found)
         inner = {name: self.factor if name in e.load else 1.0 for name in found}
         return {name: -inner[name] / along * by for name, by in found.items()}
@@ -200,7 +201,7 @@ class CriticalPoint(metaclass=Public):
             found = {name: found.get(name, 0.0) + weight / step * x for name, x in own.items()}
             by_u = by_u + weight / step * by
         e.place(self.displacements, self.factor)
-        left, v = e.T.T @ w.ravel(), e.T.T @ self.mode.ravel()
+        v, left = self._null
         by_q = e.T.T @ by_u.ravel()
         p = e.factorised().solve(by_q - v * (v @ by_q), True)
         own, _ = e.vjp(e.field(p - left * (left @ p)))
@@ -276,7 +277,7 @@ def _checked(scene: Scene) -> Scene:
         raise ValueError(f"load_path: scene must be a Scene, got {shown(scene)}")
     scene = scene if scene.precision == "f64" else scene.replace(precision="f64")
     law = scene.law.in_steps()
-    others = [t for t in (*scene.obstacles, *scene.terms_of(SelfContact, Chamber))]
+    others = (*scene.obstacles, *scene.terms_of(SelfContact, Chamber))
     if others:
         raise ValueError(
             f"load_path does not support {type(others[0]).__name__}: leave it out, press by Pressure instead of a "
@@ -389,5 +390,5 @@ class _Follower:
             kind = "limit" if abs(w @ f) > 1e-5 * np.linalg.norm(f) else "branch"
             v, w = v * np.sign(v @ (self.e.T.T @ t.ravel()) or 1.0), w * np.sign(w @ v)
             found.append(CriticalPoint(kind, point.s, point.u, self.e.field(v), count))
-            found[-1]._left, found[-1]._equilibria = self.e.field(w), self.e
+            found[-1]._null, found[-1]._equilibria = (v, w), self.e
         return found
