@@ -98,9 +98,12 @@ def couplings(kind, seed: int, mesh, steps: int, duration: float, E: float) -> l
     size = 0.01 * E * CELL**2 * np.array([1.0, 1, 1, CELL, CELL, CELL]) * rng.standard_normal(6)
     how = ("constant", "per step", "keyed")[rng.integers(3)]
     over = over_time(rng, steps, duration, how)(1.0)
-    load = {"constant": size, "per step": np.multiply.outer(over, size)}.get(how)
-    if how == "keyed":
-        load = (over[0], np.multiply.outer(over[1], size)) if isinstance(over, tuple) else lambda t: over(t) * size
+    if callable(over):
+        load = lambda t: over(t) * size  # noqa: E731
+    elif isinstance(over, tuple):
+        load = over[0], np.multiply.outer(over[1], size)
+    else:
+        load = np.multiply.outer(over, size)
     point = None if rng.random() < 0.5 else mesh.vertices[0] + CELL * rng.standard_normal(3)
     out = [ds.RemoteLoad(load, some_faces(rng, mesh), point)]
     if not kind.explicit:
