@@ -138,6 +138,8 @@ def test_a_column_buckles_at_eulers_load_and_goes_on_beyond_it():
     differences = (factor(poissons_ratio=0.201) - factor(poissons_ratio=0.199)) / 2e-3
     assert by["poissons_ratio"] == pytest.approx(differences, rel=1e-4)
     beyond = ds.load_path(scene, "traction", steps=9, step=0.3, branch=buckles)
+    with pytest.raises(ValueError, match="of the path that it was found on"):
+        ds.load_path(scene, "traction", branch=buckles, poissons_ratio=0.1)
     turned = np.pi / 2 * np.abs(beyond.displacements[-1, :, 1]).max() / L  # of the tip, [rad]
     assert np.all(beyond.negative[1:] == 0) and turned > 0.03
     assert beyond.factors[-1] / buckles.factor - 1 == pytest.approx(turned**2 / 8, rel=0.15)  # of the elastica; coarse

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import brentq
 
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.checked import number, shown
@@ -126,7 +125,10 @@ class Tangent:
         from scipy.sparse.linalg import splu
 
         self.A = A
-        factors = splu(A, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True))
+        try:
+            factors = splu(A, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True))
+        except RuntimeError:
+            raise NotConverged("load_path: the stiffness is singular to rounding", []) from None
         self._solve, self.negative = factors.solve, int((factors.U.diagonal() < 0).sum())
 
     def solve(self, b: np.ndarray, transposed: bool = False) -> np.ndarray:
@@ -267,6 +269,10 @@ def load_path(
     for name, value in (("step", step), ("tolerance", tolerance)):
         if not number(name, value) > 0:
             raise ValueError(f"load_path: {name} must be above zero, got {shown(value)}")
+    if branch and (values or load != list(branch._equilibria.load) or scene.mesh is not branch._equilibria.scene.mesh):
+        raise ValueError(
+            "load_path: a branch is followed with the scene, load and values of the path that it was found on"
+        )
     follower = _Follower(branch._equilibria if branch else Equilibria(scene, load), tolerance)
     return follower.path(steps, step, until, branch)
 
@@ -372,10 +378,12 @@ class _Follower:
 
     def _critical(self, here: _Point, t, rate, length, there: _Point) -> list[CriticalPoint]:
         """Those on the way from `here` to `there`."""
+        from scipy.optimize import brentq
+
         found, begin, count, known = [], 0.0, here.A.negative, {length: there}
 
-        def gap(l: float) -> float:
-            point = known[l] = known.get(l) or self._at(here, t, rate, l)
+        def gap(way: float) -> float:
+            point = known[way] = known.get(way) or self._at(here, t, rate, way)
             return abs(point.A.null()[2]) * (1 if point.A.negative == count else -1)
 
         known[0.0] = here
@@ -383,7 +391,7 @@ class _Follower:
             at = brentq(gap, begin, length, xtol=1e-9 * length, rtol=1e-12)
             point = known[at] if at in known else self._at(here, t, rate, at)
             v, w, _ = point.A.null()
-            beyond = min((l for l in known if l > at and known[l].A.negative != count), default=length)
+            beyond = min((way for way in known if way > at and known[way].A.negative != count), default=length)
             count, begin = known[beyond].A.negative, beyond
             self.e.place(point.u, point.s)
             f, _ = self.e.by_factor()
