@@ -67,13 +67,16 @@ from diffsim_ti.outputs import (
     PixelTracks,
     PlasticStrain,
     Reaction,
+    SectionForce,
     SelfContactForce,
+    SmoothMaximum,
     Strain,
     Stress,
     TactilePad,
     Tension,
     WorkOfLoads,
 )
+from diffsim_ti.outputs.load_path import CriticalPoint, LoadPath, load_path
 from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.rollout.adaptive_steps import adaptive_steps
@@ -109,9 +112,11 @@ from diffsim_ti.terms import (
     Growth,
     HalfSpace,
     MeshObstacle,
+    MultiPointConstraint,
     Muscle,
     Pose,
     Pressure,
+    RemoteLoad,
     RotatingFrame,
     SelfContact,
     Sphere,
@@ -139,6 +144,8 @@ __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactSlip", "ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["PixelTracks", "TactilePad"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
+__all__ += ["load_path", "LoadPath", "CriticalPoint", "SectionForce", "SmoothMaximum"]
+__all__ += ["RemoteLoad", "MultiPointConstraint"]
 __all__ += ["identify", "Unknown", "Measurement", "ModalTest", "Normal", "Smooth", "Identification", "expected"]
 __all__ += ["Accuracy", "Refined", "refine", "compare", "identifiability", "taylor_test", "dot_product_test"]
 __all__ += ["check_gradients"]

@@ -17,10 +17,10 @@ AREAS = {
     "gradients": "gradients batch batch_tape gradient_clip gradient_faults checkpoints tape outputs "
     "contact_force reaction tensor_outputs work modes identification identify identify_experiments",
     "implicit steps and equilibria": "implicit implicit_cycle linear_solves implicit_gradients implicit_contact "
-    "swept solve_report reduced reduced_explicit reduced_rigid tie",
+    "swept solve_report load_path couplings reduced reduced_explicit reduced_rigid tie",
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
-    "quadratic_answers curved_contact",
+    "quadratic_answers nafems curved_contact",
     "obstacles and friction": "contact mesh_obstacle contact_area contact_stage contact_rollers "
     "contact_crossing contact_friction contact_gradients obstacle_pairs own_obstacle poses far_from_origin",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction "

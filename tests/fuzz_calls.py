@@ -61,6 +61,8 @@ TERMS = dict(
     drag=lambda: ds.Drag(1.0),
     force=lambda: ds.ExternalForce([0, 0.1, 0], "bottom"),
     traction=lambda: ds.Traction(lambda t: (0, t, 0)),
+    remote=lambda: ds.RemoteLoad((0, 0.1, 0, 0.01, 0, 0), "cavity"),
+    relation=lambda: ds.MultiPointConstraint([0, 40], [[0, 1, 0], [0, -1, 0]], stiffness=1e4),
     pressure=lambda: ds.Pressure(10.0, "cavity"),
     gas=lambda: ds.GasChamber(1e3, "cavity"),
     filled=lambda: ds.FilledChamber(CAVITY, "cavity"),

@@ -299,6 +299,20 @@ FOLLOWED = {
         lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0)]), 1, outputs=ds.Length("rope")),
         lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0, name="rope")]), 1, outputs=ds.Length("rope")),
     ),
+    ("outputs/load_path.py", "reduced=; leave it out"): (
+        lambda: ds.load_path(
+            scene(mesh=JOINED, reduced={"body_1": "affine"}, terms=[ds.Gravity()]), "gravity", steps=1
+        ),
+        lambda: ds.load_path(scene(terms=[ds.Gravity()], fixed="xmin"), "gravity", steps=1),
+    ),
+    ("outputs/smooth_maximum.py", "of must be an output"): (
+        lambda: ds.SmoothMaximum("stress"),
+        lambda: ds.SmoothMaximum(ds.Stress(von_mises=True)),
+    ),
+    ("outputs/smooth_maximum.py", "goes with kind="): (
+        lambda: ds.SmoothMaximum(ds.Stress(), kind="ks"),
+        lambda: ds.SmoothMaximum(ds.Stress(), kind="ks", scale=1e3),
+    ),
     ("verify.py", "no health report"): (health, lambda: health(health=True)),
     ("mesh/grid.py", "vertices; take at most"): (
         lambda: ds.TetrahedralMesh.create_box(10**4, 1.0),

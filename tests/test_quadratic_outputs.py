@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from quadratic_meshes import crumpled, with_vertices
-from test_tensor_outputs import POINTS, assert_derivatives, bent, outputs
+from test_tensor_outputs import POINTS, assert_derivatives, bent, outputs, sections
 
 import diffsim_ti as ds
 from diffsim_ti.visual.colouring import field_of
@@ -32,6 +32,7 @@ def rollout_of(kind):
         "midpoint": lambda: ds.ImplicitMidpointSolver(scene, dt=5e-3, tolerance=1e-12),
     }[kind]()
     more = [ds.MaterialPoints(POINTS), ds.Stress("of_some", at="vertices", of=[0, 3, 4])]
+    more += [] if kind == "static" else sections()
     return ds.Rollout(solver, 2, save_every=1, outputs=outputs() + more, gradients="all")
 
 

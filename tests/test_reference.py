@@ -47,6 +47,7 @@ OTHERWISE = {
         "SurfaceDrag.normal",
         "SurfaceDrag.tangential",
         "square.normal",
+        "SectionForce.normal",
         "Spring.start",
         "Unknown.start",
         "smooth_step.width",

@@ -82,8 +82,8 @@ def test_stiffness_from_picture(capsys):
 
 def test_least_compliance(tmp_path, capsys):
     numbers = example("design/least_compliance").main(tmp_path, quick=True)
-    assert numbers["by_even"] >= 4.5 and numbers["volume"] == pytest.approx(0.4, abs=1e-6)
-    assert np.all(np.diff(numbers["history"]) < 0)
+    assert numbers["by_even"] >= 6.5 and numbers["volume"] == pytest.approx(0.4, abs=1e-6)
+    assert numbers["best"] <= min(numbers["history"]) * (1 + 1e-9) and numbers["clear"] > 0.8
     assert (tmp_path / "least_compliance.png").stat().st_size > 10_000
     assert "times less" in capsys.readouterr().out
 
@@ -147,6 +147,12 @@ def test_derivatives_of_the_compliance():
     change = 1e-3 * E * np.random.default_rng(1).standard_normal(len(E))
     difference = (panel.compliance(E + change)[0] - panel.compliance(E - change)[0]) / 2
     assert by_E @ change == pytest.approx(difference, rel=1e-4)
+
+    rng, volumes = np.random.default_rng(2), panel.mesh.volumes / panel.mesh.volume
+    y, by_x, way = rng.random((3, len(volumes)))
+    ends = [module.Projection(y + h * way, 4.0, volumes, 0.4).x for h in (1e-6, -1e-6)]
+    exact = module.Projection(y, 4.0, volumes, 0.4).vjp(by_x) @ way
+    assert exact == pytest.approx(by_x @ (ends[0] - ends[1]) / 2e-6, rel=1e-6)
 
 
 def test_equilibria_of_peers(capsys, monkeypatch):

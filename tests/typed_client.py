@@ -38,11 +38,14 @@ def fall() -> float:
     passed: bool = report.passed
     found = ds.modes(scene, 3)
     assert_type(found, ds.Modes)
+    path = ds.load_path(scene.replace(terms=ds.Gravity()), "gravity", steps=1)
+    assert_type(path, ds.LoadPath)
+    limits: list[ds.CriticalPoint] = path.critical
     try:
         ds.Rollout(ds.BDF2Solver(scene, dt=0.01, tolerance=1e-6), 2).forward()
     except (ds.Divergence, ds.NotConverged) as error:
         print(str(error))
-    return float(simulator.positions[:, 1].mean()) + sum(parts.values()) + float(number.sum()) + passed
+    return float(simulator.positions[:, 1].mean()) + sum(parts.values()) + float(number.sum()) + passed + len(limits)
 
 
 def parts() -> int:
@@ -84,6 +87,8 @@ def parts() -> int:
         ds.Muscle((1.0, 0.0, 0.0), 1e3, activation=0.5),
         ds.SelfContact(width=1e-3),
         ds.Tie("xmax", "xmin", tolerance=1e-4),
+        ds.RemoteLoad((0, 0, 0, 0.1, 0, 0), "xmax", point=(1.0, 0, 0)),
+        ds.MultiPointConstraint.mean(mesh, "xmax", (0, 1, 0), 0.01, stiffness=1e6),
         spring,
         cable,
         ball,
@@ -125,6 +130,8 @@ def parts() -> int:
         ds.PlasticStrain(at="vertices"),
         ds.KineticEnergy(["xmax"]),
         ds.WorkOfLoads(),
+        ds.SectionForce((0.2, 0, 0), (1, 0, 0)),
+        ds.SmoothMaximum(ds.Stress(von_mises=True), 8.0),
         ds.CenterOfMass(),
     ]
     assert_type(ds.Rollout(solvers[0], ds.UnequalSteps([1e-4, 2e-4])).on(solvers[1], save_every=1), ds.Rollout)

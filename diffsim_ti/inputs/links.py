@@ -1,6 +1,6 @@
 """Links of a body, its mass and start, and what joins the numbers of terms and the paths of obstacles."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -107,6 +107,23 @@ class NearestPoint(Link):
         (p, n), (q_adj,) = x, y_adj
         s, along = n @ (p - self.near) / (n @ n), (q_adj @ n) / (n @ n)
         return along * n, s * q_adj + along * (p - self.near - 2 * s * n)
+
+
+class Joined(Link):
+    """The numbers of several inputs in one row."""
+
+    def __init__(self, reads: Sequence[str], writes: str):
+        self.reads, self.writes = tuple(reads), (writes,)
+
+    def value(self, *x):
+        return (np.concatenate([part.ravel() for part in x]),)
+
+    def jvp(self, x, dx):
+        return self.value(*dx)
+
+    def vjp(self, x, y_adj):
+        ends = np.cumsum([part.size for part in x])[:-1]
+        return [row.reshape(part.shape) for row, part in zip(np.split(y_adj[0], ends), x)]
 
 
 class Placed(Link):

@@ -1,6 +1,7 @@
 """The kinds of interactions: a new one is a class in a folder of its own, and a name here."""
 
 from diffsim_ti.mechanics.chambers.interaction import FilledChambers, Gases
+from diffsim_ti.mechanics.constraints import Constraints
 from diffsim_ti.mechanics.fluid.interaction import FluidDrag
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interaction import Interaction
@@ -12,7 +13,7 @@ from diffsim_ti.mechanics.stress.interaction import Growths
 
 # in the order in which vertices gather their corners: what is no load comes first
 KINDS: tuple[type[Interaction], ...] = (
-    *(SpringsAndCables, Pressures, Gases, FilledChambers, FluidDrag, Foundations, InertialForces),
+    *(SpringsAndCables, Pressures, Gases, FilledChambers, FluidDrag, Foundations, InertialForces, Constraints),
     *(DeadLoads, Growths),  # which have parts of a step of their own
 )
 NUMBERS = {name: kind for each in KINDS for name, kind in each.derived.items()}  # arrays that some kind has of its own

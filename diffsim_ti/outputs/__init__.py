@@ -13,7 +13,9 @@ from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.pixel_tracks import PixelTracks
 from diffsim_ti.outputs.plastic_strain import PlasticStrain
 from diffsim_ti.outputs.reaction import Reaction
+from diffsim_ti.outputs.section_force import SectionForce
 from diffsim_ti.outputs.self_contact_force import SelfContactForce
+from diffsim_ti.outputs.smooth_maximum import SmoothMaximum
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tactile_pad import TactilePad
 from diffsim_ti.outputs.tensors import Strain, Stress
@@ -28,7 +30,7 @@ __all__ = [
     "ContactTraction",
     "Displacements",
 ]
-__all__ += ["Dissipation", "PixelTracks", "PlasticStrain"]
+__all__ += ["Dissipation", "PixelTracks", "PlasticStrain", "SectionForce", "SmoothMaximum"]
 __all__ += [
     "ElasticEnergy",
     "EnclosedVolume",

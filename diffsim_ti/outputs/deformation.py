@@ -68,6 +68,8 @@ class PointMeans:
     """Means over points by volumes V, T_i = sum c_ip V_p T_p / sum c_ip V_p; of item i over the points in row i of
     `around`, which holds the c_ip."""
 
+    moves = False  # whether its shares move with the rest shape
+
     def __init__(self, around):
         self._around = around
 
@@ -120,6 +122,8 @@ class PointMeans:
 
 class PointInterpolation:
     """Values at places in ten-node tetrahedra, of the linear functions that those at their four points make."""
+
+    moves = True
 
     def __init__(self, mesh, located):
         self.located, self._start = located, barycentric_in(mesh.vertices[located.vertices], located.points)[:, 1:]

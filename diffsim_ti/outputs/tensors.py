@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointInterpolation, PointMeans
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.recovery import PatchRecovery
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
 
 if TYPE_CHECKING:
@@ -18,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class _Tensors(Output):
-    """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means of what the tetrahedra around have there; or
-    material points X [m], shape (k, 3), each with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is the
-    mean over its points, by their volumes; at X and at its nodes it is the linear function of place that these four make,
-    which is more accurate than the tensor of the displacements there. of: the tetrahedra that are meant: only these have a
-    tensor, or count alone at their vertices.
+    """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means of what the tetrahedra around have there;
+    "recovered", at vertices, too, by superconvergent patches (recovery.py); or material points X [m], shape (k, 3), each
+    with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is the mean over its points, by their volumes;
+    at X and at its nodes it is the linear function of place that these four make, which is more accurate than the tensor of
+    the displacements there. of: the tetrahedra that are meant: only these have a tensor, or count alone at their vertices.
     numbers: what of them is given instead, a name in deformation.NUMBERS, or None. name: how a loss calls it.
     Barlow 1976, Optimal stress locations in finite element models, doi:10.1002/nme.1620100202; Hinton, Campbell 1974, Local
     and global smoothing of discontinuous finite element functions, doi:10.1002/nme.1620080305."""
@@ -37,11 +38,14 @@ class _Tensors(Output):
                 f"{type(self).__name__}: {' and '.join(asked)} exclude each other; take one output for each"
             )
         self.name, self.at, self.of, self.numbers = name, at, of, asked[0] if asked else None
-        if isinstance(at, str) and at not in ("tetrahedra", "vertices"):
-            raise ValueError(f'{type(self).__name__}: at must be "tetrahedra", "vertices" or points, got {at!r}')
+        if isinstance(at, str) and at not in ("tetrahedra", "vertices", "recovered"):
+            raise ValueError(
+                f'{type(self).__name__}: at must be "tetrahedra", "vertices", "recovered" or points, got {at!r}'
+            )
         if of is not None and not isinstance(at, str):
             raise ValueError(
-                f'{type(self).__name__}: of= says which tetrahedra are meant; it goes with at="tetrahedra" or "vertices"'
+                f'{type(self).__name__}: of= says which tetrahedra are meant; it goes with at="tetrahedra", "vertices" or '
+                '"recovered"'
             )
 
     def settled(self, scene: "Scene") -> "Output":
@@ -54,8 +58,9 @@ class _Tensors(Output):
             out.chosen = of
         out.read, out.count = out.chosen, len(out.chosen)  # read: whose deformation is looked at
         if self._at_vertices:
-            out.means, out.count = PointMeans.of_vertices(mesh, of), mesh.num_vertices
-            out.alike = out.points > 1
+            recovered = self.at == "recovered"
+            out.means = PatchRecovery(mesh, of) if recovered else PointMeans.of_vertices(mesh, of)
+            out.count, out.alike = mesh.num_vertices, out.points > 1 and not recovered
         elif out.points > 1 and not every:
             out.means = PointInterpolation(mesh, located)
         elif out.points > 1:
@@ -85,23 +90,19 @@ class _Tensors(Output):
         return derived, deformation, z, T, T if self.means is None else self.means.value(T, self._shares(derived))
 
     @property
-    def _interpolated(self) -> bool:
-        return isinstance(self.means, PointInterpolation)
-
-    @property
     def _at_vertices(self) -> bool:
-        return isinstance(self.at, str) and self.at == "vertices"
+        return isinstance(self.at, str) and self.at != "tetrahedra"
 
     def _shares(self, derived) -> np.ndarray:
         """How much the points of the chosen tetrahedra count: by their volumes, alike, or by shares in values at places."""
         if self.alike:
             return np.ones(self.points * len(self.chosen))
-        return self.means.shares(derived.rest) if self._interpolated else derived.volumes[self.chosen].ravel()
+        return self.means.shares(derived.rest) if self.means.moves else derived.volumes[self.chosen].ravel()
 
     def _shares_jvp(self, derived, moved) -> np.ndarray:
         if self.alike:
             return np.zeros(self.points * len(self.chosen))
-        if self._interpolated:
+        if self.means.moves:
             return self.means.shares_jvp(derived.rest, moved.rest)
         return moved.volumes[self.chosen].ravel()
 
@@ -125,7 +126,7 @@ class _Tensors(Output):
         adjoint, seed = derived.zeros(), NUMBERS[self.numbers][3](shown, seed) if self.numbers else seed
         if self.means is not None:
             seed, by_shares = self.means.vjp(T, self._shares(derived), seed)
-            if self._interpolated:
+            if self.means.moves:
                 by_rest = self.means.shares_vjp(derived.rest, by_shares)
             elif not self.alike:
                 np.add.at(adjoint.volumes, self.chosen, by_shares.reshape(-1, *adjoint.volumes.shape[1:]))
@@ -140,8 +141,8 @@ class _Tensors(Output):
 class Strain(_Tensors):
     """Green's strain E = (F^T F - I) / 2 [-], F = I + sum_a u_a (x) grad N_a, in each frame; symmetric 3x3 tensors.
 
-    at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", (frames, num_vertices, 3, 3), as `Stress` has it; or
-    points X [m] of the rest shape, shape (k, 3). of: as of `Stress`. name: how a loss calls it.
+    at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices" or "recovered", (frames, num_vertices, 3, 3), as `Stress`
+    has them; or points X [m] of the rest shape, shape (k, 3). of: as of `Stress`. name: how a loss calls it.
     principal: its eigenvalues E_i instead, ascending, shape (frames, ..., 3). stretches: the principal stretches
     sqrt(1 + 2 E_i) [-], ascending; at vertices those of the mean strain. Where two of either coincide only their sum has a
     gradient: each has the slope along an eigenvector that the solver happened to choose.
@@ -176,16 +177,17 @@ class Strain(_Tensors):
 class Stress(_Tensors):
     """Stress [Pa] in each frame: Cauchy's sigma = P F^T / J, or the first Piola-Kirchhoff stress P = dpsi/dF.
 
-    kind: "cauchy" or "first_piola". at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", (frames, num_vertices,
-        3, 3); or points X [m] of the rest shape, shape (k, 3). name: how a loss calls it.
+    kind: "cauchy" or "first_piola". at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices" or "recovered", (frames,
+        num_vertices, 3, 3); or points X [m] of the rest shape, shape (k, 3). name: how a loss calls it.
     of: tetrahedra, by a set's name, indices, a mask or a list of names: at tetrahedra only theirs is given, shape
-        (frames, k, 3, 3); at vertices they count alone: where two materials meet and stress jumps, which side's stress is
-        meant. Without it an interface has the mean of both sides.
+        (frames, k, 3, 3); at vertices, and recovered, they count alone: where two materials meet and stress jumps, which
+        side's stress is meant. Without it an interface has the mean of both sides.
 
     At a vertex it is the mean over the tetrahedra around of the stress that each has at the vertex, which in ten-node
     tetrahedra is the linear function through their four points, with volume="patches" too. Linear tetrahedra have one stress
-    each and count by their volumes: at a surface this mean is the stress some half an element below; take ten nodes
-    (`mesh.quadratic()`) for stress at surfaces.
+    each and count by their volumes: at a surface this mean is the stress some half an element below. "recovered" is the
+    value at the vertex of the polynomial, linear or of ten nodes quadratic, that fits the points of the tetrahedra around
+    it, about twice as accurate with ten nodes, at surfaces too (Zienkiewicz, Zhu 1992, doi:10.1002/nme.1620330702).
     principal: Cauchy's eigenvalues instead, ascending, shape (frames, ..., 3); where two coincide only their sum has a
     gradient. von_mises: sqrt(3/2 s : s) of Cauchy's deviator s instead, shape (frames, ...), at vertices that of the mean
     stress; where it is 0 it has a kink, and its gradient is given as 0.

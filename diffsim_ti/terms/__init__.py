@@ -8,6 +8,7 @@ from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.growth import Growth
 from diffsim_ti.terms.lines import Anchor, Cable, Spring
 from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
+from diffsim_ti.terms.multi_point_constraint import MultiPointConstraint
 from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
 from diffsim_ti.terms.obstacles.box import Box, Cylinder
@@ -16,6 +17,7 @@ from diffsim_ti.terms.obstacles.half_space import HalfSpace
 from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.pose import Pose
+from diffsim_ti.terms.remote_load import RemoteLoad
 from diffsim_ti.terms.rotating_frame import RotatingFrame
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.surface_drag import SurfaceDrag
@@ -24,10 +26,10 @@ from diffsim_ti.terms.tie import Tie
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
 LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, Muscle)
-LOADS += (Growth, ElasticFoundation)
+LOADS += (Growth, ElasticFoundation, RemoteLoad, MultiPointConstraint)
 TERMS = (Gravity, Drag, RotatingFrame, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact, Tie)
 __all__ = ["Anchor", "BodyForce", "Box", "Cable", "Capsule", "Chamber", "Cylinder", "Drag", "ElasticFoundation"]
 __all__ += ["ExternalForce", "FilledChamber", "GasChamber", "Gravity", "Ground", "Growth", "HalfSpace", "Load"]
 __all__ += ["MeshObstacle", "Muscle", "OBSTACLES", "Obstacle", "Pose", "Pressure", "SelfContact", "Sphere", "Spring"]
 __all__ += ["RotatingFrame", "SurfaceDrag", "Term", "TERMS", "Tie", "Traction"]
-__all__ += ["VertexForce"]
+__all__ += ["MultiPointConstraint", "RemoteLoad", "VertexForce"]

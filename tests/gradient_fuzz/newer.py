@@ -5,7 +5,7 @@ import numpy as np
 import diffsim_ti as ds
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies
 
-from .loads import over_time
+from .loads import over_time, some_faces
 from .structures import CELL
 
 
@@ -88,6 +88,30 @@ def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> lis
         return [ds.Muscle(fibre, stress, rng.random((steps, len(some))), some, per="tetrahedron")]
     how = ("constant", "per step", "keyed")[rng.integers(3)]
     return [ds.Muscle(fibre, stress, over_time(rng, steps, duration, how)(1.0), some)]
+
+
+def couplings(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list:
+    """Loads at remote points and, in implicit ones, relations, in a quarter of the structures behind those of golden.py."""
+    if kind.number < 60 or np.random.default_rng([44, kind.number]).random() > 0.25:
+        return []
+    rng = np.random.default_rng([45, seed])
+    size = 0.01 * E * CELL**2 * np.array([1.0, 1, 1, CELL, CELL, CELL]) * rng.standard_normal(6)
+    how = ("constant", "per step", "keyed")[rng.integers(3)]
+    over = over_time(rng, steps, duration, how)(1.0)
+    if callable(over):
+        load = lambda t: over(t) * size  # noqa: E731
+    elif isinstance(over, tuple):
+        load = over[0], np.multiply.outer(over[1], size)
+    else:
+        load = np.multiply.outer(over, size)
+    point = None if rng.random() < 0.5 else mesh.vertices[0] + CELL * rng.standard_normal(3)
+    out = [ds.RemoteLoad(load, some_faces(rng, mesh), point)]
+    if not kind.explicit:
+        which = rng.permutation(mesh.num_vertices)[: rng.integers(1, 6)]
+        value = over_time(rng, steps, duration, how)(1e-3 * CELL)
+        c = rng.standard_normal((len(which), 3))
+        out.append(ds.MultiPointConstraint(which, c, value, stiffness=E * CELL * rng.uniform(0.1, 10)))
+    return out
 
 
 def grown(kind, seed: int, law, mesh):

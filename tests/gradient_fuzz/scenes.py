@@ -150,6 +150,7 @@ def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configu
         terms.append(tie(name, more, mesh, steps, duration, mass, beat))
 
     terms += newer.muscles(kind, seed, mesh, steps, duration, E)
+    terms += newer.couplings(kind, seed, mesh, steps, duration, E)
     if kind.chamber:
         own = chamber(kind.chamber, more, mesh, start, steps, duration, E)
         terms.insert(int(more.integers(0, len(terms) + 1)), own)

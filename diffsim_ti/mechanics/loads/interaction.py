@@ -7,13 +7,13 @@ import numpy as np
 from diffsim_ti.inputs.loads import SumOfForces
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.state.corners import slots
-from diffsim_ti.terms import BodyForce, ExternalForce, Traction
+from diffsim_ti.terms import BodyForce, ExternalForce, RemoteLoad, Traction
 
 
 class DeadLoads(Interaction):
     """Forces that do not change with the body, added up; kernels take them as a part of the kick (explicit.py)."""
 
-    name, kinds, works = "dead_loads", (BodyForce, ExternalForce, Traction), "loads"
+    name, kinds, works = "dead_loads", (BodyForce, ExternalForce, RemoteLoad, Traction), "loads"
     in_kernels = on_host = False
 
     @cached_property

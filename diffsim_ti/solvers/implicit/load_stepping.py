@@ -62,9 +62,10 @@ class LoadStepping:
                 except NotConverged:
                     share = 0.5 * min(share, 1 - done)
                     if stage.static and share < max(self.nearly * ws.reached(j, stage, done), self.least):
+                        shares = self._share_of_loads(j, stage, done)
                         ws.potential.place(place)
                         newton.residual_of(apply_loads(done))
-                        why = self._why(error, self._share_of_loads(j, stage, done))
+                        why = self._why(error, *shares)
                         raise NotConverged(why, error.residuals) from None
                     if not stage.static and share < self.in_motion:
                         raise error from None
@@ -75,20 +76,29 @@ class LoadStepping:
             apply_loads(1.0)
         return place
 
-    def _share_of_loads(self, j: int, stage: Stage, done: float) -> float:
-        """Of the load of its step; in the first step loads that change in time, too, grow faster than its share."""
-        ws, sizes = self.ws, []
-        share = ws.reached(j, stage, done)
-        if ws.pass_of_all(j) >= ws.solver.substeps or ws.volumes:
-            return share
-        for k, applied_share in ((j, done), (int(ws.solver.schedule.first(ws.solver.schedule.row(j) + 1)) - 1, 1.0)):
-            ws.apply_loads(k, stage, applied_share)
-            forces = ws.loads(k, stage)
-            sizes.append(np.linalg.norm(forces + ws.newton.others.forces(np.zeros_like(forces))))
-        return sizes[0] / sizes[1] if sizes[1] > 0 else share
+    def _share_of_loads(self, j: int, stage: Stage, done: float) -> tuple[float, float]:
+        """(of the load that its step ends with, of what the step adds). In the first step loads that change in time, too,
+        grow faster than its share."""
+        ws, schedule = self.ws, self.ws.solver.schedule
+        added, row = ws.reached(j, stage, done), schedule.row(j)
+        first, now = int(schedule.first(row)), self._load(int(schedule.first(row + 1)) - 1, stage)
+        if ws.volumes or not now.any() or ws.pass_of_all(j) != j and not first:
+            return added, added  # motions alone, or a step whose load before is not known
+        if first:
+            before = self._load(first - 1, stage)
+            here = before + added * (now - before)
+        else:
+            here = self._load(j, stage, done)
+        return float(np.linalg.norm(here) / np.linalg.norm(now)), added
 
-    def _why(self, error: NotConverged, reached: float) -> str:
-        """What the path of equilibria means for the problem; `reached`: the share of the step at which it ends."""
+    def _load(self, j: int, stage: Stage, share: float = 1.0) -> np.ndarray:
+        """Loads [N] at a share of pass j, those that follow the surface as at rest."""
+        self.ws.apply_loads(j, stage, share)
+        forces = self.ws.loads(j, stage)
+        return forces + self.ws.newton.others.forces(np.zeros_like(forces))
+
+    def _why(self, error: NotConverged, reached: float, added: float) -> str:
+        """What the path of equilibria means for the problem; at which shares it ends, as `_share_of_loads` has them."""
         newton = self.ws.newton
         if reached > 0 and not newton.by_residual and newton.is_unstable():
             end = (
@@ -98,10 +108,11 @@ class LoadStepping:
         else:
             end = (
                 "and is not seen to be unstable there: what comes next may lie beyond a limit point, the most that the body "
-                "carries, or be too hard for Newton's method: apply a smaller load"
+                "carries, which `load_path` finds and passes, or be too hard for Newton's method: apply a smaller load"
             )
+        more = "" if abs(added - reached) < 1e-3 else f" ({100 * added:.3g}% of what the step adds to them)"
         return (
             f"no equilibrium was found: the path of equilibria from the state before goes to {100 * reached:.3g}% of the "
-            f"step's loads and prescribed motion, {end}, or take a solver with inertia, which follows the jump (without "
-            f"load stepping: {len(error.residuals)} rounds, to a relative residual of {error.residuals[-1]:.2g})"
+            f"step's loads and prescribed motion{more}, {end}, or take a solver with inertia, which follows the jump "
+            f"(without load stepping: {len(error.residuals)} rounds, to a relative residual of {error.residuals[-1]:.2g})"
         )

@@ -33,7 +33,16 @@ def pressed_by(terms, mesh, density: float) -> float:
     section = float(np.sort(size)[:2].prod())
     for term in terms:
         kind, most = type(term).__name__, {}
-        if kind in ("Muscle", "Cable", "Traction", "Pressure", "GasChamber", "BodyForce", "ExternalForce"):
+        if kind in (
+            "Muscle",
+            "Cable",
+            "Traction",
+            "Pressure",
+            "GasChamber",
+            "BodyForce",
+            "ExternalForce",
+            "RemoteLoad",
+        ):
             most = {described.plain: _most(term, described) for described in term.described}
         if kind == "Muscle":
             total += most["muscle_stress"] * max(1.0, most["activation"])
@@ -46,6 +55,8 @@ def pressed_by(terms, mesh, density: float) -> float:
             total += abs(most[term.described[0].plain] - outside)
         elif kind == "BodyForce":
             total += most["body_force"] * (density if term.per == "mass" else 1.0) * float(size.max())
+        elif kind == "RemoteLoad":
+            total += most["remote_load"] / section
         elif kind == "ExternalForce":
             total += most["external_forces"] * len(term.indices(mesh)) / section
     return total
