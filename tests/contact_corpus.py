@@ -601,7 +601,7 @@ SCENES["pin cushion of segments"] = _cushion(True)
 @scene("funnel")
 def funnel(meshes: Meshes) -> Posed:
     """A body is pulled into a tube of 40 mm by what of it is lowest. Where facets of the tube are equally near their
-    distance has a kink, and equilibria that lie there are found to about the paper's tolerance alone."""
+    distance has a kink, and equilibria that lie there are found roughly alone."""
     vertices, triangles = meshes.surface("funnel")
     tube, speed = Surface(vertices, triangles), 0.06
     if meshes.folder:

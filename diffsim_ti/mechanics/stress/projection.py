@@ -42,7 +42,9 @@ class Projection:
         )
         rows, columns = (x.ravel() for x in np.broadcast_arrays(at[:, :, None], at[:, None]))
         raised = bsr_matrix((self.raised, np.arange(self.num_vertices), np.arange(self.num_vertices + 1)))
-        return coo_matrix((blocks.ravel(), (rows, columns)), shape=(size, size)).tocsr() + raised
+        out = coo_matrix((blocks.ravel(), (rows, columns)), shape=(size, size)).tocsr() + raised.tocsr()
+        out.eliminate_zeros()
+        return out
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         dH = np.einsum("eac,eaj->ecj", w[self.nodes], self.N)

@@ -125,11 +125,8 @@ class CandidatePairs:
         x = runtime.fetch(rest).astype(np.float64) + runtime.fetch(u, slot)
         bodies, slack = x[self._bodies], runtime.fetch(self.slack).astype(np.float64).max(0)
         wide = MARGIN * (reach + 2 * slack.sum()) + 1e-5 * np.abs(bodies).max()
-        beyond = (x < bodies.min(0) - wide) @ [1, 2, 4] + (x > bodies.max(0) + wide) @ [
-            8,
-            16,
-            32,
-        ]  # which sides, in bits
+        low, high = bodies.min(0) - wide, bodies.max(0) + wide
+        beyond = np.concatenate([x < low, x > high], 1) @ (1 << np.arange(6))  # on which sides, a bit for each
         a, b = beyond[self._edges].T
         return np.flatnonzero(beyond[self._acting] == 0), None, np.flatnonzero((a & b) == 0)
 

@@ -106,7 +106,7 @@ def whole(source) -> np.ndarray:
 
 
 def put(array, data: np.ndarray) -> None:
-    """Copy numbers to where an array begins; vectors have three components."""
+    """Copy numbers, or vectors by rows, to where an array begins."""
     host = runtime.view(array)
     if host is None:
         padded = np.zeros((array.shape[0], *data.shape[1:]), data.dtype)

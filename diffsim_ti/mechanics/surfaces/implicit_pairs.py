@@ -73,6 +73,7 @@ class ImplicitPairs(SurfacePairs):
         return self._acting
 
     def run_acting(self, kernel, at: dict, slot: int = 0, **numbers) -> None:
+        """Launch a kernel of pairs on those that act."""
         acting, sizes = self._of_acting()
         self.run(kernel, at, acting, slot=slot, **numbers, **sizes)
 
