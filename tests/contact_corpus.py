@@ -1,12 +1,14 @@
 """The scenes that contact codes are judged by, and a table of what becomes of them.
 
-    python tests/contact_corpus.py [--meshes FOLDER] [--scene NAME ...] [--steps N] [--list]
+    python tests/contact_corpus.py [--meshes FOLDER ...] [--scene NAME ...] [--steps N] [--list]
 
-FOLDER holds the meshes of the IPC paper's repository (spike.msh, wedge.msh, cube.msh, tet.msh, mat20x20.msh, mat40x40.msh,
-arch/01.msh ..., and surfaces *.obj); without it coarser ones of our own stand for them. Each scene runs once. The table says
-how many steps were done, what an exact judge found (exact_predicates.py: edges that pierce triangles and points within
-tetrahedra, at the end of each step and at three places on the straight way to it), Newton's rounds, processor seconds of a
-step, microseconds of a step and tetrahedron beside the paper's, and whether bodies went where they were to go.
+FOLDERs hold the meshes of the IPC paper's repository (spike.msh, wedge.msh, cube.msh, tet.msh, mat20x20.msh,
+mat40x40.msh, arch/01.msh ..., and surfaces *.obj), and Armadillo13K.msh, which goes through the funnel in place of the
+paper's dolphin; coarser ones of our own stand for all without them, and balls and rods for the paper's always. Each scene
+runs once. The table says how many steps were done, what an exact judge found at the end of each step (exact_predicates.py:
+edges that pierce triangles and points within tetrahedra) and at three places on the straight way to it, which Newton's
+method need not have taken, Newton's rounds, processor seconds of a step, microseconds of a step and tetrahedron beside the
+paper's, and whether bodies went where they were to go.
 
 Li, Ferguson, Schneider, Langlois, Zorin, Panozzo, Jiang, Kaufman 2020, Incremental Potential Contact,
 doi:10.1145/3386569.3392425. Erleben 2018, Methodology for Assessing Mesh-Based Contact Point Methods, doi:10.1145/3096239.
@@ -33,14 +35,18 @@ NONE = np.zeros((0, 3), int)
 
 
 class Meshes:
-    """Meshes by their names in the paper's repository, of a folder or, without one, of our own."""
+    """Meshes by their names in the paper's repository, of folders, of which the first has the paper's, or of our own."""
 
-    def __init__(self, folder: str | None = None):
+    def __init__(self, folder: str | None = None, *more: str):
         self.folder = None if folder is None else Path(folder)
+        self.folders = [Path(f) for f in (folder, *more) if f is not None]
 
     def __call__(self, name: str) -> ds.TetrahedralMesh:
-        if self.folder is not None:
-            return ds.TetrahedralMesh.from_file(self.folder / f"{name}.msh", fix_orientation=True, drop_orphans=True)
+        for folder in self.folders:
+            if (file := folder / f"{name}.msh").exists():
+                return ds.TetrahedralMesh.from_file(file, fix_orientation=True, drop_orphans=True)
+        if self.folders:
+            raise ValueError(f"no {name}.msh in {', '.join(map(str, self.folders))}")
         return getattr(self, f"_{name}")()
 
     def arch(self) -> list[ds.TetrahedralMesh]:
@@ -53,6 +59,8 @@ class Meshes:
     def surface(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(vertices, triangles) of NAME.obj."""
         if self.folder is None:
+            if name == "funnel":
+                return _funnel()
             mesh = self(name)
             return mesh.vertices, mesh.surface_triangles
         vertices, triangles = [], []
@@ -84,6 +92,18 @@ class Meshes:
 
     def _mat40x40(self):
         return ds.TetrahedralMesh.create_box((11, 2, 11), size=(1, 0.008, 1)).translated([-0.5, -0.004, -0.5])
+
+
+def _funnel(around: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """An open sheet: a tube with a mouth."""
+    profile = np.array([[0.5, 0.12], [0.4565, 0.048], *([y, 0.02] for y in np.linspace(0.413, -0.5, 8))])
+    angle = 2 * np.pi * np.arange(around) / around
+    ring = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], 1)
+    vertices = np.concatenate([r * ring + [0, y, 0] for y, r in profile])
+    k, row = np.arange(around), around * np.arange(len(profile) - 1)[:, None]
+    a, b = row + k, row + (k + 1) % around
+    corners = [[a, b, a + around], [b, b + around, a + around]]
+    return vertices, np.concatenate([np.stack(three, -1).reshape(-1, 3) for three in corners])
 
 
 def _ball(cells: int, radius: float) -> ds.TetrahedralMesh:
@@ -131,13 +151,25 @@ def set_on(mesh: ds.TetrahedralMesh, height: float) -> ds.TetrahedralMesh:
 
 @dataclass
 class Surface:
-    """What an obstacle consists of, for the judge; path: its displacement at a time."""
+    """What an obstacle consists of, for the judge; path: its displacement at a time, or that and how far it has turned
+    about a point [rad]."""
 
     vertices: np.ndarray
     triangles: np.ndarray = field(default_factory=lambda: NONE)
     segments: np.ndarray = field(default_factory=lambda: NONE[:, :2])
     points: np.ndarray = field(default_factory=lambda: NONE[:, 0])
     path: Callable[[float], np.ndarray] = staticmethod(lambda t: np.zeros(3))
+    about: np.ndarray | None = None
+
+    def at(self, t: float) -> np.ndarray:
+        """Its vertices at a time."""
+        shift, turn = np.split(self.path(t), [3])
+        if self.about is None:
+            return self.vertices + shift
+        angle = float(np.linalg.norm(turn))
+        k, r = turn / (angle or 1.0), self.vertices - self.about
+        r = r * np.cos(angle) + np.cross(k, r) * np.sin(angle) + np.outer(r @ k, k) * (1 - np.cos(angle))
+        return self.about + r + shift
 
     def obstacle(self, **options) -> ds.MeshObstacle:
         parts = {name: getattr(self, name) for name in ("triangles", "segments", "points")}
@@ -176,7 +208,7 @@ class Posed:
         )
 
         def places(body: np.ndarray, t: float) -> np.ndarray:
-            return np.concatenate([body, *(s.vertices + s.path(t) for s in self.surfaces)])
+            return np.concatenate([body, *(s.at(t) for s in self.surfaces)])
 
         return judge, places
 
@@ -191,6 +223,7 @@ class Run:
     seconds: list = field(default_factory=list)
     rounds: list = field(default_factory=list)
     intersections: int = 0
+    on_the_way: int = 0
     turned: int = 0
     error: str | None = None
 
@@ -243,7 +276,9 @@ def run(name: str, posed: Posed, steps: int | None = None, judged: bool = True, 
         x, t, x_before, t_before = simulator.positions, simulator.time, x, t
         out.positions.append(x)
         if judged:
-            out.intersections += judge.count_along(places(x_before, t_before), places(x, t), samples)
+            here = judge.count(places(x, t))
+            out.intersections += here
+            out.on_the_way += judge.count_along(places(x_before, t_before), places(x, t), samples) - here
             out.turned += len(judge.turned(places(x, t)))
         if say:
             say(out)
@@ -466,21 +501,21 @@ SCENES["slope 0.5, friction 0.5"] = _slope(0.5)
 def twist(meshes: Meshes) -> Posed:
     """Both ends turn against each other, 0.4 turns a second together, for two turns of each end against the other."""
     mat = meshes("mat40x40")
-    x = mat.vertices[:, 0]
-    ends = [np.flatnonzero(x <= x.min() + 1e-9), np.flatnonzero(x >= x.max() - 1e-9)]
-    held = np.sort(np.concatenate(ends))
-    sign = np.where(x[held] > 0, 1.0, -1.0)
-    X = mat.vertices[held]
+    return _twisted([mat], mat.vertices, rate=0.4, dt=0.04, steps=125, contact=ds.SelfContact(1e4, 1e-3), E=2e4)
+
+
+def _twisted(bodies, x: np.ndarray, rate: float, dt: float, steps: int, E: float = 1e4, **more) -> Posed:
+    """Ends of bodies along x that turn about that axis, by so many turns a second against each other."""
+    low, high = x[:, 0].min() + 1e-9, x[:, 0].max() - 1e-9
+    held = np.flatnonzero((x[:, 0] <= low) | (x[:, 0] >= high))
+    (_, y, z), sign = x[held].T, np.sign(x[held, 0])
 
     def motion(t: float) -> np.ndarray:
-        angle = np.pi * 0.4 * t * sign
-        y, z = X[:, 1], X[:, 2]
-        return np.stack(
-            [0 * y, np.cos(angle) * y - np.sin(angle) * z - y, np.sin(angle) * y + np.cos(angle) * z - z], 1
-        )
+        angle = np.pi * rate * t * sign
+        cos, sin = np.cos(angle), np.sin(angle)
+        return np.stack([0 * y, cos * y - sin * z - y, sin * y + cos * z - z], 1)
 
-    contact = ds.SelfContact(1e4, 1e-3)
-    return posed([mat], 2e4, 0.4, 0.04, 125, gravity=False, contact=contact, fixed=held, motion=motion)
+    return posed(bodies, E, 0.4, dt, steps, gravity=False, fixed=held, motion=motion, **more)
 
 
 # ---- scenes with obstacle surfaces -----------------------------------------------------------------------------------
@@ -563,6 +598,99 @@ SCENES["pin cushion of points"] = _cushion(False)
 SCENES["pin cushion of segments"] = _cushion(True)
 
 
+@scene("funnel")
+def funnel(meshes: Meshes) -> Posed:
+    """A body is pulled into a tube of 40 mm by what of it is lowest. Where facets of the tube are equally near their
+    distance has a kink, and equilibria that lie there are found roughly alone."""
+    vertices, triangles = meshes.surface("funnel")
+    tube, speed = Surface(vertices, triangles), 0.06
+    if meshes.folder:
+        body = meshes("Armadillo13K")
+        body = ds.TetrahedralMesh(body.vertices * (0.15 / np.ptp(body.vertices, 0).max()), body.tetrahedra)
+    else:
+        body = _ball(3, radius=0.06)
+    x = body.vertices
+    body = body.translated(np.array([0, 0.505, 0]) - x[x[:, 1].argmin()])
+    held = np.flatnonzero(np.linalg.norm(body.vertices - [0, 0.505, 0], axis=1) < 0.015)
+
+    def expected(run: Run) -> str | None:
+        low = run.positions[-1][held, 1].max()
+        return None if low < 0.505 + 0.02 - 0.9 * speed * run.done * 0.04 else f"what is pulled is at {low:.3g} m"
+
+    return posed(
+        [body],
+        E=1e4,
+        nu=0.4,
+        dt=0.04,
+        steps=100,
+        contact=ds.SelfContact(1e4, 2e-4),
+        terms=[tube.obstacle(width=2e-4, stiffness_per_area=1e9)],
+        surfaces=[tube],
+        fixed=held,
+        motion=lambda t: np.tile([0, -speed * t, 0], (len(held), 1)),
+        gravity=False,
+        tolerance=1e-2,
+        expected=expected,
+        paper=(27.9, 36304, None),
+    )
+
+
+@scene("rollers")
+def rollers(meshes: Meshes) -> Posed:
+    """A ball that falls is drawn through two pairs of rollers, each of segments around a circle."""
+    radius, gap, width, rate = 0.15, 0.25, 2e-3, 1.5
+    body = _ball(10 if meshes.folder else 3, radius=0.25)
+    angle = 2 * np.pi * np.arange(24) / 24
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+    pairs = []
+    for along, height in ((2, 0.0), (0, -0.5)):
+        across = 2 - along
+        for sign in (-1, 1):
+            ends = np.zeros((2, len(angle), 3))
+            ends[:, :, across], ends[:, :, 1] = circle.T
+            ends[0, :, along], ends[1, :, along] = -0.4, 0.4
+            middle = np.zeros(3)
+            middle[across], middle[1] = sign * (radius + 0.5 * gap), height
+            k = np.arange(len(angle))
+            turn = np.zeros(3)
+            # what faces the other roller goes down
+            turn[along] = rate * sign * (1 if along == 2 else -1)
+            path = lambda t, turn=turn: np.concatenate([np.zeros(3), turn * t])  # noqa: E731
+            segments = np.stack([k, k + len(k)], 1)
+            pairs.append(Surface(ends.reshape(-1, 3) + middle, segments=segments, path=path, about=middle))
+    above = np.sqrt((0.25 + radius) ** 2 - (radius + 0.5 * gap) ** 2) + 0.02
+    body = body.translated([0.003, above, 0.002])
+
+    def expected(run: Run) -> str | None:
+        way = run.positions[0][:, 1].mean() - run.positions[-1][:, 1].mean()
+        return None if way > 0.5 else f"the ball went {way:.3g} m down"
+
+    return posed(
+        [body],
+        E=1e4,
+        nu=0.4,
+        dt=0.01,
+        steps=300,
+        contact=ds.SelfContact(1e4, width),
+        terms=[r.obstacle(width=width, path=r.path, about=r.about, friction=0.5) for r in pairs],
+        surfaces=pairs,
+        expected=expected,
+        paper=(63.3, 27792, None),
+    )
+
+
+@scene("rods")
+def rods(meshes: Meshes) -> Posed:
+    """Four rods side by side, both ends of all turned against each other about what is between them, 0.2 turns a second."""
+    n, long = (5, 41) if meshes.folder else (3, 17)
+    rod = ds.TetrahedralMesh.create_box((long, n, n), size=(1.0, 0.08, 0.08)).translated([-0.5, -0.04, -0.04])
+    bodies = [rod.translated([0, 0.045 * y, 0.045 * z]) for y in (-1, 1) for z in (-1, 1)]
+    x = np.concatenate([body.vertices for body in bodies])
+    return _twisted(
+        bodies, x, rate=0.4, dt=0.025, steps=400, contact=ds.SelfContact(1e4, 1e-3), paper=(141.5, 202000, None)
+    )
+
+
 # ---- the table -------------------------------------------------------------------------------------------------------
 
 HEAD = (
@@ -570,6 +698,7 @@ HEAD = (
     "tetrahedra",
     "steps",
     "intersections",
+    "on straight ways",
     "rounds",
     "most",
     "s/step",
@@ -587,6 +716,7 @@ def row(run: Run) -> list[str]:
         str(n),
         f"{run.done}/{run.posed.steps}",
         str(run.intersections) + (f" ({run.turned} turned)" if run.turned else ""),
+        str(run.on_the_way),
         f"{np.mean(run.rounds or [np.nan]):.1f}",
         str(max(run.rounds, default=0)),
         f"{seconds.mean():.3g}",
@@ -598,7 +728,7 @@ def row(run: Run) -> list[str]:
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--meshes", help="folder of the paper's meshes")
+    parser.add_argument("--meshes", nargs="+", default=(), help="folders of meshes, first that of the paper's")
     parser.add_argument("--scene", nargs="+", default=None, help="names, or what they begin with")
     parser.add_argument("--steps", type=int, default=None, help="at most so many of each scene")
     parser.add_argument("--list", action="store_true", help="print names and end")
@@ -608,7 +738,7 @@ def main(arguments=None) -> int:
     if given.list:
         print("\n".join(names))
         return 0
-    meshes, good = Meshes(given.meshes), True
+    meshes, good = Meshes(*given.meshes), True
     print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD), flush=True)
 
     def say(run: Run) -> None:
@@ -621,7 +751,7 @@ def main(arguments=None) -> int:
             try:
                 found = run(name, SCENES[name](meshes), given.steps, say=say)
             except (ValueError, TypeError, RuntimeError) as error:
-                print(f"| {name} | | | | | | | | | not posed: {error} |", flush=True)
+                print(f"| {name} | | | | | | | | | | not posed: {error} |", flush=True)
                 good = False
                 continue
         good &= found.verdict == "as expected" and found.intersections == 0

@@ -156,26 +156,65 @@ def test_an_inside_is_refused_and_a_sheet_has_none():
     scene(ds.MeshObstacle(x, t[1:], **BARRIER))  # open
 
 
+ENDS = np.array([[-0.5, -0.3, -1], [0.25, -0.01, -1], [1, -0.3, -1]])
+ROOF = np.concatenate([ENDS, ENDS + [0, 0, 2.5]])
+SHAPE = ["mesh_vertices", "mesh_position", "mesh_radius", "barrier_width"]
+
+
+def over_a_roof(vertices=ROOF, shapeable=True, **options) -> ds.Scene:
+    """A tetrahedron that slides over an edge."""
+    more = BARRIER | dict(width=0.1)
+    roof = ds.MeshObstacle(
+        vertices, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]], radius=0.01, shapeable=shapeable, **more
+    )
+    options = dict(initial_velocities=(1.5, -1.0, 0.0)) | options
+    law = ds.StableNeoHookean(2e4, 0.3)
+    return ds.Scene(tetrahedron(0.1), law, 100.0, [ds.Gravity(), roof], precision="f64", **options)
+
+
 def test_gradients_by_the_shape_through_sliding_over_an_edge():
     """Vertices, place, radius and friction; Taylor's remainder falls with the square of the step."""
-    ends = np.array([[-0.5, -0.3, -1], [0.25, -0.01, -1], [1, -0.3, -1]])
-    roof = np.concatenate([ends, ends + [0, 0, 2.5]])
-    term = ds.MeshObstacle(
-        roof, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]], radius=0.01, shapeable=True, **BARRIER | dict(width=0.1)
-    )
-    law, options = ds.StableNeoHookean(2e4, 0.3), dict(precision="f64", initial_velocities=(1.5, -1.0, 0.0))
-    of = lambda term: ds.Scene(tetrahedron(0.1), law, 100.0, [ds.Gravity(), term], **options)  # noqa: E731
-    names = ["mesh_vertices", "mesh_position", "mesh_radius", "barrier_width"]
-    rollout = ds.Rollout(ds.SemiImplicitSolver(of(term), dt=2e-3, substeps=4), 20, gradients=names)
+    rollout = ds.Rollout(ds.SemiImplicitSolver(over_a_roof(), dt=2e-3, substeps=4), 20, gradients=SHAPE)
     report = ds.check_gradients(rollout, verbose=False)
     assert report.passed and ds.dot_product_test(rollout) < 1e-12
     for row in report.rows:
         assert row.relative_error < 1e-6 and row.analytic != 0, str(report)
-    other = roof + 0.002 * RNG.standard_normal(roof.shape)  # as if it had been made so
+    other = ROOF + 0.002 * RNG.standard_normal(ROOF.shape)  # as if it had been made so
     moved = rollout.forward(mesh_vertices=other).positions
-    again = ds.MeshObstacle(other, term._made.triangles, radius=0.01, **BARRIER | dict(width=0.1))
-    expected = ds.Rollout(ds.SemiImplicitSolver(of(again), dt=2e-3, substeps=4), 20).forward().positions
-    np.testing.assert_allclose(moved, expected, atol=1e-12)
+    again = ds.SemiImplicitSolver(over_a_roof(other, False), dt=2e-3, substeps=4)
+    np.testing.assert_allclose(moved, ds.Rollout(again, 20).forward().positions, atol=1e-12)
+
+
+def test_shapes_in_a_batch_and_in_torch():
+    """Three roofs together are each by itself, to the bit, and torch has the same gradients."""
+    torch = pytest.importorskip("torch")
+    from diffsim_ti.diff_simulator import rollout_frames
+
+    solver = ds.SemiImplicitSolver(over_a_roof(), dt=2e-3, substeps=4)
+    rollout, batch = ds.Rollout(solver, 20, gradients=SHAPE), ds.Batch(solver, 20, 3, gradients=SHAPE)
+    roofs = ROOF + 0.01 * RNG.standard_normal((3, *ROOF.shape))
+    frames = batch.forward(mesh_vertices=roofs)
+    by = RNG.standard_normal(frames.positions.shape)
+    found = batch.vjp(frames, positions=by)["mesh_vertices"]
+    for k in range(3):
+        alone = rollout.forward(mesh_vertices=roofs[k])
+        np.testing.assert_array_equal(frames.positions[k], alone.positions)
+        expected = rollout.vjp(alone, positions=by[k])["mesh_vertices"]
+        np.testing.assert_allclose(found[k], expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    roof = torch.tensor(roofs[2], requires_grad=True)
+    (rollout_frames(rollout, mesh_vertices=roof).positions * torch.as_tensor(by[2])).sum().backward()
+    np.testing.assert_allclose(roof.grad.numpy(), expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("solver", [ds.BDF2Solver, ds.StaticSolver])
+def test_gradients_by_the_shape_in_implicit_steps_and_equilibria(solver):
+    static = solver is ds.StaticSolver
+    options = dict(load_steps=1) if static else dict(dt=1e-2)
+    scene = over_a_roof(**(dict(fixed=[1, 3], initial_velocities=None) if static else {}))
+    rollout = ds.Rollout(solver(scene, tolerance=1e-10, **options), 1 if static else 4, gradients=SHAPE)
+    frames = rollout.forward()
+    assert np.abs(rollout.vjp(frames, positions=frames.positions)["mesh_vertices"]).max() > 1e-5
+    assert ds.dot_product_test(rollout) < 1e-8
 
 
 def test_resolution_is_not_asked_for():

@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from contact_scenes import box_surface
 from impact_judge import Judge
 
 import diffsim_ti as ds
@@ -124,6 +125,26 @@ def test_gaps_are_exact(kind, solver):
         expected = PER_AREA * SIZE**2 / 2 * WIDTH**2 * float(beta(GAP / WIDTH))
         assert stored == pytest.approx(expected, rel=1e-9)
     assert stored > 0
+
+
+def test_what_is_far_away_changes_nothing():
+    """A hundred spikes far from the body: the same bits, by trees that do not hold them."""
+    blade, sides = box_surface(1.0, -0.5)
+    blade = blade * [0.01, 0.4, 0.8] - [0, 0.2 + GAP, 0]
+    places = np.random.default_rng(0).uniform(-1, 1, (100, 3)) + [0, -3, 0]
+    spikes = np.concatenate([blade, *(places[:, None] + 0.1 * np.eye(4, 3))])
+    more = len(blade) + 4 * np.arange(100)[:, None, None] + np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+    found = []
+    for obstacle in (
+        ds.MeshObstacle(blade, sides, **BARRIER),
+        ds.MeshObstacle(spikes, np.concatenate([sides, more.reshape(-1, 3)]), **BARRIER),
+    ):
+        simulator = ds.Simulator(ds.ImplicitEulerSolver(cube(obstacle), dt=1e-3))
+        simulator.run(8)
+        trees = simulator.workspace.pairs.list.trees
+        found.append((simulator.positions, trees[0].held, trees[2].held, trees[2].count))
+    (x, *held, count), (y, *also_held, many) = found
+    assert np.array_equal(x, y) and held == also_held and many == count + 600 and held[1] > 18
 
 
 @lru_cache

@@ -222,7 +222,7 @@ class Potential:
         return SimpleNamespace(tangent=tangent, blocks=blocks, corners=corners)
 
     @cached_property
-    def _barriers(self) -> SimpleNamespace:
+    def barriers(self) -> SimpleNamespace:
         return SimpleNamespace(blocks=runtime.array(self.arrays.vector, 3, self.arrays.num_vertices))
 
     @property
@@ -257,8 +257,8 @@ class Potential:
         a, y = self.arrays, np.zeros_like(w)
         runtime.fill(self.w, w[None])
         if a.contacts:
-            self.launch("contact_blocks", lanes=False, out=self._barriers)
-            blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
+            self.launch("contact_blocks", lanes=False, out=self.barriers)
+            blocks = np.swapaxes(runtime.fetch(self.barriers.blocks).astype(np.float64), 0, 1)
             y += np.einsum("kij,kj->ki", blocks, w)
         if self.pairs:
             self.pairs.hessian_product(self.u, self.w, False)
@@ -272,8 +272,13 @@ class Potential:
         on_host = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None
         if not (self.arrays.contacts or self.pairs):
             return on_host
-        self.launch("contact_blocks", lanes=False, out=self._barriers)
+        self.launch("contact_blocks", lanes=False, out=self.barriers)
         if self.pairs:
-            self.pairs.add_blocks(self.u, self._barriers.blocks)
-        blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
+            self.pairs.add_blocks(self.u, self.barriers.blocks)
+        blocks = np.swapaxes(runtime.fetch(self.barriers.blocks).astype(np.float64), 0, 1)
         return blocks if on_host is None else blocks + on_host
+
+    def obstacle_blocks(self) -> np.ndarray:
+        """The part of obstacles at vertices in `blocks`."""
+        self.launch("contact_blocks", lanes=False, out=self.barriers)
+        return np.swapaxes(runtime.fetch(self.barriers.blocks).astype(np.float64), 0, 1)

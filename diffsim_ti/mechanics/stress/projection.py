@@ -4,7 +4,8 @@ import numpy as np
 
 
 class Projection:
-    """w -> sum over points of V B^T (C+ - C) B w, with C = d2psi/dF2 and C+ the same without negative eigenvalues.
+    """w -> sum over points of V B^T (C+ - C) B w, with C = d2psi/dF2 and C+ the same without negative eigenvalues, and the
+    same of what obstacles do at each vertex: near edges and points they yield sideways.
 
     Only tetrahedra with an eigenvalue below -slight |C| are changed: most of a body that is pressed have slightly negative
     ones, for pressed springs yield sideways, and their neighbours hold them.
@@ -26,10 +27,12 @@ class Projection:
         nodes, N, volumes = potential.stress_points
         self.C = np.einsum("eij,ej,ekj,e->eik", vectors, change, vectors, volumes[some], optimize=True)
         self.N, self.nodes, self.num_vertices = N[some], nodes[some], a.num_vertices
+        blocks = potential.obstacle_blocks() if a.contacts else np.zeros((a.num_vertices, 3, 3))
+        self.raised = without_negative(blocks) - blocks
 
     def matrix(self):
         """The same as a SciPy matrix [N/m]."""
-        from scipy.sparse import coo_matrix
+        from scipy.sparse import bsr_matrix, coo_matrix
 
         C = self.C.reshape(-1, 3, 3, 3, 3)
         blocks = np.einsum("eai,ecidj,ebj->eacbd", self.N, C, self.N, optimize=True)
@@ -38,14 +41,29 @@ class Projection:
             3 * self.num_vertices,
         )
         rows, columns = (x.ravel() for x in np.broadcast_arrays(at[:, :, None], at[:, None]))
-        return coo_matrix((blocks.ravel(), (rows, columns)), shape=(size, size)).tocsr()
+        raised = bsr_matrix((self.raised, np.arange(self.num_vertices), np.arange(self.num_vertices + 1)))
+        out = coo_matrix((blocks.ravel(), (rows, columns)), shape=(size, size)).tocsr() + raised.tocsr()
+        out.eliminate_zeros()
+        return out
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         dH = np.einsum("eac,eaj->ecj", w[self.nodes], self.N)
         dP = np.matmul(self.C, dH.reshape(-1, 9, 1)).reshape(-1, 3, 3)
         forces = np.einsum("ecj,eaj->eac", dP, self.N).reshape(-1, 3)
         at = self.nodes.ravel()
-        return np.stack([np.bincount(at, forces[:, d], self.num_vertices) for d in range(3)], 1)
+        out = np.stack([np.bincount(at, forces[:, d], self.num_vertices) for d in range(3)], 1)
+        return out + np.einsum("vij,vj->vi", self.raised, w)
+
+
+def without_negative(blocks: np.ndarray) -> np.ndarray:
+    """Symmetric blocks, shape (n, k, k), with zero in place of negative eigenvalues."""
+    out = blocks.copy()
+    some = np.flatnonzero(blocks.any((1, 2)))
+    values, vectors = np.linalg.eigh(blocks[some])
+    wrong = values[:, 0] < 0
+    values, vectors = np.maximum(values[wrong], 0), vectors[wrong]
+    out[some[wrong]] = (vectors * values[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return out
 
 
 def has_eigenvalue_below(C: np.ndarray, bound: np.ndarray, chunk: int = 4096) -> np.ndarray:

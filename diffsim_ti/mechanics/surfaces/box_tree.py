@@ -14,6 +14,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.buffers import put
 from diffsim_ti.mesh.geometry import curve_order
 from diffsim_ti.runtime import LANES, NUMPY, Kernel, kernels_of, number_type, vector_type
 
@@ -136,6 +137,11 @@ class BoxKernels:
                 low, high = ti.min(low, lo), ti.max(high, hi)
                 for d in ti.static(range(3)):
                     tree.lanes[6 * k + d][m - GROUP * k], tree.lanes[6 * k + 3 + d][m - GROUP * k] = lo[d], hi[d]
+            if GROUP * k < plan.count:
+                for m in range(plan.count, GROUP * (k + 1)):  # a place left over is nowhere
+                    for d in ti.static(range(3)):
+                        tree.lanes[6 * k + d][m - GROUP * k] = ti.cast(1e30, self.fp)
+                        tree.lanes[6 * k + 3 + d][m - GROUP * k] = ti.cast(-1e30, self.fp)
             tree.boxes[2 * (plan.leaves + k)], tree.boxes[2 * (plan.leaves + k) + 1] = low, high
         ti.loop_config(serialize=not self.parallel)
         for r in range(plan.subtrees):
@@ -156,7 +162,8 @@ class BoxKernels:
 
 
 class BoxTree:
-    """The tree of one kind of primitives (corners: vertices of each, shape (count, 1, 2 or 3))."""
+    """The tree of one kind of primitives (corners: vertices of each, shape (count, 1, 2 or 3)), or of some of them: `held`
+    is how many it holds."""
 
     sort_every = 8  # refits, after which the leaves are put in order anew
 
@@ -164,27 +171,33 @@ class BoxTree:
         self.count, self.size = corners.shape
         self.launch, self._host = launch, corners
         self.kernels = kernels_of(BoxKernels, precision, parallel, self.size)
-        self.groups = -(-self.count // GROUP)
-        self.leaves = 1 << max(self.groups - 1, 1).bit_length()
+        self._hold(self.count)
         self.corners, self.order = runtime.upload(corners.ravel(), ti.i32), runtime.array(ti.i32, self.count)
         self.slacks = runtime.array(self.kernels.vector, self.count)
         # lowest and highest corners: of primitives as they follow each other, and of nodes
         self.items = runtime.array(self.kernels.vector, 2 * self.count)
         self.boxes = runtime.array(self.kernels.vector, 4 * self.leaves)
-        # of primitives leaf by leaf: lowest x of all in it, lowest y, z, highest x, y, z; a place left over is nowhere
-        self.lanes = runtime.upload(
-            np.tile(np.repeat([1e30, -1e30], 3)[:, None], (self.groups, GROUP)), ti.types.vector(GROUP, self.kernels.fp)
-        )
-        self.refits = 0
+        # of primitives leaf by leaf: lowest x of all in it, lowest y, z, highest x, y, z
+        self.lanes = runtime.array(ti.types.vector(GROUP, self.kernels.fp), 6 * self.groups)
+        self.refits, self._those = 0, None
 
-    def refit(self, scene: tuple, slot: int, reach: float) -> None:
+    def _hold(self, count: int) -> None:
+        self.held, self.groups = count, -(-count // GROUP)
+        self.leaves = 1 << max(self.groups - 1, 1).bit_length()
+
+    def refit(self, scene: tuple, slot: int, reach: float, those: np.ndarray | None = None) -> None:
         """Put the boxes where primitives are; all within `reach` [m] + slacks of each other will overlap.
 
-        scene: (record of rest and u, record of place, body and slack).
+        scene: (record of rest and u, record of place, body and slack); those: which primitives it is to hold, all without.
         """
-        if self.refits % self.sort_every == 0:
+        changed = those is not None and not np.array_equal(those, self._those)
+        if self.refits % self.sort_every == 0 or changed:
+            self._those, own = those, slice(None) if those is None else those
             x = runtime.fetch(scene[0].rest) + runtime.fetch(scene[0].u, slot)
-            runtime.fill(self.order, curve_order(x[self._host].mean(1)))
+            middles = x[self._host[own]].mean(1)
+            order = curve_order(middles) if len(middles) else np.zeros(0, int)
+            self._hold(len(order))
+            put(self.order, order if those is None else those[order])
         self.refits += 1
         self.launch(self.kernels.refit, scene=scene, tree=self)(slot=slot, reach=reach, **self._counts())
 
@@ -194,4 +207,4 @@ class BoxTree:
         if not runtime.runs_on_cpu():
             subtrees = max(1, self.leaves // SUBTREES)
             roots = max(1, subtrees // SUBTREES)
-        return dict(count=self.count, leaves=self.leaves, subtrees=subtrees, roots=roots)
+        return dict(count=self.held, leaves=self.leaves, subtrees=subtrees, roots=roots)

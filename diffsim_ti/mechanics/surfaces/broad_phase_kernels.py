@@ -192,7 +192,6 @@ class Piercing:
         for k in range(plan.count):
             e, node = mine.order[k], 1
             i, j, lo, hi = mine.corners[2 * e], mine.corners[2 * e + 1], mine.items[2 * k], mine.items[2 * k + 1]
-            out.pierced[e] = -1
             if e < plan.first:
                 node = 0
             while node > 0:
@@ -212,7 +211,7 @@ class Piercing:
 
     @cached_property
     def find(self) -> Kernel:
-        """pierced[e]: the triangle of largest number that edge e >= first passes through, or -1."""
+        """pierced[e], -1 before: the triangle of largest number that edge e >= first passes through."""
         arrays = dict(scene=PLACE, mine=TREE, theirs=TREE, out=dict(pierced="ints"))
         numbers = dict.fromkeys(("slot", "count", "their_count", "leaves", "first"), "int")
         return Kernel("find_piercing", self.walk, self.precision, arrays, numbers)

@@ -105,6 +105,19 @@ def whole(source) -> np.ndarray:
     return source.to_numpy() if host is None else host
 
 
+def put(array, data: np.ndarray) -> None:
+    """Copy numbers, or vectors by rows, to where an array begins."""
+    host = runtime.view(array)
+    if host is None:
+        padded = np.zeros((array.shape[0], *data.shape[1:]), data.dtype)
+        padded[: len(data)] = data
+        runtime.fill(array, padded)
+    elif data.ndim > 1:
+        host[: len(data), : data.shape[1]] = data
+    else:
+        host[: len(data)] = data
+
+
 class Buffers:
     """Arrays that grow: `take` hands out one of at least the length asked for, by name."""
 

@@ -1,8 +1,12 @@
 """Contact of a surface with itself in implicit solvers: Hessian, and how far a step may go."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.buffers import put, whole
 from diffsim_ti.mechanics.surfaces.hessian_kernels import HessianKernels
 from diffsim_ti.mechanics.surfaces.lagged_friction import LaggedFriction
 from diffsim_ti.mechanics.surfaces.listed_pair import SAFE
@@ -14,6 +18,7 @@ class ImplicitPairs(SurfacePairs):
     """Pairs of a scene in Newton's method, where displacements come in tries, not in passes.
 
     After `place`, the list, the planes, the energies and the last corners of `arrays.corner` are those of that place.
+    Products and diagonals go over the pairs alone that are nearer there than their width, in order: a list has many more.
     """
 
     friction_kind = LaggedFriction
@@ -25,6 +30,7 @@ class ImplicitPairs(SurfacePairs):
         self.hessian = kernels_of(HessianKernels, arrays.precision, self.first, parallel)
         self.step = runtime.array(self.kernels.vec4, 1, arrays.num_vertices)
         self.next = runtime.array(self.kernels.vec4, 1, arrays.num_vertices)
+        self._places, self._acting = runtime.fetch(self.list.place), None
 
     def begin(self, u: np.ndarray) -> None:
         """A new pass from u: from here on all is a function of u, whatever came before."""
@@ -36,8 +42,40 @@ class ImplicitPairs(SurfacePairs):
         """Go to the displacements u[0]."""
         self.ensure(u, 0)
         self.forces(u, 0, self.a.corner)
+        self._acting = None
         if self.friction:
             self.friction.leave()
+
+    def _of_acting(self) -> tuple[SimpleNamespace, dict]:
+        """What takes the place of the list in kernels, with their numbers: the pairs that act where `place` has been."""
+        if self._acting is None:
+            k, count = self.list, self.list.count
+            gaps, at_rest = (whole(x)[:count, 3] for x in (self.plane, self.rest_plane))
+            widest = self.contacts.widths.max() if self.kinematic else self.width
+            own = np.flatnonzero(gaps <= 1.001 * np.minimum(widest, 0.5 * at_rest))
+            corners, num_vt = whole(k.pairs)[: 4 * count].reshape(-1, 4)[own], int(np.searchsorted(own, k.num_vt))
+            meets = self._places[corners.ravel()]
+            counts = np.bincount(meets, minlength=k.num_surface)
+            parts = dict(
+                pairs=(ti.i32, corners.ravel()),
+                row=(ti.i32, np.concatenate([[0], np.cumsum(counts)])),
+                corner_of=(ti.i32, np.argsort(meets, kind="stable")),
+                scale=(self.kernels.fp, whole(k.scale)[own[num_vt:] - k.num_vt]),
+                plane=(self.kernels.vec4, whole(self.plane)[own]),
+                rest_plane=(self.kernels.vec4, whole(self.rest_plane)[own]),
+            )
+            if self.kinematic:
+                parts["area"] = self.kernels.fp, whole(k.area)[own]
+            arrays = {name: k.buffers.take(f"acting {name}", kind, len(x)) for name, (kind, x) in parts.items()}
+            for name, (_, x) in parts.items():
+                put(arrays[name], x)
+            self._acting = SimpleNamespace(**arrays), dict(num_vt=num_vt, num_pairs=len(own))
+        return self._acting
+
+    def run_acting(self, kernel, at: dict, slot: int = 0, **numbers) -> None:
+        """Launch a kernel of pairs on those that act."""
+        acting, sizes = self._of_acting()
+        self.run(kernel, at, acting, slot=slot, **numbers, **sizes)
 
     def energies(self) -> np.ndarray:
         """Energy of each pair [J]."""
@@ -46,8 +84,9 @@ class ImplicitPairs(SurfacePairs):
     def hessian_product(self, u, w, convex: bool) -> None:
         """Change of the forces of contact and friction for changes w[0] of the positions, to the last corners of
         `arrays.corner`."""
+        at = dict(u=u, w=w, out=self.a.corner)
         if convex:
-            self.run(self.hessian.products, dict(u=u, w=w, out=self.a.corner), slot=0)
+            self.run_acting(self.hessian.products, at)
         else:
             self.product(u, 0, w, self.a.corner, has_planes=True)
         if self.friction:
@@ -55,7 +94,7 @@ class ImplicitPairs(SurfacePairs):
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (mechanics/energy/kernels.py)."""
-        self.run(self.hessian.blocks, dict(u=u, out=out), slot=0)
+        self.run_acting(self.hessian.blocks, dict(u=u, out=out))
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the

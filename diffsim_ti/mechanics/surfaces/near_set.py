@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces import part_kernels as kernels
-from diffsim_ti.mechanics.surfaces.buffers import Buffers, Launches, whole
+from diffsim_ti.mechanics.surfaces.buffers import Buffers, Launches, put, whole
 from diffsim_ti.mechanics.surfaces.host_geometry import NODES, SHARES
 from diffsim_ti.runtime import kernels_of
 
@@ -33,19 +33,7 @@ class NearSet:
     def _put(self, of: str, kinds: dict[str, str], **data: np.ndarray) -> None:
         for name, numbers in data.items():
             self._take(of, {name: kinds[name]}, len(numbers))
-            self._write(getattr(self.arrays[of], name), numbers)
-
-    @staticmethod
-    def _write(array, data: np.ndarray) -> None:
-        host = runtime.view(array)
-        if host is None:
-            padded = np.zeros((array.shape[0], *data.shape[1:]), data.dtype)
-            padded[: len(data)] = data
-            runtime.fill(array, padded)
-        elif data.ndim > 1:
-            host[: len(data), :3] = data
-        else:
-            host[: len(data)] = data
+            put(getattr(self.arrays[of], name), numbers)
 
     def _get(self, name: str) -> np.ndarray:
         """Vectors of the nodes."""
@@ -92,13 +80,13 @@ class NearSet:
 
     def begin(self, x: np.ndarray, anew: bool) -> None:
         """A pass begins with nodes at x; anew: and no pair is chosen."""
-        self._write(self.arrays["nodes"].x, x)
+        put(self.arrays["nodes"].x, x)
         if anew:
             runtime.fill(self.arrays["pairs"].chosen, 0)
 
     def choose(self, motion: np.ndarray) -> int:
         """Choose the pairs that come near while nodes move so: how many are new."""
-        self._write(self.arrays["nodes"].motion, motion)
+        put(self.arrays["nodes"].motion, motion)
         self._choose(**self.sizes)
         more, num_vt, num_pairs = (int(x) for x in whole(self.arrays["state"].result)[:3])
         self.acting = self.sizes | self.of_all | dict(num_vt=num_vt, num_pairs=num_pairs)
@@ -106,7 +94,7 @@ class NearSet:
 
     def start(self, motion: np.ndarray) -> None:
         """Parts begin, of a pass in which nodes would move so without contact."""
-        self._write(self.arrays["nodes"].motion, motion)
+        put(self.arrays["nodes"].motion, motion)
         for name in ("e", "b"):
             runtime.fill(getattr(self.arrays["state"], name), 0)
 

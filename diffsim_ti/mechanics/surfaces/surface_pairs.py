@@ -359,7 +359,7 @@ class SurfacePairs:
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False, only=None) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of the rest shape and all parameters).
 
-        has_planes: `forces` were last computed at u[slot]. only: of the pairs of one contact.
+        has_planes: `place` has been at u[slot] (implicit_pairs.py). only: of the pairs of one contact.
         """
         at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
         numbers = dict(d_stiffness=0.0, d_width=0.0, by_rest=int(rest_dot is not None), has_planes=int(has_planes))
@@ -370,7 +370,7 @@ class SurfacePairs:
         elif parameters_dot is not None:
             change = parameters_dot[self.a.parameters_of_self_contact][:2]
             numbers |= dict(zip(("d_stiffness", "d_width"), map(float, change)))
-        self.run(self.kernels.products, at, slot=slot, **numbers)
+        (self.run_acting if has_planes else self.run)(self.kernels.products, at, slot=slot, **numbers)
 
     def clear_sums(self) -> None:
         """Begin a reverse sweep."""

@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.energy.assembled import assemble
+from diffsim_ti.mechanics.stress.projection import without_negative
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, projectors_of
 from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
@@ -64,6 +65,7 @@ class Multigrid(Preconditioner):
         contact = self.potential.contact_blocks()
         if contact is None:
             return
+        contact = without_negative(contact)  # edges and points yield sideways, for which a cycle has no place
         if isinstance(self.free, FreeDirections):
             contact = self.free.around(contact)
         R = self.frames.matrices()

@@ -39,7 +39,9 @@ class MeshObstacle(Obstacle):
 
     Inputs with gradient: "mesh_position", shape (3,), "mesh_radius", "mesh_vertices", shape (k, 3), if it is shapeable, and
     those of every `Obstacle`, whose other arguments it takes. The distance is C1 but where two parts are equally near;
-    where the nearest goes from a face to an edge or a corner the contact's stiffness jumps.
+    where the nearest goes from a face to an edge or a corner the contact's stiffness jumps. A vertex that is pressed into
+    the crease between two faces rests where the force jumps from one to the other: there Newton's method may get no
+    further than a relative residual of 1e-3 to 1e-2, and says so.
     Raises ValueError for vertices or indices that do not fit.
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
     """
