@@ -116,13 +116,15 @@ def _compiled(name: str, arguments: dict, lines: list, scope: dict):
 class Repeated:
     """Kernels one after the other, again and again in one launch: `launch(times, numbers of each kernel)`.
 
-    parts: [(kernel, records)], as of `Kernel.bind`; an array that several of them take is one argument. The body of the
-    first says whether the others are still wanted. On one thread of the processor it is asked each time; elsewhere the
-    others themselves do nothing once they are not wanted, in a list of tasks that names them so often (repeated_loops.py).
+    groups: lists of (kernel, records), as of `Kernel.bind`; an array that several of them take is one argument. The body of
+    the first of a group says whether the others are wanted. On one thread of the processor it is asked each time; elsewhere
+    the others themselves do nothing once they are not wanted, in a list of tasks that names them so often
+    (repeated_loops.py).
     """
 
-    def __init__(self, name: str, parts: list, parallel: bool, vectorized: bool = False):
-        kernels, known, arrays, names = [kernel for kernel, _ in parts], {}, [], []
+    def __init__(self, name: str, groups: list[list], parallel: bool, vectorized: bool = False):
+        parts, known, arrays, names = [part for group in groups for part in group], {}, [], []
+        kernels = [kernel for kernel, _ in parts]
         for k, (kernel, records) in enumerate(parts):
             own = {(b, a): _found(records[b], a) for b, of in kernel.arrays.items() for a in of}
             for (b, a), array in own.items():
@@ -131,7 +133,7 @@ class Repeated:
                     arrays.append(array)
             names.append(tuple((place, known[id(array)]) for place, array in own.items()))
         self._names, one_thread = [kernel.numbers for kernel in kernels], runs_on_cpu() and not parallel
-        made = _repeated_kernel(name, tuple(kernels), tuple(names), one_thread)
+        made = _repeated_kernel(name, tuple(kernels), tuple(names), tuple(map(len, groups)), one_thread)
         title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
         options = dict(title=title, loops=0 if one_thread else -1)
         self._launch = Launch(made, *arrays, vectorized=vectorized, **options)
@@ -146,8 +148,8 @@ class Repeated:
 
 
 @lru_cache(maxsize=None)
-def _repeated_kernel(name: str, kernels: tuple, names: tuple, one_thread: bool):
-    """The first of the kernels says whether it goes on."""
+def _repeated_kernel(name: str, kernels: tuple, names: tuple, sizes: tuple, one_thread: bool):
+    """sizes: of the groups."""
     lines, calls, arrays, numbers, scope = [], [], {}, {}, {}
     for k, (kernel, own) in enumerate(zip(kernels, names)):
         first, call, arguments = kernel.call(f"body{k}", dict(own), f"k{k}_")
@@ -157,10 +159,10 @@ def _repeated_kernel(name: str, kernels: tuple, names: tuple, one_thread: bool):
         scope[f"body{k}"] = kernel.body
         lines, calls = lines + first, [*calls, call]
     if one_thread:
-        inner = [f"    if {calls[0]}:", *(f"        {call}" for call in calls[1:])]
-        lines += ["ti.loop_config(serialize=True)", "for _ in range(times):", *inner]
-    else:
-        lines += calls[1:]
+        lines += ["ti.loop_config(serialize=True)", "for _ in range(times):"]
+    for size in sizes:
+        (asks, *own), calls = calls[:size], calls[size:]
+        lines += [f"    if {asks}:", *(f"        {call}" for call in own)] if one_thread else own
     return _compiled(name, arrays | numbers | dict(times=ti.i32), lines, scope)
 
 

@@ -10,6 +10,7 @@ from diffsim_ti.runtime import PRECISIONS, Kernel
 A = ti.template()
 # places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature, 3 r . z <= 0
 RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST = range(7)
+NUMBERS, ROOM = 8, 48  # of these; of those behind them, which are Newton's method's (newton_kernels.py), too
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,32 @@ class CGKernels:
         """z = D^-1 r; inverse: the columns of each block of D^-1."""
         arrays = dict(cg=dict.fromkeys(("r", "z", "inverse"), "vectors2"))
         return Kernel("scale", self.divide, self.vectors, arrays, dict(nodes="int"))
+
+    @ti.func
+    def inverses(self, cg: A, body: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.nodes):
+            if cg.free[i] > 0:
+                D = ti.Matrix.zero(self.fp, 3, 3)
+                for j, k in ti.static(ti.ndrange(3, 3)):
+                    D[j, k] = ti.cast(out.blocks[j, i][k] + out.blocks[k, i][j], self.fp) * ti.cast(0.5, self.fp)
+                least = D - ti.Matrix.identity(self.fp, 3) * (body.least[i] - body.mass[i])
+                minor = least[0, 0] * least[1, 1] - least[0, 1] * least[1, 0]
+                body.hard[i] = 1
+                if least[0, 0] > 0 and minor > 0 and least.determinant() > 0:
+                    body.hard[i] = 0
+                inverse = (D + ti.Matrix.identity(self.fp, 3) * body.mass[i]).inverse()
+                for j in ti.static(range(3)):
+                    cg.inverse[j, i] = ti.Vector([inverse[0, j], inverse[1, j], inverse[2, j], 0], self.fp)
+
+    @cached_property
+    def invert(self) -> Kernel:
+        """D^-1 of each block of a stiffness with inertia; hard: whether it is less than `least`."""
+        arrays = dict(
+            cg=dict(free="scalars", inverse="vectors2"), body=dict(hard="ints", mass="scalars", least="scalars")
+        )
+        arrays |= dict(out=dict(blocks=f"vectors2_{self.scene}"))
+        return Kernel("invert", self.inverses, self.vectors, arrays, dict(nodes="int"))
 
     @ti.func
     def first(self, cg: A, at: A, plan: A):

@@ -7,7 +7,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Mass
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of
 from diffsim_ti.runtime import PRECISIONS, Repeated, arch_name, array_types, kernels_of, runs_on_cpu
-from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, SQUARE, STOPPED, CGKernels
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, ROOM, SQUARE, STOPPED, CGKernels
 
 
 class DeviceCG:
@@ -30,7 +30,7 @@ class DeviceCG:
         self.length = max(self.shortest, -(-n // self.most_chunks))
         self.chunks = -(-n // self.length)
         self.x, self.r, self.z, self.p, self.q = (runtime.array(self._vector, 1, n) for _ in range(5))
-        self.part, self.state = runtime.array(fp, 3, self.chunks), runtime.array(fp, 8)
+        self.part, self.state = runtime.array(fp, 6, self.chunks), runtime.array(fp, ROOM)
         self.mass, self.free = runtime.array(fp, n), runtime.array(fp, n)
         runtime.fill(self.free, mask_of(free)[:, 0])
         self.guided = isinstance(free, FreeDirections)
@@ -40,9 +40,11 @@ class DeviceCG:
             self.guide, self.held = runtime.upload(guide, ti.i32), self._columns(free.sliding_supports)
         if cycle is None:
             self.inverse = runtime.array(self._vector, 3, n)
-        self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
-        self._is_one_kernel = potential.is_one_kernel and Repeated.is_possible(parallel)
-        whole = runs_on_cpu() and not parallel and self._is_one_kernel
+        self.sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
+        self.is_one_kernel = potential.is_one_kernel and Repeated.is_possible(parallel)
+        whole = runs_on_cpu() and not parallel and self.is_one_kernel
+        # whether rounds of Newton's method are on the device, too
+        self.takes_rounds = self.is_one_kernel and self.precision == "f64"
         # iterations between looks at the state; on a card so many as the solve before took
         self._look, self._last = self.many if whole else 1 if runs_on_cpu() else 0, 10
         self._iterations = {}  # (with a matrix, convex) -> iterate(times, rounding)
@@ -75,32 +77,53 @@ class DeviceCG:
         runtime.fill(self.start, more.indptr)
         runtime.fill(self.column, np.pad(more.indices, (0, self._room - len(more.indices))))
 
+    def parts(self, more: bool) -> list:
+        """(kernel, records, numbers) of an iteration, the first saying whether it is wanted; numbers: None where they are
+        among `sizes` and those of the potential."""
+        own, potential = dict(cg=self, at=self.potential), self.potential
+        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
+        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
+        before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
+        return [*before, (*potential.multiplying, None), (kernels.step, own, None)]
+
     def _iteration(self, more: bool, convex: bool):
         """(times, rounding) -> so many iterations."""
-        potential, sizes, lanes, own = self.potential, self._sizes, runs_on_cpu(), dict(cg=self, at=self.potential)
-        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
-        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
-        before = [*before, (kernels.turn, own, sizes)]
-        if self._is_one_kernel:
-            parts = [(kernels.wanted, own, {}), *before, (*potential.multiplying, None), (kernels.step, own, None)]
-            repeated, sizes_before = (
-                Repeated("cg", [x[:2] for x in parts], self.parallel, lanes),
-                [x[2] for x in parts[:-2]],
-            )
+        parts, lanes = self.parts(more), runs_on_cpu()
+
+        def common(rounding: float) -> dict:
+            return self.potential.sizes() | self.sizes | dict(rounding=rounding)
+
+        if self.is_one_kernel:
+            repeated = Repeated("cg", [[part[:2] for part in parts]], self.parallel, lanes)
+            numbers = [part[2] for part in parts]
             return lambda times, rounding: repeated(
-                times, *sizes_before, potential.sizes(), sizes | dict(rounding=rounding)
+                times, *(common(rounding) if own is None else own for own in numbers)
             )
-        launches = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in before]
-        step = kernels.step.bind(lanes, **own)
+        *before, _, last = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in parts[1:]]
 
         def iterate(times: int, rounding: float) -> None:
+            numbers = common(rounding)
             for _ in range(times):
-                for launch, numbers in launches:
-                    launch(**numbers)
-                potential.multiply(convex)
-                step(**sizes, rounding=rounding)
+                for launch, own in before:
+                    launch(**(own or numbers))
+                self.potential.multiply(convex)
+                last[0](**numbers)
 
         return iterate
+
+    def next_look(self, done: int) -> int:
+        """Iterations until the state is looked at, after so many."""
+        return self._look or max(2, self._last - done, done)
+
+    def took(self, count: int) -> None:
+        """A solve took so many iterations."""
+        self._last = count
+
+    def put_mass(self, mass: Mass) -> None:
+        """c m of the vertices, shape (num_vertices, 1)."""
+        if mass is not self._filled:
+            runtime.fill(self.mass, mass[:, 0])
+            self._filled = mass
 
     def __call__(
         self, mass: Mass, more, convex: bool, b: np.ndarray, tolerance: float, max_iterations: int, eps: float
@@ -118,16 +141,14 @@ class DeviceCG:
         kind = more is not None, convex
         if kind not in self._iterations:
             self._iterations[kind] = self._iteration(*kind)
-        if mass is not self._filled:
-            runtime.fill(self.mass, mass[:, 0])
-            self._filled = mass
+        self.put_mass(mass)
         runtime.fill(self.r, (b / size)[None])
-        state = np.zeros(8)
+        state = np.zeros(ROOM)
         state[LEAST] = tolerance**2
         runtime.fill(self.state, state)
         done = 0
         while done < max_iterations:
-            times = min(self._look or max(2, self._last - done, done), max_iterations - done)
+            times = min(self.next_look(done), max_iterations - done)
             self._iterations[kind](times, 10 * eps)
             done, state = done + times, runtime.fetch(self.state)
             if state[STOPPED] or not np.isfinite(state[SQUARE]):

@@ -18,12 +18,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diffsim_ti.common.errors import NotConverged
-from diffsim_ti.inputs import diagonal_of
+from diffsim_ti.inputs import ConsistentMass, diagonal_of
 from diffsim_ti.mechanics.host_force import NONE, HostForces
 from diffsim_ti.mechanics.obstacles.collision_detection import Met
 from diffsim_ti.mechanics.stress.projection import Projection
-from diffsim_ti.mechanics.supports.free import Free, cleaned, linear_of, mask_of
+from diffsim_ti.mechanics.supports.free import Free, FreeDirections, cleaned, linear_of, mask_of
+from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
+from diffsim_ti.solvers.implicit.newton_kernels import BEFORE, DONE, FLOOR, PHASE
 
 LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction that are doubled while Phi falls
 
@@ -72,7 +74,7 @@ class Newton:
         self,
         potential,
         free: Free,
-        way,
+        collisions,
         preconditioners,
         tolerance: float,
         max_iterations: int,
@@ -83,7 +85,7 @@ class Newton:
         self.volumes = volumes  # of chambers, that are held (multipliers.py), or None
         self.others = others  # host forces without an energy
         self.moves = mask_of(free)  # in some direction
-        self.potential, self.free, self.collisions, self.preconditioners = potential, free, way, preconditioners
+        self.potential, self.free, self.collisions, self.preconditioners = potential, free, collisions, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
         self.report, self.reports = NewtonReport(), []  # of the last solve, of all since the last report
@@ -119,10 +121,19 @@ class Newton:
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
         self.preconditioner, self.stiffness = self.preconditioners(mass)
-        E, norm, rough, solved, far = self._evaluate(u), np.inf, False, False, np.abs(u).max(1, keepdims=True)
-        self.upright = bool(np.all(E[2] > 0))
-        most = self.max_iterations if rounds is None else rounds
+        E, norm, rough, solved, far = None, np.inf, False, False, np.abs(u).max(1, keepdims=True)
+        most, floor = self.max_iterations if rounds is None else rounds, 0.0
         while self._goes_on(most, rounds is None):
+            device = self._on_device() if rounds is None else None
+            if device:
+                u, numbers = device(self, max(most - len(report.residuals), 1))
+                if numbers[PHASE] == DONE and not leave_saddles:
+                    return u
+                u, E, norm, floor = self.potential.place(u), None, numbers[BEFORE] or np.inf, numbers[FLOOR]
+                report.residuals.pop()  # this round goes on here
+            if E is None:
+                E = self._evaluate(u)
+                self.upright = bool(np.all(E[2] > 0))
             (R, size), before = self._residual(u), norm
             rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far) + self.rigid.rounding
             floor = 4 * np.linalg.norm(self._rigidity() * rounding * self.moves)
@@ -163,6 +174,19 @@ class Newton:
             return u
         report.place = u
         raise NotConverged(self._why(report.residuals), report.residuals)
+
+    def _on_device(self) -> DeviceNewton | None:
+        """What takes rounds without the host; None where that takes part in forces or in linear solves."""
+        potential, preconditioner, static = self.potential, self.preconditioner, not diagonal_of(self.mass).any()
+        plain = isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections
+        on_host = potential.pairs or potential.hosts or self.others or self.volumes or self.rigid
+        if not plain or on_host or isinstance(self.mass, ConsistentMass) or not preconditioner.solver.takes_rounds:
+            return None
+        if preconditioner.given_up or static and preconditioner.spent > 2 * preconditioner.patience:
+            return None
+        if preconditioner.rounds is None:
+            preconditioner.rounds = DeviceNewton(potential, preconditioner, self.collisions.detection)
+        return preconditioner.rounds
 
     def _why(self, done: list) -> str:
         """What a solve that failed says, and what helps: more rounds where they gained to the last."""
@@ -349,7 +373,7 @@ class Newton:
     def _safe_share(self, u, d) -> float:
         """The longest step along d in which surfaces stay apart, from obstacles and from each other."""
         pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
-        free, self.report.met = self.collisions(u, d, most)
+        free, self.report.met = self.collisions.past(u, d, most)
         free = min(free, pairs.safe_share(u, d, free)) if pairs else free
         self.report.cuts += free < 1
         return free
@@ -357,7 +381,7 @@ class Newton:
     def is_free(self, u, step) -> bool:
         """Whether nothing is met on the way of a step."""
         pairs = self.potential.pairs
-        return self.collisions(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
+        return self.collisions.past(u, step)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
     def _against_loads(self, u, step) -> float:
         """Change of Phi along a step without those of E and W."""

@@ -32,12 +32,13 @@ class Frames:
             hard=runtime.array(ti.i32, n),
         )
         kernel = kernels_of(FrameKernels, potential.arrays.precision, parallel).frames
-        self._launch = kernel.bind(at=potential, body=self._body, frames=self)
+        numbers = dict(zip(("points", "nodes", "vertices"), self.count))
+        self.part = kernel, dict(at=potential, body=self._body, frames=self), numbers  # of a launch, with others
+        self._launch = kernel.bind(**self.part[1])
 
     def update(self) -> None:
         """To the displacement at which the potential is placed."""
-        points, nodes, vertices = self.count
-        self._launch(points=points, nodes=nodes, vertices=vertices)
+        self._launch(**self.part[2])
         hard = np.nonzero(runtime.fetch(self._body.hard))[0]
         if len(hard):
             R = self.matrices()
