@@ -41,12 +41,12 @@ class DeviceCG:
         if cycle is None:
             self.inverse = runtime.array(self._vector, 3, n)
         self.sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
-        self.is_one_kernel = potential.is_one_kernel and Repeated.is_possible(parallel)
-        whole = runs_on_cpu() and not parallel and self.is_one_kernel
+        self._is_one_kernel = potential.is_one_kernel and Repeated.is_possible(parallel)
+        whole = runs_on_cpu() and not parallel and self._is_one_kernel
         # whether rounds of Newton's method are on the device, too
-        self.takes_rounds = self.is_one_kernel and self.precision == "f64"
+        self.takes_rounds = self._is_one_kernel and self.precision == "f64"
         # iterations between looks at the state; on a card so many as the solve before took
-        self._look, self._last = self.many if whole else 1 if runs_on_cpu() else 0, 10
+        self._look, self.last = self.many if whole else 1 if runs_on_cpu() else 0, 10
         self._iterations = {}  # (with a matrix, convex) -> iterate(times, rounding)
         self._room = -1  # blocks of that matrix
         self._filled: np.ndarray | None = None  # what `mass` holds
@@ -77,53 +77,44 @@ class DeviceCG:
         runtime.fill(self.start, more.indptr)
         runtime.fill(self.column, np.pad(more.indices, (0, self._room - len(more.indices))))
 
-    def parts(self, more: bool) -> list:
-        """(kernel, records, numbers) of an iteration, the first saying whether it is wanted; numbers: None where they are
-        among `sizes` and those of the potential."""
-        own, potential = dict(cg=self, at=self.potential), self.potential
-        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
-        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
-        before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
-        return [*before, (*potential.multiplying, None), (kernels.step, own, None)]
-
     def _iteration(self, more: bool, convex: bool):
         """(times, rounding) -> so many iterations."""
-        parts, lanes = self.parts(more), runs_on_cpu()
-
-        def common(rounding: float) -> dict:
-            return self.potential.sizes() | self.sizes | dict(rounding=rounding)
-
-        if self.is_one_kernel:
-            repeated = Repeated("cg", [[part[:2] for part in parts]], self.parallel, lanes)
-            numbers = [part[2] for part in parts]
-            return lambda times, rounding: repeated(
-                times, *(common(rounding) if own is None else own for own in numbers)
+        potential, sizes, lanes, own = self.potential, self.sizes, runs_on_cpu(), dict(cg=self, at=self.potential)
+        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
+        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
+        before = [*before, (kernels.turn, own, sizes)]
+        if self._is_one_kernel:
+            parts = [(kernels.wanted, own, {}), *before, (*potential.multiplying, None), (kernels.step, own, None)]
+            repeated, sizes_before = (
+                Repeated("cg", [[x[:2] for x in parts]], self.parallel, lanes),
+                [x[2] for x in parts[:-2]],
             )
-        *before, _, last = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in parts[1:]]
+            return lambda times, rounding: repeated(
+                times, *sizes_before, potential.sizes(), sizes | dict(rounding=rounding)
+            )
+        launches = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in before]
+        step = kernels.step.bind(lanes, **own)
 
         def iterate(times: int, rounding: float) -> None:
-            numbers = common(rounding)
             for _ in range(times):
-                for launch, own in before:
-                    launch(**(own or numbers))
-                self.potential.multiply(convex)
-                last[0](**numbers)
+                for launch, numbers in launches:
+                    launch(**numbers)
+                potential.multiply(convex)
+                step(**sizes, rounding=rounding)
 
         return iterate
 
-    def next_look(self, done: int) -> int:
-        """Iterations until the state is looked at, after so many."""
-        return self._look or max(2, self._last - done, done)
-
-    def took(self, count: int) -> None:
-        """A solve took so many iterations."""
-        self._last = count
-
     def put_mass(self, mass: Mass) -> None:
-        """c m of the vertices, shape (num_vertices, 1)."""
+        """c m, shape (num_vertices, 1)."""
         if mass is not self._filled:
             runtime.fill(self.mass, mass[:, 0])
             self._filled = mass
+
+    def iterate(self, done: int, most: int, eps: float, more: bool = False, convex: bool = False) -> None:
+        """Some of at most so many iterations, of which some are done."""
+        if (more, convex) not in self._iterations:
+            self._iterations[more, convex] = self._iteration(more, convex)
+        self._iterations[more, convex](min(self._look or max(2, self.last - done, done), most - done), 10 * eps)
 
     def __call__(
         self, mass: Mass, more, convex: bool, b: np.ndarray, tolerance: float, max_iterations: int, eps: float
@@ -138,9 +129,6 @@ class DeviceCG:
             return np.zeros_like(b), 0.0, 0, None
         if more is not None:
             self._put(more)
-        kind = more is not None, convex
-        if kind not in self._iterations:
-            self._iterations[kind] = self._iteration(*kind)
         self.put_mass(mass)
         runtime.fill(self.r, (b / size)[None])
         state = np.zeros(ROOM)
@@ -148,16 +136,16 @@ class DeviceCG:
         runtime.fill(self.state, state)
         done = 0
         while done < max_iterations:
-            times = min(self.next_look(done), max_iterations - done)
-            self._iterations[kind](times, 10 * eps)
-            done, state = done + times, runtime.fetch(self.state)
+            self.iterate(done, max_iterations, eps, more is not None, convex)
+            state = runtime.fetch(self.state)
+            done = max(done + 1, int(state[COUNT]))
             if state[STOPPED] or not np.isfinite(state[SQUARE]):
                 break
         if state[STOPPED] == 3:  # the preconditioner is not positive definite
             return np.zeros_like(b), np.inf, int(state[COUNT]), None
         if not np.isfinite(state[SQUARE]):
             raise FloatingPointError("the stiffness of this state is not finite")
-        count = self._last = int(state[COUNT])
+        count = self.last = int(state[COUNT])
         negative = None
         if state[STOPPED] == 2:
             negative = runtime.fetch_row(self.p, 0)

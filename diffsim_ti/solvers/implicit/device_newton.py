@@ -13,112 +13,110 @@ class DeviceNewton:
     """Takes rounds of a `Newton` whose forces are all on the device, by the same rules, as long as nothing is unusual: an
     indefinite Hessian, a line search without success and the like are left to the host.
 
-    Kernels are in three groups, for a trial of the line search with its residual, the preconditioner, and an iteration of
-    conjugate gradients. On one thread of the processor all of a solve is one launch; elsewhere a launch is one group.
+    A round is one launch for trials of the line search and the residual of what is taken, some for the preconditioner, and
+    those of conjugate gradients. What comes next is a number on the device, `PHASE`.
     """
 
-    many, most_rounds = 400, 64  # groups in a launch on one thread, which stops by itself; rounds between looks
+    halvings, most_rounds = 50, 64  # trials in a launch on one thread; rounds before the host looks at their residuals
 
     def __init__(self, potential, preconditioner, detection):
         self.potential, self.preconditioner, self.detection = potential, preconditioner, detection
-        self.cg, a, lanes = preconditioner.solver, potential.arrays, runs_on_cpu()
-        cg, n, guided = self.cg, a.num_vertices, isinstance(preconditioner.free, FreeDirections)
-        points, contact = potential.J.shape[0], bool(a.contacts)
-        kernels = kernels_of(NewtonKernels, a.precision, cg.precision, cg.parallel, guided, contact)
-        fp = runtime.PRECISIONS[cg.precision]
-        vector = runtime.array_types(cg.precision)["vectors"].dtype
+        self.cg, a, n = preconditioner.solver, potential.arrays, potential.arrays.num_vertices
+        cg, points, self.contact = self.cg, potential.J.shape[0], bool(a.contacts)
+        guided = isinstance(preconditioner.free, FreeDirections)
+        kernels = kernels_of(NewtonKernels, a.precision, cg.precision, cg.parallel, guided, self.contact)
+        fp, vector = runtime.PRECISIONS[cg.precision], runtime.array_types(cg.precision)["vectors"].dtype
         self.u, self.d, self.R, self.inertial, self.loads = (runtime.array(vector, n) for _ in range(5))
         self.far, self.stiffness, self.history = (runtime.array(fp, k) for k in (n, n, self.most_rounds + 1))
-        self.J, self._stiffness_there = runtime.array(a.fp, points), None
-        self._sizes = dict(chunks=cg.chunks, length=cg.length, nodes=n)
-        self._sizes |= dict(points=points, points_length=-(-points // cg.chunks), count=detection.count)
-        own = dict(cg=cg, at=potential, newton=self)
+        self.J, self._filled = runtime.array(a.fp, points), {}
+        self.sizes = cg.sizes | dict(points=points, points_length=-(-points // cg.chunks), count=detection.count)
+        way, barriers = (detection.way, potential.barriers) if self.contact else (None, None)
+        own = dict(cg=cg, at=potential, newton=(self, way), out=detection.found, barriers=barriers)
         of_potential = dict(scene=a, pass_=potential, at=potential, out=potential)
-        trial, swept = [(kernels.wanted["round"], own, None), (kernels.direction, own, None)], []
-        if contact:
-            own |= dict(newton=(self, detection.way), out=detection.found, barriers=potential.barriers)
-            trial[1] = kernels.direction, own, None
-            of_way = dict(scene=a, way=detection.way, at=potential, out=detection.found)
-            swept = [(detection.kernels.shares, of_way, dict(count=detection.count, most=1.0, kept=detection.kept))]
-            swept += [(kernels.bound, own, None)]
-        trial += [*swept, (kernels.move, own, None), (potential.kernels.energy, of_potential, None)]
-        trial += [(kernels.choose, own, None), (potential.kernels.forces, of_potential, None)]
-        if contact:
-            barriers = of_potential | dict(out=potential.barriers)
-            trial.append((potential.kernels.contact_blocks, barriers, None))
-        trial.append((kernels.judge, own | dict(barriers=potential.barriers if contact else None), None))
-        parts, hard = preconditioner.updating()
-        self._updates = bool(parts)
-        update = [(kernels.wanted["update"], own, None), *parts, (kernels.ready, own | dict(body=hard), None)]
-        solve = [(kernels.wanted["solve"], own, None), *cg.parts(False)[1:]]
-        groups = [trial, *([update] if parts else []), solve]
-        self._whole = lanes and not cg.parallel
-        groups = dict(newton=groups) if self._whole else dict(trial=[trial], update=[update], solve=[solve])
-        self._launches = [self._launch(name, some) for name, some in groups.items()]
+        energies = [(kernels.wants_energies, own), (kernels.direction, own)]
+        residual = [(kernels.wants_residual, own), (potential.kernels.forces, of_potential)]
+        if self.contact:
+            of_way = dict(scene=a, way=way, at=potential, out=detection.found)
+            energies += [(detection.kernels.shares, of_way), (kernels.bound, own)]
+            residual.append((potential.kernels.contact_blocks, of_potential | dict(out=barriers)))
+        energies += [(kernels.move, own), (potential.kernels.energy, of_potential), (kernels.choose, own)]
+        groups = [energies, [*residual, (kernels.judge, own)]]
+        self._trial, self._parts = Repeated("trial", groups, cg.parallel, runs_on_cpu()), sum(map(len, groups))
+        self._trials = self.halvings if runs_on_cpu() and not cg.parallel else 1
+        self._update, hard = preconditioner.updating()
+        if self._update:
+            self._update = [*self._update, lambda ready=kernels.ready.bind(cg=cg, body=hard): ready(**self.sizes)]
 
-    def _launch(self, name: str, groups: list):
-        repeated = Repeated(name, [[part[:2] for part in g] for g in groups], self.cg.parallel, runs_on_cpu())
-        numbers = [part[2] for g in groups for part in g]
-        return lambda times, common: repeated(times, *(common if own is None else own for own in numbers))
+    # ---- what is solved ----------------------------------------------------------------------------------------------
 
-    def _begin(self, newton, most: int) -> np.ndarray:
-        """Tell the device what is solved, from where the potential stands."""
-        cg, state = self.cg, np.zeros(nk.ROOM)
-        cg.put_mass(newton.mass)
-        runtime.fill(self.inertial, newton.inertial)
-        runtime.fill(self.loads, newton.loads)
-        if newton.stiffness is not self._stiffness_there:
-            runtime.fill(self.stiffness, newton.stiffness[:, 0])
-            self._stiffness_there = newton.stiffness
-        state[nk.TOLERANCE], state[nk.EPS] = newton.tolerance, newton.eps
-        state[nk.MOST] = min(most, self.most_rounds)
-        state[nk.LIMIT] = min(10 * cg.nodes, self.preconditioner.patience)
+    def _put(self, name: str, data: np.ndarray) -> None:
+        """Set an array, unless it holds the same object's numbers."""
+        if self._filled.get(name) is not data:
+            runtime.fill(getattr(self, name), data)
+            self._filled[name] = data
+
+    def _begin(self, newton, phase: int, most: int = 0) -> np.ndarray:
+        """Tell the device the problem of a solve, and that it begins where the potential stands."""
+        state = np.zeros(nk.ROOM)
+        self.cg.put_mass(newton.mass)
+        self._put("inertial", newton.inertial)
+        self._put("loads", newton.loads)
+        self._put("stiffness", newton.stiffness.ravel())
+        if self.contact:
+            self.detection.put(newton.collisions.rows[::3])
+        state[nk.TOLERANCE], state[nk.EPS], state[nk.MOST] = newton.tolerance, newton.eps, min(most, self.most_rounds)
+        state[nk.LIMIT] = min(10 * self.cg.nodes, self.preconditioner.patience)
         state[nk.INSIST], state[nk.SHORTEST] = newton.insist, newton.shortest
         state[nk.INEXACT], state[nk.ROUGHEST], state[nk.FRACTION] = newton.inexact, newton.rough, 1.0
-        if self.potential.arrays.contacts:
-            self.detection.put(newton.collisions.rows[::3])
-        runtime.fill(cg.state, state)
+        state[nk.STOPPED], state[nk.PHASE] = nk.WAITS, phase
+        self._common = self.potential.sizes() | self.sizes | dict(most=1.0, kept=self.detection.kept)
         return state
+
+    def _launch(self, state: np.ndarray | None = None) -> None:
+        if state is not None:
+            runtime.fill(self.cg.state, state)
+        self._trial(self._trials, *[self._common] * self._parts)
+
+    # ---- rises of the potential --------------------------------------------------------------------------------------
+
+    def stand(self, newton, u: np.ndarray) -> None:
+        """Measure `rise` from u."""
+        self.potential.place(u)
+        self._based = self._begin(newton, nk.BASE)
+        self._launch(self._based)
+        self._based = runtime.fetch(self.cg.state)
+        self._based[nk.PHASE] = nk.PROBE
+
+    def rise(self, there: np.ndarray) -> float:
+        """How much higher Phi is there; infinite where a tetrahedron changes its volume more than tenfold."""
+        self.potential.place(there)
+        self._launch(self._based)
+        return float(runtime.fetch(self.cg.state)[nk.RISE])
+
+    # ---- rounds ------------------------------------------------------------------------------------------------------
 
     def __call__(self, newton, most: int) -> tuple[np.ndarray, np.ndarray]:
         """(displacement, numbers of newton_kernels.py) after at most so many rounds from where the potential stands, which
         the report of `newton` has; solved where the phase is DONE."""
-        cg, state, tried = self.cg, self._begin(newton, most), False
-        common = self.potential.sizes() | self._sizes | dict(rounding=10 * newton.eps)
+        cg, state, tried, on_host = self.cg, self._begin(newton, nk.START, most), False, runs_on_cpu()
+        runtime.fill(cg.state, state)
         while state[nk.PHASE] < nk.DONE and self._is_going_well(state):
-            phase = state[nk.PHASE]
-            if phase == nk.UPDATE and (tried or not self._updates):
+            phase, trial = state[nk.PHASE], state[nk.PHASE] <= nk.JUDGE or state[nk.STOPPED] == 1
+            if phase == nk.UPDATE and (tried or not self._update):
                 self.preconditioner.update(self.potential.held_at)
-                state[nk.PHASE] = nk.SOLVE
+                state[nk.PHASE], state[nk.STOPPED] = nk.SOLVE, 0
                 runtime.fill(cg.state, state)
-            elif self._whole:
-                self._launches[0](self.many, common)
-            elif phase == nk.UPDATE:
-                self._launches[1](1, common)
-            elif phase == nk.SOLVE and not state[nk.STOPPED]:
-                done = int(state[nk.COUNT])
-                self._launches[2](min(cg.next_look(done), int(state[nk.LIMIT]) - done), common)
-            else:
-                self._launches[0](1, common)
+            elif trial:
+                self._launch()
+            if tried := bool(self._update) and (phase == nk.UPDATE and not tried or trial and not on_host):
+                for launch in self._update:
+                    launch()
+            if phase == nk.SOLVE and not trial or tried and not on_host:
+                cg.iterate(int(state[nk.COUNT]) * (not trial), int(state[nk.LIMIT]), newton.eps)
             state = runtime.fetch(cg.state)
-            tried = state[nk.PHASE] == nk.UPDATE and (self._whole or phase == nk.UPDATE)
-            if state[nk.STOPPED]:
-                cg.took(int(state[nk.COUNT]))
-        solved, report = state[nk.PHASE] == nk.DONE, newton.report
-        self.preconditioner.spent += int(state[nk.PRODUCTS])
-        report.residuals += runtime.fetch(self.history)[: int(state[nk.ROUND])].tolist()
-        report.products, report.trials = (
-            report.products + int(state[nk.PRODUCTS]),
-            report.trials + int(state[nk.TRIALS]),
-        )
-        report.halvings, report.cuts = report.halvings + int(state[nk.HALVINGS]), report.cuts + int(state[nk.CUTS])
-        if state[nk.CUTS]:
-            report.met = self.detection.read()
-        newton.upright = state[nk.UPRIGHT] == 1
-        u = runtime.fetch(self.potential.u)[0] if solved else runtime.fetch(self.u)
-        if solved:
-            self.potential.held_at = u.astype(np.float64)
-        return u.astype(np.float64), state
+            if state[nk.STOPPED] == 1:
+                cg.last = int(state[nk.COUNT])
+        return self._report(newton, state), state
 
     @staticmethod
     def _is_going_well(state: np.ndarray) -> bool:
@@ -126,3 +124,18 @@ class DeviceNewton:
         fails = state[nk.STOPPED] > 1 or not np.isfinite(state[nk.SQUARE])
         fails = fails or (not state[nk.STOPPED] and state[nk.COUNT] >= state[nk.LIMIT])
         return not (state[nk.PHASE] == nk.SOLVE and fails)
+
+    def _report(self, newton, state: np.ndarray) -> np.ndarray:
+        """Note what rounds took; returns where they ended."""
+        solved, report = state[nk.PHASE] == nk.DONE, newton.report
+        self.preconditioner.spent += int(state[nk.PRODUCTS])
+        report.residuals += runtime.fetch(self.history)[: int(state[nk.ROUND])].tolist()
+        for name, place in nk.COUNTED.items():
+            setattr(report, name, getattr(report, name) + int(state[place]))
+        if state[nk.CUTS]:
+            report.met = self.detection.read()
+        newton.upright = state[nk.UPRIGHT] == 1
+        if not solved:
+            return runtime.fetch(self.u).astype(np.float64)
+        self.potential.held_at = runtime.fetch_row(self.potential.u, 0)
+        return self.potential.held_at

@@ -12,6 +12,7 @@ starts need that).
 Kane, Marsden, Ortiz, West 2000, doi:10.1002/1097-0207(20001210)49:10<1295::AID-NME993>3.0.CO;2-W.
 """
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 
@@ -116,11 +117,11 @@ class Newton:
         """
         self.report = report = NewtonReport()
         self.reports.append(report)
-        self.mass, self.inertial, self.loads, self._turning = mass, inertial, loads, False
+        self._turning = False
+        self._pose((mass, inertial, loads))
         u = self.potential.place(start)
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
-        self.preconditioner, self.stiffness = self.preconditioners(mass)
         E, norm, rough, solved, far = None, np.inf, False, False, np.abs(u).max(1, keepdims=True)
         most, floor = self.max_iterations if rounds is None else rounds, 0.0
         while self._goes_on(most, rounds is None):
@@ -387,18 +388,33 @@ class Newton:
         """Change of Phi along a step without those of E and W."""
         return float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
 
-    def rise(self, u: np.ndarray, before: tuple, there: np.ndarray, problem: tuple) -> float:
-        """How much higher Phi is at another place than at u, where the energy was `before`. Forces without an energy do no
-        more work on the way than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+    def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[np.ndarray], float]:
+        """there -> how much higher Phi is at another place than at u. Forces without an energy do no more work on the way
+        than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+        self._pose(problem)
+        device = self._on_device()
+        if device:
+            device.stand(self, u)
+            return device.rise
+        self.potential.place(u)
+        E, _, J0 = self.potential.energy()
+
+        def rise(there: np.ndarray) -> float:
+            step = self.potential.place(there) - u
+            after, _, J = self.potential.energy()
+            if np.any((J0 > 0) & ~((J > 0.1 * J0) & (J < 10 * J0))):
+                return np.inf
+            change = after - E + self._against_loads(u, step)
+            if self.others:
+                change -= min(float((self.others.forces(u) * step).sum()), self.others.work(u, step))
+            return change
+
+        return rise
+
+    def _pose(self, problem: tuple) -> None:
+        """What is solved: mass, inertial and loads of `solve`."""
         self.mass, self.inertial, self.loads = problem
-        step = self.potential.place(there) - u
-        (after, _, J), (E, _, J0) = self.potential.energy(), before
-        if np.any((J0 > 0) & ~((J > 0.1 * J0) & (J < 10 * J0))):
-            return np.inf
-        change = after - E + self._against_loads(u, step)
-        if self.others:
-            change -= min(float((self.others.forces(u) * step).sum()), self.others.work(u, step))
-        return change
+        self.preconditioner, self.stiffness = self.preconditioners(self.mass)
 
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in

@@ -11,16 +11,15 @@ from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, NUMBERS, ROOM, 
 A = ti.template()
 # places of numbers in `state`, behind those of conjugate gradients: what is done next; norms of the residual and what
 # measures them; of the line search; potential and the sum of its absolute parts, before and where it is tried; of the report
-(PHASE, NORM, BEFORE, SIZE, FLOOR, ROUGH, SLOPE, FRACTION, LONGEST, MET, FRESH, DOUBTED, ACCEPTED) = range(
-    NUMBERS, NUMBERS + 13
-)
-(E, PARTS, E_TRIED, PARTS_TRIED, UPRIGHT, ROUND, PRODUCTS, TRIALS, HALVINGS, CUTS) = range(ACCEPTED + 1, ACCEPTED + 11)
+(PHASE, NORM, BEFORE, FLOOR, ROUGH, SLOPE, FRACTION, FRESH, DOUBTED, ACCEPTED, RISE) = range(NUMBERS, NUMBERS + 11)
+(E, PARTS, E_TRIED, PARTS_TRIED, UPRIGHT, ROUND, PRODUCTS, TRIALS, HALVINGS, CUTS) = range(RISE + 1, RISE + 11)
 # what a solve is told: tolerances, limits, and numbers of `Newton`
 (TOLERANCE, EPS, MOST, LIMIT, INSIST, INEXACT, ROUGHEST, SHORTEST) = range(CUTS + 1, CUTS + 9)
-assert SHORTEST < ROOM
-# phases: the energy where the solve starts, a trial of the line search, its residual, the preconditioner, conjugate
-# gradients; then ends: it is solved, or the host has to go on
-START, TRY, JUDGE, UPDATE, SOLVE, DONE, TROUBLE = range(7)
+COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
+# phases: energies where rises are measured from, and of one; where a solve starts, a trial of the line search, its residual, the
+# preconditioner, conjugate gradients; then ends: it is done, or the host has to go on
+BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE, DONE, TROUBLE = range(9)
+WAITS = 4  # of STOPPED: conjugate gradients have not begun
 
 
 @dataclass(frozen=True)
@@ -51,26 +50,23 @@ class NewtonKernels:
     def end(self, c, length, count):
         return ti.min((c + 1) * length, count)
 
-    # ---- which group of kernels is wanted ----------------------------------------------------------------------------
-
     @ti.func
-    def is_round(self, cg: A, plan: A):
-        return cg.state[PHASE] <= JUDGE or (cg.state[PHASE] == SOLVE and cg.state[STOPPED] == 1)
-
-    @ti.func
-    def is_update(self, cg: A, plan: A):
-        return cg.state[PHASE] == UPDATE
-
-    @ti.func
-    def is_solve(self, cg: A, plan: A):
-        return cg.state[PHASE] == SOLVE and cg.state[STOPPED] == 0 and cg.state[COUNT] < cg.state[LIMIT]
+    def is_trial(self, cg: A, plan: A):
+        return cg.state[PHASE] <= TRY or (cg.state[PHASE] == SOLVE and cg.state[STOPPED] == 1)
 
     @cached_property
-    def wanted(self) -> dict[str, Kernel]:
-        """Whether a group is, for `Repeated`."""
-        asks = dict(round=self.is_round, update=self.is_update, solve=self.is_solve)
-        own = dict(cg=dict(state="scalars"))
-        return {name: Kernel(f"is_{name}", function, self.vectors, own, {}) for name, function in asks.items()}
+    def wants_energies(self) -> Kernel:
+        """Whether something is tried, for `Repeated`."""
+        return Kernel("wants_energies", self.is_trial, self.vectors, dict(cg=dict(state="scalars")), {})
+
+    @ti.func
+    def is_judged(self, cg: A, plan: A):
+        return cg.state[PHASE] == JUDGE
+
+    @cached_property
+    def wants_residual(self) -> Kernel:
+        """Whether it may be taken."""
+        return Kernel("wants_residual", self.is_judged, self.vectors, dict(cg=dict(state="scalars")), {})
 
     # ---- line search -------------------------------------------------------------------------------------------------
 
@@ -94,7 +90,7 @@ class NewtonKernels:
             if cg.state[PHASE] == SOLVE and cg.state[STOPPED] == 1:
                 cg.state[PHASE], cg.state[FRESH] = ti.cast(TRY, self.fp), ti.cast(1, self.fp)
                 cg.state[SLOPE] = self.cg.total(cg.part, 0, plan.chunks)
-                cg.state[LONGEST], cg.state[FRACTION] = ti.cast(1, self.fp), ti.cast(1, self.fp)
+                cg.state[FRACTION] = ti.cast(1, self.fp)
                 cg.state[PRODUCTS] = cg.state[PRODUCTS] + cg.state[COUNT]
 
     @cached_property
@@ -109,13 +105,9 @@ class NewtonKernels:
         ti.loop_config(serialize=True)
         for _ in range(1):
             if cg.state[FRESH] == 1:
-                least, met = ti.cast(1, self.fp), -1
                 for j in range(plan.count):
-                    if out.found[j] < least:
-                        least, met = ti.cast(out.found[j], self.fp), j
-                cg.state[LONGEST], cg.state[FRACTION] = least, least
-                cg.state[MET] = ti.cast(met, self.fp)
-                if met >= 0:
+                    cg.state[FRACTION] = ti.min(cg.state[FRACTION], ti.cast(out.found[j], self.fp))
+                if cg.state[FRACTION] < 1:
                     cg.state[CUTS] = cg.state[CUTS] + ti.cast(1, self.fp)
 
     @cached_property
@@ -128,7 +120,7 @@ class NewtonKernels:
     def go(self, cg: A, newton: A, at: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
-            if cg.state[PHASE] == START:
+            if cg.state[PHASE] == BASE or cg.state[PHASE] == START:
                 u, most = self.cg.to(self.fp, at.u[0, i]), ti.cast(0, self.fp)
                 for k in ti.static(range(3)):
                     most = ti.max(most, ti.abs(u[k]))
@@ -152,10 +144,10 @@ class NewtonKernels:
             e, J = ti.cast(at.elastic[k], self.fp), at.J[k]
             value += e
             size += ti.abs(e)
-            if not J > newton.J[k] * ti.cast(0.1, PRECISIONS[self.scene]):
-                flat += ti.cast(1, self.fp)
-            if not J > 0:
-                turned += ti.cast(1, self.fp)
+            least, most = newton.J[k] * ti.cast(0.1, PRECISIONS[self.scene]), newton.J[k] * 10
+            if not J > least or (cg.state[PHASE] == PROBE and not J < most):
+                flat += ti.cast(cg.state[PHASE] != PROBE or newton.J[k] > 0, self.fp)
+            turned += ti.cast(not J > 0, self.fp)
         for i in range(c * plan.length, self.end(c, plan.length, plan.nodes)):
             e, u = ti.cast(at.contact[i], self.fp), self.cg.to(self.fp, at.u[0, i])
             value += e
@@ -172,17 +164,24 @@ class NewtonKernels:
         """Whether what is tried lowers the potential (`Newton._search`)."""
         value, size = self.cg.total(cg.part, 0, plan.chunks), self.cg.total(cg.part, 1, plan.chunks)
         cg.state[E_TRIED], cg.state[PARTS_TRIED], cg.state[DOUBTED] = value, size, ti.cast(0, self.fp)
-        cg.state[TRIALS] = cg.state[TRIALS] + ti.cast(1, self.fp)
-        if cg.state[PHASE] == START:
-            cg.state[UPRIGHT] = ti.cast(0, self.fp)
-            if self.cg.total(cg.part, 3, plan.chunks) == 0:
-                cg.state[UPRIGHT] = ti.cast(1, self.fp)
-            cg.state[PHASE] = ti.cast(JUDGE, self.fp)
+        cg.state[ACCEPTED] = ti.cast(0, self.fp)
+        change = value - cg.state[E] + self.cg.total(cg.part, 4, plan.chunks)
+        flat = self.cg.total(cg.part, 2, plan.chunks) > 0
+        if cg.state[PHASE] == BASE:
+            cg.state[E], cg.state[PARTS], cg.state[ACCEPTED] = value, size, ti.cast(1, self.fp)
+            cg.state[PHASE] = ti.cast(DONE, self.fp)
+        elif cg.state[PHASE] == PROBE:
+            cg.state[RISE], cg.state[PHASE] = change, ti.cast(DONE, self.fp)
+            if flat:
+                cg.state[RISE] = ti.cast(ti.math.inf, self.fp)
+        elif cg.state[PHASE] == START:
+            cg.state[UPRIGHT] = ti.cast(self.cg.total(cg.part, 3, plan.chunks) == 0, self.fp)
+            cg.state[PHASE], cg.state[TRIALS] = ti.cast(JUDGE, self.fp), ti.cast(1, self.fp)
         else:
-            change = value - cg.state[E] + self.cg.total(cg.part, 4, plan.chunks)
+            cg.state[TRIALS] = cg.state[TRIALS] + ti.cast(1, self.fp)
             noise = cg.state[EPS] * 10 * (cg.state[PARTS] + size + self.cg.total(cg.part, 5, plan.chunks))
             upright = cg.state[UPRIGHT] == 1 and cg.state[FRACTION] > cg.state[INSIST]
-            admissible = not upright or self.cg.total(cg.part, 2, plan.chunks) == 0
+            admissible = not (upright and flat)
             if admissible and change <= cg.state[FRACTION] * cg.state[SLOPE] * ti.cast(-1e-4, self.fp):
                 cg.state[PHASE] = ti.cast(JUDGE, self.fp)
             elif admissible and ti.abs(cg.state[SLOPE]) * cg.state[FRACTION] <= noise and change <= noise:
@@ -206,6 +205,10 @@ class NewtonKernels:
         for _ in range(1):
             if cg.state[PHASE] <= TRY:
                 self.decide(cg, plan)
+        ti.loop_config(serialize=not self.parallel)
+        for k in range(plan.points):
+            if cg.state[ACCEPTED] == 1:
+                newton.J[k] = at.J[k]
 
     @cached_property
     def choose(self) -> Kernel:
@@ -254,7 +257,7 @@ class NewtonKernels:
         cg.state[ACCEPTED], cg.state[BEFORE] = one, cg.state[NORM]
         norm, size = ti.sqrt(self.cg.total(cg.part, 0, plan.chunks)), ti.sqrt(self.cg.total(cg.part, 1, plan.chunks))
         floor = ti.sqrt(self.cg.total(cg.part, 2, plan.chunks)) * 4
-        cg.state[NORM], cg.state[SIZE], cg.state[FLOOR] = norm, size, floor
+        cg.state[NORM], cg.state[FLOOR] = norm, floor
         relative = norm
         if size > 0:
             relative = norm / size
@@ -283,7 +286,7 @@ class NewtonKernels:
                 cg.state[ROUGH] = one
             forcing = ti.max(forcing, cg.state[EPS] * 10)
             cg.state[LEAST], cg.state[PHASE] = forcing * forcing, ti.cast(UPDATE, self.fp)
-            cg.state[STOPPED], cg.state[COUNT], cg.state[SQUARE] = ti.cast(0, self.fp), ti.cast(0, self.fp), one
+            cg.state[STOPPED], cg.state[COUNT], cg.state[SQUARE] = ti.cast(WAITS, self.fp), ti.cast(0, self.fp), one
 
     @ti.func
     def weigh(self, cg: A, newton: A, at: A, barriers: A, plan: A):
@@ -330,7 +333,7 @@ class NewtonKernels:
             for i in range(plan.nodes):
                 hard = hard | body.hard[i]
             if cg.state[PHASE] == UPDATE and hard == 0:
-                cg.state[PHASE] = ti.cast(SOLVE, self.fp)
+                cg.state[PHASE], cg.state[STOPPED] = ti.cast(SOLVE, self.fp), ti.cast(0, self.fp)
 
     @cached_property
     def ready(self) -> Kernel:
