@@ -99,10 +99,11 @@ class Launch:
             self._buffer.restore()
         known = self._set
         for k, (setter, index, is_float) in enumerate(self._setters):
-            if is_float or numbers[k] != known[k]:  # a third of a microsecond each
+            number = numbers[k]
+            if number is not known[k] and (is_float or number != known[k]):  # a third of a microsecond each
                 known[k] = None  # also if this is interrupted
-                setter(index, numbers[k])
-                known[k] = numbers[k]
+                setter(index, number)
+                known[k] = number
         if self._repeated:
             with self._repeated.times(numbers[-1]):
                 self._owner().launch_kernel(self._code, self._context)

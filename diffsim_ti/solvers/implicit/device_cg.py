@@ -79,20 +79,15 @@ class DeviceCG:
 
     def _iteration(self, more: bool, convex: bool):
         """(times, rounding) -> so many iterations."""
-        potential, sizes, lanes, own = self.potential, self.sizes, runs_on_cpu(), dict(cg=self, at=self.potential)
+        potential, lanes, own = self.potential, runs_on_cpu(), dict(cg=self, at=self.potential)
         kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
-        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
-        before = [*before, (kernels.turn, own, sizes)]
+        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
+        before, last = [*before, (kernels.turn, own, None)], (kernels.step, own, None)
         if self._is_one_kernel:
-            parts = [(kernels.wanted, own, {}), *before, (*potential.multiplying, None), (kernels.step, own, None)]
-            repeated, sizes_before = (
-                Repeated("cg", [[x[:2] for x in parts]], self.parallel, lanes),
-                [x[2] for x in parts[:-2]],
-            )
-            return lambda times, rounding: repeated(
-                times, *sizes_before, potential.sizes(), sizes | dict(rounding=rounding)
-            )
-        launches = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in before]
+            parts = [(kernels.wanted, own, None), *before, (*potential.multiplying, None), last]
+            repeated = Repeated("cg", [parts], self.parallel, lanes)
+            return lambda times, rounding: repeated(times, **potential.sizes(), **self.sizes, rounding=rounding)
+        launches = [(kernel.bind(lanes, **records), numbers or self.sizes) for kernel, records, numbers in before]
         step = kernels.step.bind(lanes, **own)
 
         def iterate(times: int, rounding: float) -> None:
@@ -100,7 +95,7 @@ class DeviceCG:
                 for launch, numbers in launches:
                     launch(**numbers)
                 potential.multiply(convex)
-                step(**sizes, rounding=rounding)
+                step(**self.sizes, rounding=rounding)
 
         return iterate
 

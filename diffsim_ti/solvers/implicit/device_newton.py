@@ -6,6 +6,7 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.supports.free import FreeDirections
 from diffsim_ti.runtime import Repeated, kernels_of, runs_on_cpu
 from diffsim_ti.solvers.implicit import newton_kernels as nk
+from diffsim_ti.solvers.implicit.cg_kernels import ROOM
 from diffsim_ti.solvers.implicit.newton_kernels import NewtonKernels
 
 
@@ -33,19 +34,20 @@ class DeviceNewton:
         way, barriers = (detection.way, potential.barriers) if self.contact else (None, None)
         own = dict(cg=cg, at=potential, newton=(self, way), out=detection.found, barriers=barriers)
         of_potential = dict(scene=a, pass_=potential, at=potential, out=potential)
-        energies = [(kernels.wants_energies, own), (kernels.direction, own)]
-        residual = [(kernels.wants_residual, own), (potential.kernels.forces, of_potential)]
+        energies, forces = [(kernels.wants_energies, own), (kernels.direction, own)], potential.kernels.forces
+        residual = [(kernels.wants_residual, own), (forces, of_potential)]
         if self.contact:
             of_way = dict(scene=a, way=way, at=potential, out=detection.found)
             energies += [(detection.kernels.shares, of_way), (kernels.bound, own)]
             residual.append((potential.kernels.contact_blocks, of_potential | dict(out=barriers)))
         energies += [(kernels.move, own), (potential.kernels.energy, of_potential), (kernels.choose, own)]
-        groups = [energies, [*residual, (kernels.judge, own)]]
-        self._trial, self._parts = Repeated("trial", groups, cg.parallel, runs_on_cpu()), sum(map(len, groups))
+        groups = [[(*part, None) for part in group] for group in (energies, [*residual, (kernels.judge, own)])]
+        self._trial = Repeated("trial", groups, cg.parallel, runs_on_cpu())
         self._trials = self.halvings if runs_on_cpu() and not cg.parallel else 1
         self._update, hard = preconditioner.updating()
         if self._update:
-            self._update = [*self._update, lambda ready=kernels.ready.bind(cg=cg, body=hard): ready(**self.sizes)]
+            ready = kernels.ready.bind(cg=cg, body=hard)
+            self._update = [*self._update, lambda: ready(**self.sizes)]
 
     # ---- what is solved ----------------------------------------------------------------------------------------------
 
@@ -57,7 +59,7 @@ class DeviceNewton:
 
     def _begin(self, newton, phase: int, most: int = 0) -> np.ndarray:
         """Tell the device the problem of a solve, and that it begins where the potential stands."""
-        state = np.zeros(nk.ROOM)
+        state = np.zeros(ROOM)
         self.cg.put_mass(newton.mass)
         self._put("inertial", newton.inertial)
         self._put("loads", newton.loads)
@@ -69,13 +71,13 @@ class DeviceNewton:
         state[nk.INSIST], state[nk.SHORTEST] = newton.insist, newton.shortest
         state[nk.INEXACT], state[nk.ROUGHEST], state[nk.FRACTION] = newton.inexact, newton.rough, 1.0
         state[nk.STOPPED], state[nk.PHASE] = nk.WAITS, phase
-        self._common = self.potential.sizes() | self.sizes | dict(most=1.0, kept=self.detection.kept)
+        self._numbers = self.potential.sizes() | self.sizes | dict(most=1.0, kept=self.detection.kept)
         return state
 
     def _launch(self, state: np.ndarray | None = None) -> None:
         if state is not None:
             runtime.fill(self.cg.state, state)
-        self._trial(self._trials, *[self._common] * self._parts)
+        self._trial(self._trials, **self._numbers)
 
     # ---- rises of the potential --------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.runtime import PRECISIONS, Kernel, kernels_of
-from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, NUMBERS, ROOM, SQUARE, STOPPED, CGKernels
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, NUMBERS, SQUARE, STOPPED, CGKernels
 
 A = ti.template()
 # places of numbers in `state`, behind those of conjugate gradients: what is done next; norms of the residual and what
@@ -16,8 +16,8 @@ A = ti.template()
 # what a solve is told: tolerances, limits, and numbers of `Newton`
 (TOLERANCE, EPS, MOST, LIMIT, INSIST, INEXACT, ROUGHEST, SHORTEST) = range(CUTS + 1, CUTS + 9)
 COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
-# phases: energies where rises are measured from, and of one; where a solve starts, a trial of the line search, its residual, the
-# preconditioner, conjugate gradients; then ends: it is done, or the host has to go on
+# phases: energies where rises are measured from, and of one; where a solve starts, a trial of the line search, its
+# residual, the preconditioner, conjugate gradients; then ends: it is done, or the host has to go on
 BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE, DONE, TROUBLE = range(9)
 WAITS = 4  # of STOPPED: conjugate gradients have not begun
 
