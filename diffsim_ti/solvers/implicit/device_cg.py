@@ -1,5 +1,7 @@
 """Conjugate gradients on the device: of what crosses to the host, a few numbers every few iterations."""
 
+from collections.abc import Callable
+
 import numpy as np
 import taichi as ti
 
@@ -7,7 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Mass
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of
 from diffsim_ti.runtime import PRECISIONS, Repeated, arch_name, array_types, kernels_of, runs_on_cpu
-from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, ROOM, SQUARE, STOPPED, CGKernels
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, LIMIT, ROOM, SQUARE, STOPPED, CGKernels
 
 
 class DeviceCG:
@@ -70,25 +72,34 @@ class DeviceCG:
         """A matrix of blocks that joins the Hessian."""
         more = more.tobsr((3, 3))
         if len(more.data) > self._room:
-            self._room, self._iterations = max(2 * len(more.data), 1), {}
+            self._room = max(2 * len(more.data), 1)
+            self._iterations = {kind: own for kind, own in self._iterations.items() if not kind[0]}
             self.start, self.column = runtime.array(ti.i32, self.nodes + 1), runtime.array(ti.i32, self._room)
             self.blocks = self._columns(more.data, self._room)
         self._fill(self.blocks, more.data)
         runtime.fill(self.start, more.indptr)
         runtime.fill(self.column, np.pad(more.indices, (0, self._room - len(more.indices))))
 
-    def _iteration(self, more: bool, convex: bool):
-        """(times, rounding) -> so many iterations."""
-        potential, lanes, own = self.potential, runs_on_cpu(), dict(cg=self, at=self.potential)
+    def parts(self, more: bool) -> list:
+        """An iteration, as [(kernel, records, numbers)] of `Repeated`."""
+        potential, own = self.potential, dict(cg=self, at=self.potential)
         kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
-        before, last = [*before, (kernels.turn, own, None)], (kernels.step, own, None)
+        before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
+        return [*before, (*potential.multiplying, None), (kernels.step, own, None)]
+
+    def serve(self, iterate: Callable) -> None:
+        """Let what serves Newton's method, too, make iterations: (times, rounding) -> so many."""
+        self._iterations[False, False] = iterate
+
+    def _iteration(self, more: bool, convex: bool):
+        """(times, rounding) -> so many iterations."""
+        parts, potential, lanes = self.parts(more), self.potential, runs_on_cpu()
         if self._is_one_kernel:
-            parts = [(kernels.wanted, own, None), *before, (*potential.multiplying, None), last]
             repeated = Repeated("cg", [parts], self.parallel, lanes)
             return lambda times, rounding: repeated(times, **potential.sizes(), **self.sizes, rounding=rounding)
-        launches = [(kernel.bind(lanes, **records), numbers or self.sizes) for kernel, records, numbers in before]
-        step = kernels.step.bind(lanes, **own)
+        launches = [(kernel.bind(lanes, **records), numbers or self.sizes) for kernel, records, numbers in parts[1:-2]]
+        step = parts[-1][0].bind(lanes, **parts[-1][1])
 
         def iterate(times: int, rounding: float) -> None:
             for _ in range(times):
@@ -127,7 +138,7 @@ class DeviceCG:
         self.put_mass(mass)
         runtime.fill(self.r, (b / size)[None])
         state = np.zeros(ROOM)
-        state[LEAST] = tolerance**2
+        state[LEAST], state[LIMIT] = tolerance**2, max_iterations
         runtime.fill(self.state, state)
         done = 0
         while done < max_iterations:

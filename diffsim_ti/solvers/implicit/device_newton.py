@@ -1,12 +1,14 @@
 """Rounds of Newton's method on the device: of what crosses to the host, a few numbers a round."""
 
+import weakref
+
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.supports.free import FreeDirections
 from diffsim_ti.runtime import Repeated, kernels_of, runs_on_cpu
 from diffsim_ti.solvers.implicit import newton_kernels as nk
-from diffsim_ti.solvers.implicit.cg_kernels import ROOM
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LIMIT, ROOM, SQUARE, STOPPED
 from diffsim_ti.solvers.implicit.newton_kernels import NewtonKernels
 
 
@@ -14,14 +16,16 @@ class DeviceNewton:
     """Takes rounds of a `Newton` whose forces are all on the device, by the same rules, as long as nothing is unusual: an
     indefinite Hessian, a line search without success and the like are left to the host.
 
-    A round is one launch for trials of the line search and the residual of what is taken, some for the preconditioner, and
-    those of conjugate gradients. What comes next is a number on the device, `PHASE`.
+    A round is a launch for a trial of the line search and the residual of what is taken, some for the preconditioner, and
+    those of conjugate gradients; on one thread of the processor they are one kernel, and a solve is a launch or few. What
+    comes next is a number on the device, `PHASE`.
     """
 
-    halvings, most_rounds = 50, 64  # trials in a launch on one thread; rounds before the host looks at their residuals
+    many, most_rounds = 200, 64  # phases in a launch on one thread; rounds before the host looks at their residuals
 
     def __init__(self, potential, preconditioner, detection):
-        self.potential, self.preconditioner, self.detection = potential, preconditioner, detection
+        self.potential, self.detection = potential, detection
+        self.preconditioner = weakref.proxy(preconditioner)  # which holds this: no circle
         self.cg, a, n = preconditioner.solver, potential.arrays, potential.arrays.num_vertices
         cg, points, self.contact = self.cg, potential.J.shape[0], bool(a.contacts)
         guided = isinstance(preconditioner.free, FreeDirections)
@@ -34,20 +38,29 @@ class DeviceNewton:
         way, barriers = (detection.way, potential.barriers) if self.contact else (None, None)
         own = dict(cg=cg, at=potential, newton=(self, way), out=detection.found, barriers=barriers)
         of_potential = dict(scene=a, pass_=potential, at=potential, out=potential)
-        energies, forces = [(kernels.wants_energies, own), (kernels.direction, own)], potential.kernels.forces
-        residual = [(kernels.wants_residual, own), (forces, of_potential)]
+        forces, (tries, judges, updates) = potential.kernels.forces, kernels.wanted
+        energies, residual = [(tries, own), (kernels.direction, own)], [(judges, own), (forces, of_potential)]
         if self.contact:
             of_way = dict(scene=a, way=way, at=potential, out=detection.found)
             energies += [(detection.kernels.shares, of_way), (kernels.bound, own)]
             residual.append((potential.kernels.contact_blocks, of_potential | dict(out=barriers)))
         energies += [(kernels.move, own), (potential.kernels.energy, of_potential), (kernels.choose, own)]
         groups = [[(*part, None) for part in group] for group in (energies, [*residual, (kernels.judge, own)])]
-        self._trial = Repeated("trial", groups, cg.parallel, runs_on_cpu())
-        self._trials = self.halvings if runs_on_cpu() and not cg.parallel else 1
-        self._update, hard = preconditioner.updating()
-        if self._update:
-            ready = kernels.ready.bind(cg=cg, body=hard)
-            self._update = [*self._update, lambda: ready(**self.sizes)]
+        update, hard = preconditioner.updating()
+        update = [*update, (kernels.ready, dict(cg=cg, body=hard), None)] if update else []
+        self.whole, self._update, lanes = runs_on_cpu() and not cg.parallel, [], runs_on_cpu()
+        if self.whole:
+            groups += [[(updates, own, None), *update]] if update else []
+            groups.append(cg.parts(False))
+        else:
+            self._update = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in update]
+        repeated, always = (
+            Repeated("newton", groups, cg.parallel, lanes),
+            self.sizes | dict(most=1.0, kept=detection.kept),
+        )
+        self._launch = launch = lambda times, **numbers: repeated(times, **always, **numbers)
+        if self.whole:
+            cg.serve(lambda times, rounding: launch(times, **potential.sizes(), rounding=rounding))
 
     # ---- what is solved ----------------------------------------------------------------------------------------------
 
@@ -67,64 +80,63 @@ class DeviceNewton:
         if self.contact:
             self.detection.put(newton.collisions.rows[::3])
         state[nk.TOLERANCE], state[nk.EPS], state[nk.MOST] = newton.tolerance, newton.eps, min(most, self.most_rounds)
-        state[nk.LIMIT] = min(10 * self.cg.nodes, self.preconditioner.patience)
+        state[LIMIT] = min(10 * self.cg.nodes, self.preconditioner.patience)
         state[nk.INSIST], state[nk.SHORTEST] = newton.insist, newton.shortest
         state[nk.INEXACT], state[nk.ROUGHEST], state[nk.FRACTION] = newton.inexact, newton.rough, 1.0
-        state[nk.STOPPED], state[nk.PHASE] = nk.WAITS, phase
-        self._numbers = self.potential.sizes() | self.sizes | dict(most=1.0, kept=self.detection.kept)
+        state[STOPPED], state[nk.PHASE] = nk.WAITS, phase
         return state
-
-    def _launch(self, state: np.ndarray | None = None) -> None:
-        if state is not None:
-            runtime.fill(self.cg.state, state)
-        self._trial(self._trials, **self._numbers)
 
     # ---- rises of the potential --------------------------------------------------------------------------------------
 
     def stand(self, newton, u: np.ndarray) -> None:
         """Measure `rise` from u."""
         self.potential.place(u)
-        self._based = self._begin(newton, nk.BASE)
-        self._launch(self._based)
-        self._based = runtime.fetch(self.cg.state)
+        self._based = self._run(self._begin(newton, nk.BASE), newton.eps)
         self._based[nk.PHASE] = nk.PROBE
 
     def rise(self, there: np.ndarray) -> float:
         """How much higher Phi is there; infinite where a tetrahedron changes its volume more than tenfold."""
         self.potential.place(there)
-        self._launch(self._based)
-        return float(runtime.fetch(self.cg.state)[nk.RISE])
+        return float(self._run(self._based)[nk.RISE])
 
     # ---- rounds ------------------------------------------------------------------------------------------------------
 
     def __call__(self, newton, most: int) -> tuple[np.ndarray, np.ndarray]:
         """(displacement, numbers of newton_kernels.py) after at most so many rounds from where the potential stands, which
         the report of `newton` has; solved where the phase is DONE."""
-        cg, state, tried, on_host = self.cg, self._begin(newton, nk.START, most), False, runs_on_cpu()
-        runtime.fill(cg.state, state)
-        while state[nk.PHASE] < nk.DONE and self._is_going_well(state):
-            phase, trial = state[nk.PHASE], state[nk.PHASE] <= nk.JUDGE or state[nk.STOPPED] == 1
-            if phase == nk.UPDATE and (tried or not self._update):
-                self.preconditioner.update(self.potential.held_at)
-                state[nk.PHASE], state[nk.STOPPED] = nk.SOLVE, 0
-                runtime.fill(cg.state, state)
-            elif trial:
-                self._launch()
-            if tried := bool(self._update) and (phase == nk.UPDATE and not tried or trial and not on_host):
-                for launch in self._update:
-                    launch()
-            if phase == nk.SOLVE and not trial or tried and not on_host:
-                cg.iterate(int(state[nk.COUNT]) * (not trial), int(state[nk.LIMIT]), newton.eps)
-            state = runtime.fetch(cg.state)
-            if state[nk.STOPPED] == 1:
-                cg.last = int(state[nk.COUNT])
+        state = self._run(self._begin(newton, nk.START, most), newton.eps)
         return self._report(newton, state), state
+
+    def _run(self, state: np.ndarray, eps: float = 0.0) -> np.ndarray:
+        """From one phase to the next until it is done, or the host has to go on."""
+        cg, numbers, served = self.cg, self.potential.sizes() | dict(rounding=10 * eps), False
+        runtime.fill(cg.state, state)
+        while state[nk.PHASE] > nk.TROUBLE and self._is_going_well(state):
+            phase, solving = state[nk.PHASE], state[nk.PHASE] == nk.SOLVE and not state[STOPPED]
+            if phase == nk.UPDATE and served:  # and not done
+                self.preconditioner.update(self.potential.held_at)
+                state[nk.PHASE], state[STOPPED], served = nk.SOLVE, 0, False
+                runtime.fill(cg.state, state)
+                continue
+            if self.whole:
+                self._launch(self.many, **numbers)
+            elif phase != nk.UPDATE and not solving:
+                self._launch(1, **numbers)
+            served = self.whole or phase == nk.UPDATE or phase >= nk.START and not runs_on_cpu()
+            for launch, own in self._update if served else ():
+                launch(**(own or self.sizes | numbers))
+            if not self.whole and (solving or served and self._update and not runs_on_cpu()):
+                cg.iterate(int(state[COUNT]) if solving else 0, int(state[LIMIT]), eps)
+            state = runtime.fetch(cg.state)
+            if state[STOPPED] == 1:
+                cg.last = int(state[COUNT])
+        return state
 
     @staticmethod
     def _is_going_well(state: np.ndarray) -> bool:
         """Whether a linear solve is not at its limit, and has met no negative curvature and nothing that is not finite."""
-        fails = state[nk.STOPPED] > 1 or not np.isfinite(state[nk.SQUARE])
-        fails = fails or (not state[nk.STOPPED] and state[nk.COUNT] >= state[nk.LIMIT])
+        fails = state[STOPPED] in (2, 3) or not np.isfinite(state[SQUARE])
+        fails = fails or (not state[STOPPED] and state[COUNT] >= state[LIMIT])
         return not (state[nk.PHASE] == nk.SOLVE and fails)
 
     def _report(self, newton, state: np.ndarray) -> np.ndarray:

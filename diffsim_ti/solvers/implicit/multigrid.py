@@ -60,7 +60,7 @@ class Multigrid(Preconditioner):
 
     def updating(self) -> tuple[list, object]:
         changes = self.potential.arrays.contacts or self.potential.pairs or self.potential.hosts
-        return ([], None) if changes else ([self.frames.launch], self.frames.body)
+        return ([], None) if changes else ([self.frames.part], self.frames.body)
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""

@@ -14,11 +14,11 @@ A = ti.template()
 (PHASE, NORM, BEFORE, FLOOR, ROUGH, SLOPE, FRACTION, FRESH, DOUBTED, ACCEPTED, RISE) = range(NUMBERS, NUMBERS + 11)
 (E, PARTS, E_TRIED, PARTS_TRIED, UPRIGHT, ROUND, PRODUCTS, TRIALS, HALVINGS, CUTS) = range(RISE + 1, RISE + 11)
 # what a solve is told: tolerances, limits, and numbers of `Newton`
-(TOLERANCE, EPS, MOST, LIMIT, INSIST, INEXACT, ROUGHEST, SHORTEST) = range(CUTS + 1, CUTS + 9)
+(TOLERANCE, EPS, MOST, INSIST, INEXACT, ROUGHEST, SHORTEST) = range(CUTS + 1, CUTS + 8)
 COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
-# phases: energies where rises are measured from, and of one; where a solve starts, a trial of the line search, its
-# residual, the preconditioner, conjugate gradients; then ends: it is done, or the host has to go on
-BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE, DONE, TROUBLE = range(9)
+# phases: it is done, or the host has to go on; energies where rises are measured from, and of one; where a solve starts, a
+# trial of the line search, its residual, the preconditioner, conjugate gradients
+DONE, TROUBLE, BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE = range(9)
 WAITS = 4  # of STOPPED: conjugate gradients have not begun
 
 
@@ -52,21 +52,23 @@ class NewtonKernels:
 
     @ti.func
     def is_trial(self, cg: A, plan: A):
-        return cg.state[PHASE] <= TRY or (cg.state[PHASE] == SOLVE and cg.state[STOPPED] == 1)
-
-    @cached_property
-    def wants_energies(self) -> Kernel:
-        """Whether something is tried, for `Repeated`."""
-        return Kernel("wants_energies", self.is_trial, self.vectors, dict(cg=dict(state="scalars")), {})
+        s = ti.cast(cg.state[PHASE], ti.i32)
+        return (s >= BASE and s <= TRY) or (s == SOLVE and cg.state[STOPPED] == 1)
 
     @ti.func
     def is_judged(self, cg: A, plan: A):
         return cg.state[PHASE] == JUDGE
 
+    @ti.func
+    def is_updated(self, cg: A, plan: A):
+        return cg.state[PHASE] == UPDATE
+
     @cached_property
-    def wants_residual(self) -> Kernel:
-        """Whether it may be taken."""
-        return Kernel("wants_residual", self.is_judged, self.vectors, dict(cg=dict(state="scalars")), {})
+    def wanted(self) -> list[Kernel]:
+        """Whether something is tried, whether it may be taken, whether the preconditioner is to follow, for `Repeated`."""
+        own = dict(cg=dict(state="scalars"))
+        asks = self.is_trial, self.is_judged, self.is_updated
+        return [Kernel(function.__name__, function, self.vectors, own, {}) for function in asks]
 
     # ---- line search -------------------------------------------------------------------------------------------------
 
@@ -203,7 +205,7 @@ class NewtonKernels:
             self.sum_energies(c, cg, newton, at, plan)
         ti.loop_config(serialize=True)
         for _ in range(1):
-            if cg.state[PHASE] <= TRY:
+            if self.is_trial(cg, plan):
                 self.decide(cg, plan)
         ti.loop_config(serialize=not self.parallel)
         for k in range(plan.points):

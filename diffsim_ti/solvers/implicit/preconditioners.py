@@ -29,8 +29,8 @@ class Preconditioner:
         self.spent, self.given_up, self.unfit = 0, False, False
 
     def updating(self) -> tuple[list, object]:
-        """(launches that do what `update` does, whose `hard` is not zero where a vertex needs the host all the same);
-        none where that is needed anyway."""
+        """(what `update` does, as [(kernel, records, numbers)] of `Repeated`; whose `hard` is not zero where a vertex needs
+        the host all the same); nothing where that is needed anyway."""
         return [], None
 
     @property
@@ -79,8 +79,8 @@ class BlockJacobi(Preconditioner):
         body = SimpleNamespace(hard=runtime.array(ti.i32, n), mass=runtime.array(kind, n), least=runtime.array(kind, n))
         runtime.fill(body.mass, self.mass[:, 0])
         runtime.fill(body.least, np.broadcast_to(self.least, (n, 1))[:, 0])
-        invert = kernels.invert.bind(cg=solver, body=body, out=p.block_arrays)
-        return [lambda: p.launch("blocks", out=p.block_arrays), lambda: invert(nodes=n)], body
+        blocks = p.kernels.blocks, dict(scene=a, pass_=p, at=p, out=p.block_arrays), None
+        return [blocks, (kernels.invert, dict(cg=solver, body=body, out=p.block_arrays), None)], body
 
     def _inverted(self, D: np.ndarray) -> np.ndarray:
         least = np.broadcast_to(self.least, (len(D), 1))

@@ -32,16 +32,16 @@ class Frames:
             hard=runtime.array(ti.i32, n),
         )
         kernel = kernels_of(FrameKernels, potential.arrays.precision, parallel).frames
-        self._launch = kernel.bind(at=potential, body=self.body, frames=self)
-
-    def launch(self) -> None:
-        """`update` without those that the kernel has left in `body.hard`."""
-        points, nodes, vertices = self.count
-        self._launch(points=points, nodes=nodes, vertices=vertices)
+        self.part = (
+            kernel,
+            dict(at=potential, body=self.body, frames=self),
+            dict(zip(("points", "nodes", "vertices"), self.count)),
+        )
+        self._launch = kernel.bind(**self.part[1])
 
     def update(self) -> None:
         """To the displacement at which the potential is placed."""
-        self.launch()
+        self._launch(**self.part[2])
         hard = np.nonzero(runtime.fetch(self.body.hard))[0]
         if len(hard):
             R = self.matrices()
