@@ -33,12 +33,11 @@ class CGKernels:
         return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
     @ti.func
-    def total(self, part: A, k, chunks):
-        """The sum of what chunks have left in row k."""
-        out = ti.cast(0, self.fp)
-        for c in range(chunks):
-            out += part[k, c]
-        return out
+    def add_up(self, part: A, rows: A, chunks):
+        """part[k, 0] = the sum of what chunks have left in each of so many rows k."""
+        for c in range(1, chunks):
+            for k in ti.static(range(rows)):
+                part[k, 0] = part[k, 0] + part[k, c]
 
     @ti.func
     def to(self, fp: A, v):
@@ -102,7 +101,8 @@ class CGKernels:
             cg.part[0, c] = rz
         ti.loop_config(serialize=True)
         for _ in range(1):
-            rz, old = self.total(cg.part, 0, plan.chunks), cg.state[RZ]
+            self.add_up(cg.part, 1, plan.chunks)
+            rz, old = cg.part[0, 0], cg.state[RZ]
             if cg.state[STOPPED] == 0 and not rz > 0:
                 cg.state[STOPPED] = ti.cast(3, self.fp)
             cg.state[BETA] = ti.cast(0, self.fp)
@@ -162,8 +162,8 @@ class CGKernels:
     @ti.func
     def choose(self, cg: A, plan: A):
         """alpha = r . z / p . A p, zero once it has stopped."""
-        curvature = self.total(cg.part, 0, plan.chunks)
-        size = ti.sqrt(self.total(cg.part, 1, plan.chunks) * self.total(cg.part, 2, plan.chunks))
+        self.add_up(cg.part, 3, plan.chunks)
+        curvature, size = cg.part[0, 0], ti.sqrt(cg.part[1, 0] * cg.part[2, 0])
         cg.state[ALPHA] = ti.cast(0, self.fp)
         if cg.state[STOPPED] == 0:
             cg.state[COUNT] = cg.state[COUNT] + ti.cast(1, self.fp)
@@ -194,7 +194,8 @@ class CGKernels:
             cg.part[0, c] = square
         ti.loop_config(serialize=True)
         for _ in range(1):
-            cg.state[SQUARE] = self.total(cg.part, 0, plan.chunks)
+            self.add_up(cg.part, 1, plan.chunks)
+            cg.state[SQUARE] = cg.part[0, 0]
             if cg.state[STOPPED] == 0 and cg.state[SQUARE] <= cg.state[LEAST]:
                 cg.state[STOPPED] = ti.cast(1, self.fp)
 

@@ -91,7 +91,8 @@ class NewtonKernels:
             cg.state[FRESH] = ti.cast(0, self.fp)
             if cg.state[PHASE] == SOLVE and cg.state[STOPPED] == 1:
                 cg.state[PHASE], cg.state[FRESH] = ti.cast(TRY, self.fp), ti.cast(1, self.fp)
-                cg.state[SLOPE] = self.cg.total(cg.part, 0, plan.chunks)
+                self.cg.add_up(cg.part, 1, plan.chunks)
+                cg.state[SLOPE] = cg.part[0, 0]
                 cg.state[FRACTION] = ti.cast(1, self.fp)
                 cg.state[PRODUCTS] = cg.state[PRODUCTS] + cg.state[COUNT]
 
@@ -164,11 +165,12 @@ class NewtonKernels:
     @ti.func
     def decide(self, cg: A, plan: A):
         """Whether what is tried lowers the potential (`Newton._search`)."""
-        value, size = self.cg.total(cg.part, 0, plan.chunks), self.cg.total(cg.part, 1, plan.chunks)
+        self.cg.add_up(cg.part, 6, plan.chunks)
+        value, size = cg.part[0, 0], cg.part[1, 0]
         cg.state[E_TRIED], cg.state[PARTS_TRIED], cg.state[DOUBTED] = value, size, ti.cast(0, self.fp)
         cg.state[ACCEPTED] = ti.cast(0, self.fp)
-        change = value - cg.state[E] + self.cg.total(cg.part, 4, plan.chunks)
-        flat = self.cg.total(cg.part, 2, plan.chunks) > 0
+        change = value - cg.state[E] + cg.part[4, 0]
+        flat = cg.part[2, 0] > 0
         if cg.state[PHASE] == BASE:
             cg.state[E], cg.state[PARTS], cg.state[ACCEPTED] = value, size, ti.cast(1, self.fp)
             cg.state[PHASE] = ti.cast(DONE, self.fp)
@@ -177,11 +179,11 @@ class NewtonKernels:
             if flat:
                 cg.state[RISE] = ti.cast(ti.math.inf, self.fp)
         elif cg.state[PHASE] == START:
-            cg.state[UPRIGHT] = ti.cast(self.cg.total(cg.part, 3, plan.chunks) == 0, self.fp)
+            cg.state[UPRIGHT] = ti.cast(cg.part[3, 0] == 0, self.fp)
             cg.state[PHASE], cg.state[TRIALS] = ti.cast(JUDGE, self.fp), ti.cast(1, self.fp)
         else:
             cg.state[TRIALS] = cg.state[TRIALS] + ti.cast(1, self.fp)
-            noise = cg.state[EPS] * 10 * (cg.state[PARTS] + size + self.cg.total(cg.part, 5, plan.chunks))
+            noise = cg.state[EPS] * 10 * (cg.state[PARTS] + size + cg.part[5, 0])
             upright = cg.state[UPRIGHT] == 1 and cg.state[FRACTION] > cg.state[INSIST]
             admissible = not (upright and flat)
             if admissible and change <= cg.state[FRACTION] * cg.state[SLOPE] * ti.cast(-1e-4, self.fp):
@@ -257,8 +259,8 @@ class NewtonKernels:
             cg.state[UPRIGHT] = ti.cast(0, self.fp)
         cg.state[E], cg.state[PARTS] = cg.state[E_TRIED], cg.state[PARTS_TRIED]
         cg.state[ACCEPTED], cg.state[BEFORE] = one, cg.state[NORM]
-        norm, size = ti.sqrt(self.cg.total(cg.part, 0, plan.chunks)), ti.sqrt(self.cg.total(cg.part, 1, plan.chunks))
-        floor = ti.sqrt(self.cg.total(cg.part, 2, plan.chunks)) * 4
+        norm, size = ti.sqrt(cg.part[0, 0]), ti.sqrt(cg.part[1, 0])
+        floor = ti.sqrt(cg.part[2, 0]) * 4
         cg.state[NORM], cg.state[FLOOR] = norm, floor
         relative = norm
         if size > 0:
@@ -299,7 +301,8 @@ class NewtonKernels:
         for _ in range(1):
             cg.state[ACCEPTED] = ti.cast(0, self.fp)
             if cg.state[PHASE] == JUDGE:
-                falls = self.cg.total(cg.part, 3, plan.chunks) >= cg.state[SLOPE] * ti.cast(-0.8, self.fp)
+                self.cg.add_up(cg.part, 4, plan.chunks)
+                falls = cg.part[3, 0] >= cg.state[SLOPE] * ti.cast(-0.8, self.fp)
                 if cg.state[DOUBTED] == 1 and not falls:
                     self.halve(cg)
                 else:
