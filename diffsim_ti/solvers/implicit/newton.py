@@ -123,18 +123,21 @@ class Newton:
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
         E, norm, rough, solved, far = None, np.inf, False, False, np.abs(u).max(1, keepdims=True)
-        most, floor = self.max_iterations if rounds is None else rounds, 0.0
+        most, floor, self.upright, on_host = self.max_iterations if rounds is None else rounds, 0.0, None, bool(rounds)
         while self._goes_on(most, rounds is None):
-            device = self._on_device() if rounds is None else None
+            device = None if on_host else self._on_device()
             if device:
                 u, numbers = device(self, max(most - len(report.residuals), 1))
                 if numbers[PHASE] == DONE and not leave_saddles:
                     return u
                 u, E, norm, floor = self.potential.place(u), None, numbers[BEFORE] or np.inf, numbers[FLOOR]
-                report.residuals.pop()  # this round goes on here
+                report.residuals.pop()
+                on_host = True  # goes on with this round
+                continue
+            on_host = bool(rounds)
             if E is None:
                 E = self._evaluate(u)
-                self.upright = bool(np.all(E[2] > 0))
+                self.upright = bool(np.all(E[2] > 0)) if self.upright is None else self.upright
             (R, size), before = self._residual(u), norm
             rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far) + self.rigid.rounding
             floor = 4 * np.linalg.norm(self._rigidity() * rounding * self.moves)
