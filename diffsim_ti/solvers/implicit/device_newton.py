@@ -1,6 +1,7 @@
 """Rounds of Newton's method on the device: of what crosses to the host, a few numbers a round."""
 
 import weakref
+from collections.abc import Callable
 
 import numpy as np
 
@@ -17,11 +18,12 @@ class DeviceNewton:
     indefinite Hessian, a line search without success and the like are left to the host.
 
     A round is a launch for a trial of the line search and the residual of what is taken, some for the preconditioner, and
-    those of conjugate gradients; on one thread of the processor they are one kernel, and a solve is a launch or few. What
+    those of conjugate gradients; of small bodies on the processor they are one kernel, and a solve is a launch or few. What
     comes next is a number on the device, `PHASE`.
     """
 
-    many, most_rounds = 200, 64  # phases in a launch on one thread; rounds before the host looks at their residuals
+    small, many = 300, 200  # vertices up to which a solve on one thread is one kernel; phases in a launch of it
+    most_rounds = 64  # before the host looks at their residuals
 
     def __init__(self, potential, preconditioner, detection):
         self.potential, self.detection = potential, detection
@@ -48,19 +50,32 @@ class DeviceNewton:
         groups = [[(*part, None) for part in group] for group in (energies, [*residual, (kernels.judge, own)])]
         update, hard = preconditioner.updating()
         update = [*update, (kernels.ready, dict(cg=cg, body=hard), None)] if update else []
-        self.whole, self._update, lanes = runs_on_cpu() and not cg.parallel, [], runs_on_cpu()
+        on_cpu = runs_on_cpu()
+        self.whole = on_cpu and not cg.parallel and n <= self.small
+        self._always, self._update = self.sizes | dict(most=1.0, kept=detection.kept), self._in_turn(update)
         if self.whole:
-            groups += [[(updates, own, None), *update]] if update else []
-            groups.append(cg.parts(False))
+            groups += [[(updates, own, None), *update], cg.parts(False)] if update else [cg.parts(False)]
+        if self.whole or not on_cpu:
+            self._trial, self._residual = Repeated("newton", groups, cg.parallel, on_cpu), None
         else:
-            self._update = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in update]
-        repeated, always = (
-            Repeated("newton", groups, cg.parallel, lanes),
-            self.sizes | dict(most=1.0, kept=detection.kept),
-        )
-        self._launch = launch = lambda times, **numbers: repeated(times, **always, **numbers)
+            self._trial, self._residual = (self._in_turn(group[1:]) for group in groups)
         if self.whole:
-            cg.serve(lambda times, rounding: launch(times, **potential.sizes(), rounding=rounding))
+            launch, always = self._trial, self._always
+            cg.serve(lambda times, rounding: launch(times, **always, **potential.sizes(), rounding=rounding))
+
+    def _in_turn(self, parts: list) -> Callable:
+        """Kernels that are launched one by one, as others launch them, so that they are compiled once."""
+        in_vectors = self.potential.kernels.forces, self.potential.kernels.blocks
+        bound = [
+            (kernel.bind(kernel in in_vectors and self.potential.arrays.in_vectors, **records), own or {})
+            for kernel, records, own in parts
+        ]
+
+        def launch(times: int, **numbers) -> None:
+            for one, own in bound:
+                one(**(numbers | own))
+
+        return launch if parts else None
 
     # ---- what is solved ----------------------------------------------------------------------------------------------
 
@@ -109,23 +124,27 @@ class DeviceNewton:
 
     def _run(self, state: np.ndarray, eps: float = 0.0) -> np.ndarray:
         """From one phase to the next until it is done, or the host has to go on."""
-        cg, numbers, served = self.cg, self.potential.sizes() | dict(rounding=10 * eps), False
+        cg, on_cpu, served = self.cg, runs_on_cpu(), False
+        numbers = self._always | self.potential.sizes() | dict(rounding=10 * eps)
         runtime.fill(cg.state, state)
         while state[nk.PHASE] > nk.TROUBLE and self._is_going_well(state):
             phase, solving = state[nk.PHASE], state[nk.PHASE] == nk.SOLVE and not state[STOPPED]
-            if phase == nk.UPDATE and served:  # and not done
+            if phase == nk.UPDATE and (served or not self._update):
                 self.preconditioner.update(self.potential.held_at)
                 state[nk.PHASE], state[STOPPED], served = nk.SOLVE, 0, False
                 runtime.fill(cg.state, state)
                 continue
             if self.whole:
-                self._launch(self.many, **numbers)
+                self._trial(self.many, **numbers)
+            elif phase == nk.JUDGE and on_cpu:
+                self._residual(1, **numbers)
             elif phase != nk.UPDATE and not solving:
-                self._launch(1, **numbers)
-            served = self.whole or phase == nk.UPDATE or phase >= nk.START and not runs_on_cpu()
-            for launch, own in self._update if served else ():
-                launch(**(own or self.sizes | numbers))
-            if not self.whole and (solving or served and self._update and not runs_on_cpu()):
+                self._trial(1, **numbers)
+            ahead = phase >= nk.START and not on_cpu  # a card goes on before the host knows
+            served = bool(self._update) and (self.whole or phase == nk.UPDATE or ahead)
+            if served and not self.whole:
+                self._update(1, **numbers)
+            if not self.whole and (solving or served and ahead):
                 cg.iterate(int(state[COUNT]) if solving else 0, int(state[LIMIT]), eps)
             state = runtime.fetch(cg.state)
             if state[STOPPED] == 1:
