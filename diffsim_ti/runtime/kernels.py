@@ -77,6 +77,11 @@ class Kernel:
         first, call, arguments = self.call("body", {})
         self.kernel = _compiled(name, arguments, [*first, call], dict(body=body))
 
+    @property
+    def variables(self) -> int:
+        """Its local variables, by whose square its compile time grows; 0 before its first launch."""
+        return getattr(self.kernel._primal, "variables", 0)
+
     def call(self, body: str, names: dict, prefix: str = "") -> tuple[list, str, dict]:
         """(lines before all loops, the line that calls the body, {argument: type}) in the source of a kernel; names: of the
         arguments that have others there, {(bundle, array): argument}."""

@@ -54,6 +54,7 @@ class Launch:
             before = made["variables"]
             compiled = kernel.compiled_kernels[kernel.ensure_compiled(*self._arrays, *numbers)]
             self.variables = made["variables"] - before  # that were traced here
+            kernel.variables = max(self.variables, getattr(kernel, "variables", 0))
             self._code = self._compile(prog, config, compiled)
         if self._loops:
             self._repeated = RepeatedLoops(self._code, self._owner, self._loops)

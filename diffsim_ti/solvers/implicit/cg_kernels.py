@@ -46,7 +46,7 @@ class CGKernels:
 
     @ti.func
     def is_wanted(self, cg: A, plan: A):
-        return cg.state[STOPPED] == 0 and cg.state[COUNT] < cg.state[LIMIT]
+        return cg.state[STOPPED] == 0
 
     @cached_property
     def wanted(self) -> Kernel:

@@ -42,7 +42,7 @@ class DeviceCG:
             self.guide, self.held = runtime.upload(guide, ti.i32), self._columns(free.sliding_supports)
         if cycle is None:
             self.inverse = runtime.array(self._vector, 3, n)
-        self.sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
+        self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
         self._is_one_kernel = potential.is_one_kernel and Repeated.is_possible(parallel)
         whole = runs_on_cpu() and not parallel and self._is_one_kernel
         # whether rounds of Newton's method are on the device, too
@@ -97,8 +97,8 @@ class DeviceCG:
         parts, potential, lanes = self.parts(more), self.potential, runs_on_cpu()
         if self._is_one_kernel:
             repeated = Repeated("cg", [parts], self.parallel, lanes)
-            return lambda times, rounding: repeated(times, **potential.sizes(), **self.sizes, rounding=rounding)
-        launches = [(kernel.bind(lanes, **records), numbers or self.sizes) for kernel, records, numbers in parts[1:-2]]
+            return lambda times, rounding: repeated(times, **potential.sizes(), **self._sizes, rounding=rounding)
+        launches = [(kernel.bind(lanes, **records), numbers or self._sizes) for kernel, records, numbers in parts[1:-2]]
         step = parts[-1][0].bind(lanes, **parts[-1][1])
 
         def iterate(times: int, rounding: float) -> None:
@@ -106,7 +106,7 @@ class DeviceCG:
                 for launch, numbers in launches:
                     launch(**numbers)
                 potential.multiply(convex)
-                step(**self.sizes, rounding=rounding)
+                step(**self._sizes, rounding=rounding)
 
         return iterate
 

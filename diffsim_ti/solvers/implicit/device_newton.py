@@ -23,6 +23,7 @@ class DeviceNewton:
     """
 
     small, many = 300, 200  # vertices up to which a solve on one thread is one kernel; phases in a launch of it
+    short = 600  # variables of a law's longest kernel up to which one kernel of all compiles soon
     most_rounds = 64  # before the host looks at their residuals
 
     def __init__(self, potential, preconditioner, detection):
@@ -36,11 +37,12 @@ class DeviceNewton:
         self.u, self.d, self.R, self.inertial, self.loads = (runtime.array(vector, n) for _ in range(5))
         self.far, self.stiffness, self.history = (runtime.array(fp, k) for k in (n, n, self.most_rounds + 1))
         self.J, self._filled = runtime.array(a.fp, points), {}
-        self.sizes = cg.sizes | dict(points=points, points_length=-(-points // cg.chunks), count=detection.count)
+        self.sizes = dict(chunks=cg.chunks, length=cg.length, nodes=n, count=detection.count)
+        self.sizes |= dict(points=points, points_length=-(-points // cg.chunks))
         way, barriers = (detection.way, potential.barriers) if self.contact else (None, None)
         own = dict(cg=cg, at=potential, newton=(self, way), out=detection.found, barriers=barriers)
         of_potential = dict(scene=a, pass_=potential, at=potential, out=potential)
-        forces, (tries, judges, updates) = potential.kernels.forces, kernels.wanted
+        forces, (tries, judges, updates, solves) = potential.kernels.forces, kernels.wanted
         energies, residual = [(tries, own), (kernels.direction, own)], [(judges, own), (forces, of_potential)]
         if self.contact:
             of_way = dict(scene=a, way=way, at=potential, out=detection.found)
@@ -52,13 +54,18 @@ class DeviceNewton:
         update = [*update, (kernels.ready, dict(cg=cg, body=hard), None)] if update else []
         on_cpu = runs_on_cpu()
         self.whole = on_cpu and not cg.parallel and n <= self.small
+        self.whole &= potential.kernels.blocks.variables <= self.short
         self._always, self._update = self.sizes | dict(most=1.0, kept=detection.kept), self._in_turn(update)
         if self.whole:
-            groups += [[(updates, own, None), *update], cg.parts(False)] if update else [cg.parts(False)]
-        if self.whole or not on_cpu:
-            self._trial, self._residual = Repeated("newton", groups, cg.parallel, on_cpu), None
-        else:
+            groups += [[(updates, own, None), *update]] if update else []
+            groups.append([(solves, own, None), *cg.parts(False)[1:]])
+        self._residual = None
+        if self.whole:
+            self._trial = Repeated("newton", groups, cg.parallel, vectorized=True)
+        elif on_cpu:
             self._trial, self._residual = (self._in_turn(group[1:]) for group in groups)
+        else:
+            self._trial, self._residual = (Repeated(f"newton{k}", [own], True) for k, own in enumerate(groups))
         if self.whole:
             launch, always = self._trial, self._always
             cg.serve(lambda times, rounding: launch(times, **always, **potential.sizes(), rounding=rounding))
@@ -93,7 +100,7 @@ class DeviceNewton:
         self._put("loads", newton.loads)
         self._put("stiffness", newton.stiffness.ravel())
         if self.contact:
-            self.detection.put(newton.collisions.rows[::3])
+            self.detection.put(runtime.fetch(self.potential.poses)[::3])
         state[nk.TOLERANCE], state[nk.EPS], state[nk.MOST] = newton.tolerance, newton.eps, min(most, self.most_rounds)
         state[LIMIT] = min(10 * self.cg.nodes, self.preconditioner.patience)
         state[nk.INSIST], state[nk.SHORTEST] = newton.insist, newton.shortest
@@ -126,6 +133,8 @@ class DeviceNewton:
         """From one phase to the next until it is done, or the host has to go on."""
         cg, on_cpu, served = self.cg, runs_on_cpu(), False
         numbers = self._always | self.potential.sizes() | dict(rounding=10 * eps)
+        if state[nk.PHASE] == nk.START:
+            self.preconditioner.follow(self.potential.held_at)
         runtime.fill(cg.state, state)
         while state[nk.PHASE] > nk.TROUBLE and self._is_going_well(state):
             phase, solving = state[nk.PHASE], state[nk.PHASE] == nk.SOLVE and not state[STOPPED]
@@ -134,21 +143,25 @@ class DeviceNewton:
                 state[nk.PHASE], state[STOPPED], served = nk.SOLVE, 0, False
                 runtime.fill(cg.state, state)
                 continue
+            # a card goes on before the host has looked, but not to conjugate gradients
+            ahead = not on_cpu and nk.START <= phase and not solving
             if self.whole:
                 self._trial(self.many, **numbers)
-            elif phase == nk.JUDGE and on_cpu:
-                self._residual(1, **numbers)
-            elif phase != nk.UPDATE and not solving:
+            elif solving:
+                cg.iterate(int(state[COUNT]), int(state[LIMIT]), eps)
+            elif phase not in (nk.JUDGE, nk.UPDATE):
                 self._trial(1, **numbers)
-            ahead = phase >= nk.START and not on_cpu  # a card goes on before the host knows
+            if not self.whole and (phase == nk.JUDGE or ahead and phase != nk.UPDATE):
+                self._residual(1, **numbers)
             served = bool(self._update) and (self.whole or phase == nk.UPDATE or ahead)
             if served and not self.whole:
+                self.preconditioner.follow(runtime.fetch_row(self.potential.u, 0)) if on_cpu else None
                 self._update(1, **numbers)
-            if not self.whole and (solving or served and ahead):
-                cg.iterate(int(state[COUNT]) if solving else 0, int(state[LIMIT]), eps)
             state = runtime.fetch(cg.state)
-            if state[STOPPED] == 1:
+            if state[STOPPED] == 1 and not self.whole:
                 cg.last = int(state[COUNT])
+                if solving:
+                    self.preconditioner.learn(float(np.sqrt(state[SQUARE])), cg.last)
         return state
 
     @staticmethod

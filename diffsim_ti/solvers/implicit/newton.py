@@ -26,7 +26,7 @@ from diffsim_ti.mechanics.stress.projection import Projection
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, cleaned, linear_of, mask_of
 from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
-from diffsim_ti.solvers.implicit.newton_kernels import BEFORE, DONE, FLOOR, PHASE
+from diffsim_ti.solvers.implicit.newton_kernels import BEFORE, DONE, FLOOR, PHASE, ROUND
 
 LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction that are doubled while Phi falls
 
@@ -69,13 +69,14 @@ class Newton:
     patience = 6  # times as many rounds as asked for, at most (`_goes_on`)
     steady = 10  # rounds that halve the residual while more than asked for are taken; 0: none are
     by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
+    detection = None  # of obstacles (obstacles/collision_detection.py); without, rounds are the host's
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
     def __init__(
         self,
         potential,
         free: Free,
-        collisions,
+        way,
         preconditioners,
         tolerance: float,
         max_iterations: int,
@@ -86,7 +87,7 @@ class Newton:
         self.volumes = volumes  # of chambers, that are held (multipliers.py), or None
         self.others = others  # host forces without an energy
         self.moves = mask_of(free)  # in some direction
-        self.potential, self.free, self.collisions, self.preconditioners = potential, free, collisions, preconditioners
+        self.potential, self.free, self.collisions, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
         self.report, self.reports = NewtonReport(), []  # of the last solve, of all since the last report
@@ -131,7 +132,8 @@ class Newton:
                 if numbers[PHASE] == DONE and not leave_saddles:
                     return u
                 u, E, norm, floor = self.potential.place(u), None, numbers[BEFORE] or np.inf, numbers[FLOOR]
-                report.residuals.pop()
+                if numbers[ROUND]:
+                    report.residuals.pop()
                 on_host = True  # goes on with this round
                 continue
             on_host = bool(rounds)
@@ -182,14 +184,14 @@ class Newton:
     def _on_device(self) -> DeviceNewton | None:
         """What takes rounds without the host; None where that takes part in forces or in linear solves."""
         potential, preconditioner, static = self.potential, self.preconditioner, not diagonal_of(self.mass).any()
-        plain = isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections
+        plain = self.detection and (isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections)
         on_host = potential.pairs or potential.hosts or self.others or self.volumes or self.rigid
         if not plain or on_host or isinstance(self.mass, ConsistentMass) or not preconditioner.solver.takes_rounds:
             return None
         if preconditioner.given_up or static and preconditioner.spent > 2 * preconditioner.patience:
             return None
         if preconditioner.rounds is None:
-            preconditioner.rounds = DeviceNewton(potential, preconditioner, self.collisions.detection)
+            preconditioner.rounds = DeviceNewton(potential, preconditioner, self.detection)
         return preconditioner.rounds
 
     def _why(self, done: list) -> str:
@@ -377,7 +379,7 @@ class Newton:
     def _safe_share(self, u, d) -> float:
         """The longest step along d in which surfaces stay apart, from obstacles and from each other."""
         pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
-        free, self.report.met = self.collisions.past(u, d, most)
+        free, self.report.met = self.collisions(u, d, most)
         free = min(free, pairs.safe_share(u, d, free)) if pairs else free
         self.report.cuts += free < 1
         return free
@@ -385,7 +387,7 @@ class Newton:
     def is_free(self, u, step) -> bool:
         """Whether nothing is met on the way of a step."""
         pairs = self.potential.pairs
-        return self.collisions.past(u, step)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
+        return self.collisions(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
     def _against_loads(self, u, step) -> float:
         """Change of Phi along a step without those of E and W."""

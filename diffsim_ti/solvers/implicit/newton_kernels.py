@@ -6,7 +6,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.runtime import PRECISIONS, Kernel, kernels_of
-from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, NUMBERS, SQUARE, STOPPED, CGKernels
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, LIMIT, NUMBERS, SQUARE, STOPPED, CGKernels
 
 A = ti.template()
 # places of numbers in `state`, behind those of conjugate gradients: what is done next; norms of the residual and what
@@ -63,11 +63,16 @@ class NewtonKernels:
     def is_updated(self, cg: A, plan: A):
         return cg.state[PHASE] == UPDATE
 
+    @ti.func
+    def is_solved(self, cg: A, plan: A):
+        return cg.state[STOPPED] == 0 and cg.state[COUNT] < cg.state[LIMIT]
+
     @cached_property
     def wanted(self) -> list[Kernel]:
-        """Whether something is tried, whether it may be taken, whether the preconditioner is to follow, for `Repeated`."""
+        """Whether something is tried, whether it may be taken, whether the preconditioner is to follow, whether conjugate
+        gradients go on, for `Repeated`."""
         own = dict(cg=dict(state="scalars"))
-        asks = self.is_trial, self.is_judged, self.is_updated
+        asks = self.is_trial, self.is_judged, self.is_updated, self.is_solved
         return [Kernel(function.__name__, function, self.vectors, own, {}) for function in asks]
 
     # ---- line search -------------------------------------------------------------------------------------------------

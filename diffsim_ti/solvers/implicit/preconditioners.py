@@ -28,6 +28,12 @@ class Preconditioner:
     def begin(self) -> None:
         self.spent, self.given_up, self.unfit = 0, False, False
 
+    def learn(self, residual: float, iterations: int) -> None:
+        """What a linear solve took, to a relative residual."""
+
+    def follow(self, u: np.ndarray) -> None:
+        """What `update` makes anew now and then, before what it does each time."""
+
     def updating(self) -> tuple[list, object]:
         """(what `update` does, as [(kernel, records, numbers)] of `Repeated`; whose `hard` is not zero where a vertex needs
         the host all the same); nothing where that is needed anyway."""

@@ -81,8 +81,9 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.volumes = self.volume_constraints(eps)
         self.multipliers = {}  # the pressures [Pa] that each pass ended with
         self.preconditioner, self.noted, self.collisions = Preconditioners(self), Noted(self), ObstacleCollisions(self)
-        finders, more = (self.collisions, self.preconditioner), (others, self.volumes)
+        finders, more = (self.collisions.past, self.preconditioner), (others, self.volumes)
         self.newton = Newton(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
+        self.newton.detection = self.collisions.detection
         self.approach, self.closing = Approach(self), Closing(self)
         self.check_apart()
 
