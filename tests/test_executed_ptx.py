@@ -57,10 +57,8 @@ ONCE_FORWARD = dict(synchronisations=0, copies_to_device=17, copies_to_host=8, f
 ONCE_REVERSE = dict(synchronisations=0, copies_to_device=6, copies_to_host=5, fills=14)
 DOUBLE_IN_SINGLE = {
     "_find_bad": "ti.math.isinf compares with a double",
-    **dict.fromkeys(
-        ("newton0", "newton1", "invert", "ready"), "vectors and sums of Newton's method, as of conjugate gradients"
-    ),
     "cg": "vectors of conjugate gradients, beside products in float32: a stiff body takes more digits than these have",
+    **dict.fromkeys(("newton0", "newton1", "invert", "ready"), "vectors of Newton's method, and sums of energies"),
 }
 
 

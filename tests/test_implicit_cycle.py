@@ -345,31 +345,22 @@ def test_a_little_less_than_the_share_that_is_named_is_borne(load):
 
 
 def moving(name: str) -> ds.Rollout:
-    mesh, law = (
-        ds.TetrahedralMesh.create_box((3, 3, 4), (0.2, 0.2, 0.3)).translated((0, 0.01, 0)),
-        ds.StableNeoHookean(1e5, 0.4),
-    )
-    mesh = ds.TetrahedralMesh.create_box((2, 2, 3), 0.1).translated((0, 0.006, 0)) if name == "blocks" else mesh
-    lying = dict(terms=[ds.Gravity(), ds.Ground(friction=0.3, width=5e-3)], initial_velocities=[0.5, 0.0, 0.0])
-    slides = dict(terms=[ds.Gravity()], fixed={"xmin": "x", "ymin": [0.0, 1.0, 1.0]})
-    own = slides if name in ("slides", "balance") else lying
-    scene = ds.Scene(mesh, law, 1000.0, precision="f64", **own)
-    return ds.Rollout(
-        ds.StaticSolver(scene) if name == "balance" else ds.ImplicitEulerSolver(scene, dt=0.01),
-        1 if name == "balance" else 4,
-    )
+    shape = ((2, 2, 3), 0.1) if name == "blocks" else ((3, 3, 4), (0.2, 0.2, 0.3))
+    mesh = ds.TetrahedralMesh.create_box(*shape).translated((0.0, 0.006, 0.0))
+    terms, fixed = [ds.Gravity(), ds.Ground(friction=0.3, width=5e-3)], None
+    if name in ("slides", "balance"):
+        terms, fixed = [ds.Gravity()], {"xmin": "x", "ymin": [0.0, 1.0, 1.0], "zmin": "z"}
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.4), 1000.0, terms, fixed, precision="f64")
+    return ds.Rollout(ds.StaticSolver(scene) if name == "balance" else ds.ImplicitEulerSolver(scene, dt=0.01), 1)
 
 
-@pytest.mark.parametrize("small", [0, 300], ids=["kernels one by one", "one kernel"])
-@pytest.mark.parametrize("name", ["blocks", "multigrid", "slides", "balance"])
+@pytest.mark.parametrize("name, small", [("blocks", 300), ("multigrid", 0), ("slides", 0), ("balance", 300)])
 def test_rounds_on_the_device_are_those_of_the_host(name, small, monkeypatch):
-    """Where what crosses the host's line searches, forcing terms and preconditioners says the same, so do frames."""
+    """small: vertices up to which a solve is one kernel."""
     monkeypatch.setattr(DeviceNewton, "small", small)
     found, taken, here = [], [], Newton._on_device
-    for on_device in (True, False):
-        monkeypatch.setattr(
-            Newton, "_on_device", lambda self: taken.append(here(self)) or taken[-1] if on_device else None
-        )
+    for choose in (lambda self: taken.append(here(self)) or taken[-1], lambda self: None):
+        monkeypatch.setattr(Newton, "_on_device", choose)
         rollout = moving(name)
         frames = rollout.forward()
         found.append((frames.positions, rollout.vjp(frames, frames.positions)["youngs_modulus"]))
@@ -378,18 +369,14 @@ def test_rounds_on_the_device_are_those_of_the_host(name, small, monkeypatch):
     assert np.abs(x - other).max() <= 1e-9 * np.ptp(x, 0).max() and abs(by_E - by_other_E) <= 1e-6 * abs(by_other_E)
 
 
-@pytest.mark.parametrize("small", [0, 300], ids=["kernels one by one", "one kernel"])
-def test_rounds_that_the_device_leaves_go_on_on_the_host(small, monkeypatch):
+def test_rounds_that_the_device_leaves_go_on_on_the_host(monkeypatch):
     """A column that is pressed beyond its buckling load meets indefinite Hessians: the same minimum."""
-    monkeypatch.setattr(DeviceNewton, "small", small)
-    mesh = ds.TetrahedralMesh.create_box((9, 2, 2), (0.8, 0.1, 0.1))
-    scene = ds.Scene(
-        mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, [ds.Traction([-6e3, 0, 1.0], "xmax")], "xmin", precision="f64"
-    )
-    solver, runs = ds.ImplicitEulerSolver(scene, dt=0.5), []
-    for on_device in (True, False):
-        if not on_device:
-            monkeypatch.setattr(Newton, "_on_device", lambda self: None)
+    mesh, runs = ds.TetrahedralMesh.create_box((9, 2, 2), (0.8, 0.1, 0.1)), []
+    pressed = [ds.Traction([-6e3, 0.0, 1.0], "xmax")]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, pressed, "xmin", precision="f64")
+    solver = ds.ImplicitEulerSolver(scene, dt=0.5)
+    for choose in (Newton._on_device, lambda self: None):
+        monkeypatch.setattr(Newton, "_on_device", choose)
         workspace = solver.workspace(solver.start_values())
         workspace.advance(0, 1, 1)
         runs.append((workspace.u_star, workspace.newton.report.indefinite))
