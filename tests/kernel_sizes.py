@@ -13,6 +13,7 @@ from scipy.sparse import diags, eye
 from scipy.sparse.linalg import spsolve
 
 import diffsim_ti as ds
+from diffsim_ti import runtime
 from diffsim_ti.runtime.launch import Launch
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
@@ -89,6 +90,7 @@ def traced_alone(found: dict):
         for part in (self._trial, self._residual, self._update):
             if part:
                 part(1, **numbers)
+        runtime.fill(self.u, self.potential.held_at)
         state[PHASE] = TROUBLE
         return state
 
