@@ -119,7 +119,7 @@ class Newton:
         self.report = report = NewtonReport()
         self.reports.append(report)
         self._turning = False
-        self._pose((mass, inertial, loads))
+        self.pose((mass, inertial, loads))
         u = self.potential.place(start)
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
@@ -396,7 +396,7 @@ class Newton:
     def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[np.ndarray], float]:
         """there -> how much higher Phi is at another place than at u. Forces without an energy do no more work on the way
         than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
-        self._pose(problem)
+        self.pose(problem)
         device = self._on_device()
         if device:
             device.stand(self, u)
@@ -416,7 +416,7 @@ class Newton:
 
         return rise
 
-    def _pose(self, problem: tuple) -> None:
+    def pose(self, problem: tuple) -> None:
         """What is solved: mass, inertial and loads of `solve`."""
         self.mass, self.inertial, self.loads = problem
         self.preconditioner, self.stiffness = self.preconditioners(self.mass)
