@@ -30,6 +30,7 @@ from diffsim_ti import (
     Traction,
     VelocityVerletSolver,
 )
+from diffsim_ti.solvers.implicit.cg_kernels import ROOM
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
 
 pytestmark = pytest.mark.backends
@@ -47,8 +48,8 @@ CONTACT_FORWARD = NO_TRAFFIC | dict(launches=17, copies_to_device=3, bytes_to_de
 CONTACT_REVERSE = NO_TRAFFIC | dict(launches=19, copies_to_device=4, bytes_to_device=2048, copies_to_host=1)
 # ... for a new list; every eighth puts the primitives in order anew, on the host
 NEW_LIST = NO_TRAFFIC | dict(launches=55, copies_to_device=16, copies_to_host=11, fills=2)
-# ... for each implicit step of this scene, whose linear solver's vectors live on the host, and of it for each product
-IMPLICIT_FORWARD = NO_TRAFFIC | dict(launches=250, copies_to_device=95, copies_to_host=95, fills=8)
+# ... for each implicit step of this scene, whose rounds of Newton's method read a few numbers, and for a product of the host
+IMPLICIT_FORWARD = NO_TRAFFIC | dict(launches=340, copies_to_device=65, copies_to_host=28, fills=4)
 IMPLICIT_REVERSE = NO_TRAFFIC | dict(launches=60, copies_to_device=11, copies_to_host=10, fills=2)
 PRODUCT = NO_TRAFFIC | dict(launches=3, copies_to_device=2, copies_to_host=1)
 # ... for a whole explicit run, besides its substeps: arrays go each way once, zeroing is a memset
@@ -57,6 +58,7 @@ ONCE_REVERSE = dict(synchronisations=0, copies_to_device=6, copies_to_host=5, fi
 DOUBLE_IN_SINGLE = {
     "_find_bad": "ti.math.isinf compares with a double",
     "cg": "vectors of conjugate gradients, beside products in float32: a stiff body takes more digits than these have",
+    **dict.fromkeys(("newton0", "newton1", "invert", "ready"), "vectors of Newton's method, and sums of energies"),
 }
 
 
@@ -161,7 +163,7 @@ def test_implicit_steps_stay_below_their_ceilings(driver, cube):
     check_counts(driver.counts(), PRODUCT)
 
 
-def test_ten_iterations_on_the_device_bring_eight_numbers_to_the_host(driver, monkeypatch):
+def test_ten_iterations_on_the_device_bring_a_few_numbers_to_the_host(driver, monkeypatch):
     """Besides arguments of launches nothing goes to the card."""
     monkeypatch.setattr(Multigrid, "direct", 0)
     mesh = TetrahedralMesh.create_box((9, 4, 4), (0.8, 0.3, 0.3))
@@ -178,7 +180,7 @@ def test_ten_iterations_on_the_device_bring_eight_numbers_to_the_host(driver, mo
         assert count == iterations
         found[iterations] = driver.counts()
     more = {name: found[20][name] - found[10][name] for name in found[10]}
-    assert more["copies_to_host"] == 1 and more["bytes_to_host"] <= 64 and more["synchronisations"] == 0
+    assert more["copies_to_host"] == 1 and more["bytes_to_host"] <= 8 * ROOM and more["synchronisations"] == 0
     assert more["fills"] == more["copies_on_device"] == 0
     assert more["bytes_to_device"] <= 1024 * more["launches"]
 

@@ -7,7 +7,9 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti.mechanics.stress.projection import Projection
+from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
+from diffsim_ti.solvers.implicit.newton import Newton
 
 
 def beam(precision="f64", **more) -> ds.Scene:
@@ -340,3 +342,43 @@ def test_a_little_less_than_the_share_that_is_named_is_borne(load):
     u = pressed_beyond(load, 0.99 * share * 3 * LIMIT).forward().displacements[-1]
     assert -0.05 < u[:, 0].min() < -0.02
     assert share_named(pressed_beyond(load, 1.02 * share * 3 * LIMIT)) > 0.97
+
+
+def moving(name: str) -> ds.Rollout:
+    shape = ((2, 2, 3), 0.1) if name == "blocks" else ((3, 3, 4), (0.2, 0.2, 0.3))
+    mesh = ds.TetrahedralMesh.create_box(*shape).translated((0.0, 0.006, 0.0))
+    terms, fixed = [ds.Gravity(), ds.Ground(friction=0.3, width=5e-3)], None
+    if name in ("slides", "balance"):
+        terms, fixed = [ds.Gravity()], {"xmin": "x", "ymin": [0.0, 1.0, 1.0], "zmin": "z"}
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.4), 1000.0, terms, fixed, precision="f64")
+    return ds.Rollout(ds.StaticSolver(scene) if name == "balance" else ds.ImplicitEulerSolver(scene, dt=0.01), 1)
+
+
+@pytest.mark.parametrize("name, small", [("blocks", 300), ("multigrid", 0), ("slides", 0), ("balance", 300)])
+def test_rounds_on_the_device_are_those_of_the_host(name, small, monkeypatch):
+    """small: vertices up to which a solve is one kernel."""
+    monkeypatch.setattr(DeviceNewton, "small", small)
+    found, taken, here = [], [], Newton._on_device
+    for choose in (lambda self: taken.append(here(self)) or taken[-1], lambda self: None):
+        monkeypatch.setattr(Newton, "_on_device", choose)
+        rollout = moving(name)
+        frames = rollout.forward()
+        found.append((frames.positions, rollout.vjp(frames, frames.positions)["youngs_modulus"]))
+    assert taken and all(taken)
+    (x, by_E), (other, by_other_E) = found
+    assert np.abs(x - other).max() <= 1e-9 * np.ptp(x, 0).max() and abs(by_E - by_other_E) <= 1e-6 * abs(by_other_E)
+
+
+def test_rounds_that_the_device_leaves_go_on_on_the_host(monkeypatch):
+    """A column that is pressed beyond its buckling load meets indefinite Hessians: the same minimum."""
+    mesh, runs = ds.TetrahedralMesh.create_box((9, 2, 2), (0.8, 0.1, 0.1)), []
+    pressed = [ds.Traction([-6e3, 0.0, 1.0], "xmax")]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, pressed, "xmin", precision="f64")
+    solver = ds.ImplicitEulerSolver(scene, dt=0.5)
+    for choose in (Newton._on_device, lambda self: None):
+        monkeypatch.setattr(Newton, "_on_device", choose)
+        workspace = solver.workspace(solver.start_values())
+        workspace.advance(0, 1, 1)
+        runs.append((workspace.u_star, workspace.newton.report.indefinite))
+    assert runs[0][1] > 0 and runs[1][1] > 0
+    assert np.abs(runs[0][0] - runs[1][0]).max() < 1e-4 * np.abs(runs[0][0]).max()

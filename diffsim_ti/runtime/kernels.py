@@ -77,6 +77,11 @@ class Kernel:
         first, call, arguments = self.call("body", {})
         self.kernel = _compiled(name, arguments, [*first, call], dict(body=body))
 
+    @property
+    def variables(self) -> int:
+        """Its local variables, by whose square its compile time grows; 0 before its first launch."""
+        return getattr(self.kernel._primal, "variables", 0)
+
     def call(self, body: str, names: dict, prefix: str = "") -> tuple[list, str, dict]:
         """(lines before all loops, the line that calls the body, {argument: type}) in the source of a kernel; names: of the
         arguments that have others there, {(bundle, array): argument}."""
@@ -114,54 +119,61 @@ def _compiled(name: str, arguments: dict, lines: list, scope: dict):
 
 
 class Repeated:
-    """Kernels one after the other, again and again in one launch: `launch(times, numbers of each kernel)`.
+    """Kernels one after the other, again and again in one launch: `launch(times, **numbers)`.
 
-    parts: [(kernel, records)], as of `Kernel.bind`; an array that several of them take is one argument. The body of the
-    first says whether the others are still wanted. On one thread of the processor it is asked each time; elsewhere the
-    others themselves do nothing once they are not wanted, in a list of tasks that names them so often (repeated_loops.py).
+    groups: lists of (kernel, records, numbers), records as of `Kernel.bind`; an array that several of them take is one
+    argument; numbers: None where they are those of the launch. The body of the first of a group says whether the others are
+    wanted. On one thread of the processor it is asked each time; elsewhere the others themselves do nothing once they are
+    not wanted, in a list of tasks that names them so often (repeated_loops.py).
     """
 
-    def __init__(self, name: str, parts: list, parallel: bool, vectorized: bool = False):
-        kernels, known, arrays, names = [kernel for kernel, _ in parts], {}, [], []
-        for k, (kernel, records) in enumerate(parts):
+    def __init__(self, name: str, groups: list[list], parallel: bool, vectorized: bool = False):
+        parts, known, arrays, names = [part for group in groups for part in group], {}, [], []
+        kernels, own_numbers = tuple(kernel for kernel, *_ in parts), [numbers for *_, numbers in parts]
+        for k, (kernel, records, _) in enumerate(parts):
             own = {(b, a): _found(records[b], a) for b, of in kernel.arrays.items() for a in of}
             for (b, a), array in own.items():
                 if id(array) not in known:
                     known[id(array)] = f"k{k}_{b}_{a}"
                     arrays.append(array)
             names.append(tuple((place, known[id(array)]) for place, array in own.items()))
-        self._names, one_thread = [kernel.numbers for kernel in kernels], runs_on_cpu() and not parallel
-        made = _repeated_kernel(name, tuple(kernels), tuple(names), one_thread)
+        one_thread, shared = runs_on_cpu() and not parallel, tuple(numbers is None for numbers in own_numbers)
+        made, numbers = _repeated_kernel(name, kernels, tuple(names), shared, tuple(map(len, groups)), one_thread)
         title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
         options = dict(title=title, loops=0 if one_thread else -1)
-        self._launch = Launch(made, *arrays, vectorized=vectorized, **options)
+        launch = Launch(made, *arrays, vectorized=vectorized, **options)
+        own = [(n, None if k is None else own_numbers[k][n]) for k, n in numbers]
+        self._launch = lambda times, given: launch(*(given[n] if x is None else x for n, x in own), times)
 
     @staticmethod
     def is_possible(parallel: bool) -> bool:
         """Whether this machine can: Vulkan's drivers lend a kernel too few arrays."""
         return runs_on_cpu() and not parallel or can_repeat()
 
-    def __call__(self, times: int, *numbers: dict) -> None:
-        self._launch(*(own[n] for names, own in zip(self._names, numbers, strict=True) for n in names), times)
+    def __call__(self, times: int, **numbers) -> None:
+        self._launch(times, numbers)
 
 
 @lru_cache(maxsize=None)
-def _repeated_kernel(name: str, kernels: tuple, names: tuple, one_thread: bool):
-    """The first of the kernels says whether it goes on."""
+def _repeated_kernel(name: str, kernels: tuple, names: tuple, shared: tuple, sizes: tuple, one_thread: bool):
+    """(the kernel, its numbers as (place of the part that they are of, name)); shared: whether those of a part are not its
+    own, so that the place is None; sizes: of the groups."""
     lines, calls, arrays, numbers, scope = [], [], {}, {}, {}
     for k, (kernel, own) in enumerate(zip(kernels, names)):
-        first, call, arguments = kernel.call(f"body{k}", dict(own), f"k{k}_")
-        of_numbers = {f"k{k}_{n}" for n in kernel.numbers}
+        prefix = "" if shared[k] else f"k{k}_"
+        first, call, arguments = kernel.call(f"body{k}", dict(own), prefix)
+        of_numbers = {prefix + n: (None if shared[k] else k, n) for n in kernel.numbers}
         arrays |= {a: kind for a, kind in arguments.items() if a not in of_numbers and a not in arrays}
-        numbers |= {a: kind for a, kind in arguments.items() if a in of_numbers}
+        numbers |= {a: (arguments[a], place) for a, place in of_numbers.items()}
         scope[f"body{k}"] = kernel.body
-        lines, calls = lines + first, [*calls, call]
+        lines, calls = lines + [line for line in first if line not in lines], [*calls, call]
     if one_thread:
-        inner = [f"    if {calls[0]}:", *(f"        {call}" for call in calls[1:])]
-        lines += ["ti.loop_config(serialize=True)", "for _ in range(times):", *inner]
-    else:
-        lines += calls[1:]
-    return _compiled(name, arrays | numbers | dict(times=ti.i32), lines, scope)
+        lines += ["ti.loop_config(serialize=True)", "for _ in range(times):"]
+    for size in sizes:
+        (asks, *own), calls = calls[:size], calls[size:]
+        lines += [f"    if {asks}:", *(f"        {call}" for call in own)] if one_thread else own
+    kinds = {a: kind for a, (kind, _) in numbers.items()}
+    return _compiled(name, arrays | kinds | dict(times=ti.i32), lines, scope), [place for _, place in numbers.values()]
 
 
 @lru_cache(maxsize=None)

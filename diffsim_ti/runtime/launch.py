@@ -54,6 +54,7 @@ class Launch:
             before = made["variables"]
             compiled = kernel.compiled_kernels[kernel.ensure_compiled(*self._arrays, *numbers)]
             self.variables = made["variables"] - before  # that were traced here
+            kernel.variables = max(self.variables, getattr(kernel, "variables", 0))
             self._code = self._compile(prog, config, compiled)
         if self._loops:
             self._repeated = RepeatedLoops(self._code, self._owner, self._loops)
@@ -99,10 +100,11 @@ class Launch:
             self._buffer.restore()
         known = self._set
         for k, (setter, index, is_float) in enumerate(self._setters):
-            if is_float or numbers[k] != known[k]:  # a third of a microsecond each
+            number = numbers[k]
+            if number is not known[k] and (is_float or number != known[k]):  # a third of a microsecond each
                 known[k] = None  # also if this is interrupted
-                setter(index, numbers[k])
-                known[k] = numbers[k]
+                setter(index, number)
+                known[k] = number
         if self._repeated:
             with self._repeated.times(numbers[-1]):
                 self._owner().launch_kernel(self._code, self._context)

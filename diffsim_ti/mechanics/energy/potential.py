@@ -184,10 +184,10 @@ class Potential:
     def blocks(self) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
         a = self.arrays
-        self.launch("blocks", out=self._block_arrays)
+        self.launch("blocks", out=self.block_arrays)
         if self.pairs:
-            self.pairs.add_blocks(self.u, self._block_arrays.blocks)
-        blocks = np.swapaxes(runtime.fetch(self._block_arrays.blocks).astype(np.float64), 0, 1)
+            self.pairs.add_blocks(self.u, self.block_arrays.blocks)
+        blocks = np.swapaxes(runtime.fetch(self.block_arrays.blocks).astype(np.float64), 0, 1)
         for part in self._on_host():
             blocks = blocks + part.blocks(self.held_at)
         if a.points > 1:
@@ -214,7 +214,7 @@ class Potential:
         return self._points[1]
 
     @cached_property
-    def _block_arrays(self) -> SimpleNamespace:
+    def block_arrays(self) -> SimpleNamespace:
         a = self.arrays
         corners = runtime.array(a.vector, 3 * a.corner.shape[0])
         room = 81 * a.points * a.num_blocks
@@ -242,12 +242,12 @@ class Potential:
         """d2psi/dF2 [Pa] at each point, its patch's pressure frozen, where `blocks` was last called, shape (points, 9,
         9)."""
         a = self.arrays
-        return a.from_blocks(runtime.fetch(self._block_arrays.tangent), 81 * a.points).reshape(-1, 9, 9)
+        return a.from_blocks(runtime.fetch(self.block_arrays.tangent), 81 * a.points).reshape(-1, 9, 9)
 
     def tangent_chunks(self, size: int):
         """(slice, `tangents` of it) for so many tetrahedra after the other, which caches hold."""
-        a, source = self.arrays, runtime.view(self._block_arrays.tangent)
-        source = runtime.fetch(self._block_arrays.tangent) if source is None else source
+        a, source = self.arrays, runtime.view(self.block_arrays.tangent)
+        source = runtime.fetch(self.block_arrays.tangent) if source is None else source
         for begin in range(0, a.num_tetrahedra, size):
             part = slice(begin, min(begin + size, a.num_tetrahedra))
             yield part, a.from_blocks(source, 81 * a.points, part).reshape(-1, 9, 9)

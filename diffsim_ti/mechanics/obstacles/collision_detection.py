@@ -32,34 +32,34 @@ class CollisionDetection:
     places, drifts: where obstacles are, and how they go meanwhile (state/obstacle_poses.py).
     """
 
-    far = 1e30
+    far, kept = 1e30, 0.1  # of the distance, or of the width if that is less, where an obstacle is met
 
     def __init__(self, arrays, parallel: bool):
         self.a, a = arrays, arrays
         self.terms, mesh = a.contacts, a.mesh
-        self._kernels = swept_kernels(a.features(), a.precision, parallel)
+        self.kernels = swept_kernels(a.features(), a.precision, parallel)
         self.vertices, self.count = mesh.surface_vertices, len(mesh.surface_vertices)
-        self._way = SimpleNamespace(
+        self.way = SimpleNamespace(
             vertices=runtime.upload(self.vertices, ti.i32),
             step=runtime.array(a.vector, 1, a.num_vertices),
             places=runtime.array(a.vector, a.poses.size // 3),
             drifts=runtime.array(a.vector, a.poses.size // 3),
         )
         self._at = SimpleNamespace(u=runtime.array(a.vector, 1, a.num_vertices))
-        self._out = SimpleNamespace(found=runtime.array(a.fp, self.count), blocker=runtime.array(ti.i32, self.count))
+        self.found = SimpleNamespace(found=runtime.array(a.fp, self.count), blocker=runtime.array(ti.i32, self.count))
         self._launches = {}
         self.met: Met | None = None  # what the last detection found
 
     def share(
-        self, u: np.ndarray, step: np.ndarray, places: np.ndarray, drifts=0.0, most: float = 1.0, kept=0.1
+        self, u: np.ndarray, step: np.ndarray, places: np.ndarray, drifts=0.0, most: float = 1.0, kept=kept
     ) -> float:
         """A share of the step from u, at most `most`, on which no vertex meets an obstacle. Where one would, the
         share `kept` of its distance (or of the width, if that is less) is kept. `met` says what stopped it."""
         if not self.terms or not (np.any(step) or np.any(drifts)):
             self.met = None
             return most
-        runtime.fill(self._way.step, step[None])
-        runtime.fill(self._way.drifts, drifts)
+        runtime.fill(self.way.step, step[None])
+        runtime.fill(self.way.drifts, drifts)
         self._check("shares", u, places, most, kept)
         return most if self.met is None else self.met.value
 
@@ -67,8 +67,8 @@ class CollisionDetection:
         """What is in an obstacle, or `within` [m] of one; where all is farther away, None."""
         if not self.terms:
             return None
-        runtime.fill(self._way.step, 0)
-        runtime.fill(self._way.drifts, 0)
+        runtime.fill(self.way.step, 0)
+        runtime.fill(self.way.drifts, 0)
         self._check("distances", u, places, max(within, 1e-30))
         return self.met
 
@@ -83,14 +83,24 @@ class CollisionDetection:
 
     def _check(self, name: str, u, places, most: float, kept: float = 0.0) -> None:
         if name not in self._launches:
-            own = dict(scene=self.a, way=self._way, at=self._at, out=self._out)
-            self._launches[name] = getattr(self._kernels, name).bind(**own)
+            own = dict(scene=self.a, way=self.way, at=self._at, out=self.found)
+            self._launches[name] = getattr(self.kernels, name).bind(**own)
         runtime.fill(self._at.u, u[None])
-        runtime.fill(self._way.places, places)
+        runtime.fill(self.way.places, places)
         self._launches[name](count=self.count, most=most, kept=kept)
-        found, blocker = runtime.fetch(self._out.found), runtime.fetch(self._out.blocker)
+        self.read()
+
+    def put(self, places: np.ndarray) -> None:
+        """Obstacles stand at places, for kernels that are launched elsewhere."""
+        runtime.fill(self.way.places, places)
+        runtime.fill(self.way.drifts, 0)
+
+    def read(self) -> Met | None:
+        """What the kernels have found, which is `met` then."""
+        found, blocker = runtime.fetch(self.found.found), runtime.fetch(self.found.blocker)
         j = int(found.argmin())
         self.met = Met((int(self.vertices[j]),), int(blocker[j]), float(found[j])) if blocker[j] >= 0 else None
+        return self.met
 
     @property
     def widths(self) -> list[float]:

@@ -9,7 +9,8 @@ from diffsim_ti.runtime import PRECISIONS, Kernel
 
 A = ti.template()
 # places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature, 3 r . z <= 0
-RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST = range(7)
+RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST, LIMIT = range(8)
+NUMBERS, ROOM = 8, 48  # of these; of those behind them, which are Newton's method's (newton_kernels.py), too
 
 
 @dataclass(frozen=True)
@@ -32,12 +33,11 @@ class CGKernels:
         return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
     @ti.func
-    def total(self, part: A, k, chunks):
-        """The sum of what chunks have left in row k."""
-        out = ti.cast(0, self.fp)
-        for c in range(chunks):
-            out += part[k, c]
-        return out
+    def add_up(self, part: A, rows: A, chunks):
+        """part[k, 0] = the sum of what chunks have left in each of so many rows k."""
+        for c in range(1, chunks):
+            for k in ti.static(range(rows)):
+                part[k, 0] = part[k, 0] + part[k, c]
 
     @ti.func
     def to(self, fp: A, v):
@@ -66,6 +66,32 @@ class CGKernels:
         return Kernel("scale", self.divide, self.vectors, arrays, dict(nodes="int"))
 
     @ti.func
+    def inverses(self, cg: A, body: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.nodes):
+            if cg.free[i] > 0:
+                D = ti.Matrix.zero(self.fp, 3, 3)
+                for j, k in ti.static(ti.ndrange(3, 3)):
+                    D[j, k] = ti.cast(out.blocks[j, i][k] + out.blocks[k, i][j], self.fp) * ti.cast(0.5, self.fp)
+                least = D - ti.Matrix.identity(self.fp, 3) * (body.least[i] - body.mass[i])
+                minor = least[0, 0] * least[1, 1] - least[0, 1] * least[1, 0]
+                body.hard[i] = 1
+                if least[0, 0] > 0 and minor > 0 and least.determinant() > 0:
+                    body.hard[i] = 0
+                inverse = (D + ti.Matrix.identity(self.fp, 3) * body.mass[i]).inverse()
+                for j in ti.static(range(3)):
+                    cg.inverse[j, i] = ti.Vector([inverse[0, j], inverse[1, j], inverse[2, j], 0], self.fp)
+
+    @cached_property
+    def invert(self) -> Kernel:
+        """D^-1 of each block of a stiffness with inertia; hard: whether it is less than `least`."""
+        arrays = dict(
+            cg=dict(free="scalars", inverse="vectors2"), body=dict(hard="ints", mass="scalars", least="scalars")
+        )
+        arrays |= dict(out=dict(blocks=f"vectors2_{self.scene}"))
+        return Kernel("invert", self.inverses, self.vectors, arrays, dict(nodes="int"))
+
+    @ti.func
     def first(self, cg: A, at: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
@@ -75,7 +101,8 @@ class CGKernels:
             cg.part[0, c] = rz
         ti.loop_config(serialize=True)
         for _ in range(1):
-            rz, old = self.total(cg.part, 0, plan.chunks), cg.state[RZ]
+            self.add_up(cg.part, 1, plan.chunks)
+            rz, old = cg.part[0, 0], cg.state[RZ]
             if cg.state[STOPPED] == 0 and not rz > 0:
                 cg.state[STOPPED] = ti.cast(3, self.fp)
             cg.state[BETA] = ti.cast(0, self.fp)
@@ -135,8 +162,8 @@ class CGKernels:
     @ti.func
     def choose(self, cg: A, plan: A):
         """alpha = r . z / p . A p, zero once it has stopped."""
-        curvature = self.total(cg.part, 0, plan.chunks)
-        size = ti.sqrt(self.total(cg.part, 1, plan.chunks) * self.total(cg.part, 2, plan.chunks))
+        self.add_up(cg.part, 3, plan.chunks)
+        curvature, size = cg.part[0, 0], ti.sqrt(cg.part[1, 0] * cg.part[2, 0])
         cg.state[ALPHA] = ti.cast(0, self.fp)
         if cg.state[STOPPED] == 0:
             cg.state[COUNT] = cg.state[COUNT] + ti.cast(1, self.fp)
@@ -167,7 +194,8 @@ class CGKernels:
             cg.part[0, c] = square
         ti.loop_config(serialize=True)
         for _ in range(1):
-            cg.state[SQUARE] = self.total(cg.part, 0, plan.chunks)
+            self.add_up(cg.part, 1, plan.chunks)
+            cg.state[SQUARE] = cg.part[0, 0]
             if cg.state[STOPPED] == 0 and cg.state[SQUARE] <= cg.state[LEAST]:
                 cg.state[STOPPED] = ti.cast(1, self.fp)
 

@@ -86,6 +86,5 @@ class Closing:
 
     def _out_of_balance(self, u, problem) -> np.ndarray:
         newton = self.ws.newton
-        newton.mass, newton.inertial, newton.loads = problem
-        newton.preconditioner, newton.stiffness = newton.preconditioners(problem[0])
+        newton.pose(problem)
         return newton.residual_at(u)

@@ -1,5 +1,7 @@
 """Conjugate gradients on the device: of what crosses to the host, a few numbers every few iterations."""
 
+from collections.abc import Callable
+
 import numpy as np
 import taichi as ti
 
@@ -7,7 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Mass
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of
 from diffsim_ti.runtime import PRECISIONS, Repeated, arch_name, array_types, kernels_of, runs_on_cpu
-from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, SQUARE, STOPPED, CGKernels
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, LIMIT, ROOM, SQUARE, STOPPED, CGKernels
 
 
 class DeviceCG:
@@ -30,7 +32,7 @@ class DeviceCG:
         self.length = max(self.shortest, -(-n // self.most_chunks))
         self.chunks = -(-n // self.length)
         self.x, self.r, self.z, self.p, self.q = (runtime.array(self._vector, 1, n) for _ in range(5))
-        self.part, self.state = runtime.array(fp, 3, self.chunks), runtime.array(fp, 8)
+        self.part, self.state = runtime.array(fp, 6, self.chunks), runtime.array(fp, ROOM)
         self.mass, self.free = runtime.array(fp, n), runtime.array(fp, n)
         runtime.fill(self.free, mask_of(free)[:, 0])
         self.guided = isinstance(free, FreeDirections)
@@ -43,8 +45,10 @@ class DeviceCG:
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
         self._is_one_kernel = potential.is_one_kernel and Repeated.is_possible(parallel)
         whole = runs_on_cpu() and not parallel and self._is_one_kernel
+        # whether rounds of Newton's method are on the device, too
+        self.takes_rounds = self._is_one_kernel and self.precision == "f64"
         # iterations between looks at the state; on a card so many as the solve before took
-        self._look, self._last = self.many if whole else 1 if runs_on_cpu() else 0, 10
+        self._look, self.last = self.many if whole else 1 if runs_on_cpu() else 0, 10
         self._iterations = {}  # (with a matrix, convex) -> iterate(times, rounding)
         self._room = -1  # blocks of that matrix
         self._filled: np.ndarray | None = None  # what `mass` holds
@@ -68,39 +72,55 @@ class DeviceCG:
         """A matrix of blocks that joins the Hessian."""
         more = more.tobsr((3, 3))
         if len(more.data) > self._room:
-            self._room, self._iterations = max(2 * len(more.data), 1), {}
+            self._room = max(2 * len(more.data), 1)
+            self._iterations = {kind: own for kind, own in self._iterations.items() if not kind[0]}
             self.start, self.column = runtime.array(ti.i32, self.nodes + 1), runtime.array(ti.i32, self._room)
             self.blocks = self._columns(more.data, self._room)
         self._fill(self.blocks, more.data)
         runtime.fill(self.start, more.indptr)
         runtime.fill(self.column, np.pad(more.indices, (0, self._room - len(more.indices))))
 
+    def parts(self, more: bool) -> list:
+        """An iteration, as [(kernel, records, numbers)] of `Repeated`."""
+        potential, own = self.potential, dict(cg=self, at=self.potential)
+        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
+        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
+        before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
+        return [*before, (*potential.multiplying, None), (kernels.step, own, None)]
+
+    def serve(self, iterate: Callable) -> None:
+        """Let what serves Newton's method, too, make iterations: (times, rounding) -> so many."""
+        self._iterations[False, False] = iterate
+
     def _iteration(self, more: bool, convex: bool):
         """(times, rounding) -> so many iterations."""
-        potential, sizes, lanes, own = self.potential, self._sizes, runs_on_cpu(), dict(cg=self, at=self.potential)
-        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
-        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
-        before = [*before, (kernels.turn, own, sizes)]
+        parts, potential, lanes = self.parts(more), self.potential, runs_on_cpu()
         if self._is_one_kernel:
-            parts = [(kernels.wanted, own, {}), *before, (*potential.multiplying, None), (kernels.step, own, None)]
-            repeated, sizes_before = (
-                Repeated("cg", [x[:2] for x in parts], self.parallel, lanes),
-                [x[2] for x in parts[:-2]],
-            )
-            return lambda times, rounding: repeated(
-                times, *sizes_before, potential.sizes(), sizes | dict(rounding=rounding)
-            )
-        launches = [(kernel.bind(lanes, **records), numbers) for kernel, records, numbers in before]
-        step = kernels.step.bind(lanes, **own)
+            repeated = Repeated("cg", [parts], self.parallel, lanes)
+            return lambda times, rounding: repeated(times, **potential.sizes(), **self._sizes, rounding=rounding)
+        launches = [(kernel.bind(lanes, **records), numbers or self._sizes) for kernel, records, numbers in parts[1:-2]]
+        step = parts[-1][0].bind(lanes, **parts[-1][1])
 
         def iterate(times: int, rounding: float) -> None:
             for _ in range(times):
                 for launch, numbers in launches:
                     launch(**numbers)
                 potential.multiply(convex)
-                step(**sizes, rounding=rounding)
+                step(**self._sizes, rounding=rounding)
 
         return iterate
+
+    def put_mass(self, mass: Mass) -> None:
+        """c m, shape (num_vertices, 1)."""
+        if mass is not self._filled:
+            runtime.fill(self.mass, mass[:, 0])
+            self._filled = mass
+
+    def iterate(self, done: int, most: int, eps: float, more: bool = False, convex: bool = False) -> None:
+        """Some of at most so many iterations, of which some are done."""
+        if (more, convex) not in self._iterations:
+            self._iterations[more, convex] = self._iteration(more, convex)
+        self._iterations[more, convex](min(self._look or max(2, self.last - done, done), most - done), 10 * eps)
 
     def __call__(
         self, mass: Mass, more, convex: bool, b: np.ndarray, tolerance: float, max_iterations: int, eps: float
@@ -115,28 +135,23 @@ class DeviceCG:
             return np.zeros_like(b), 0.0, 0, None
         if more is not None:
             self._put(more)
-        kind = more is not None, convex
-        if kind not in self._iterations:
-            self._iterations[kind] = self._iteration(*kind)
-        if mass is not self._filled:
-            runtime.fill(self.mass, mass[:, 0])
-            self._filled = mass
+        self.put_mass(mass)
         runtime.fill(self.r, (b / size)[None])
-        state = np.zeros(8)
-        state[LEAST] = tolerance**2
+        state = np.zeros(ROOM)
+        state[LEAST], state[LIMIT] = tolerance**2, max_iterations
         runtime.fill(self.state, state)
         done = 0
         while done < max_iterations:
-            times = min(self._look or max(2, self._last - done, done), max_iterations - done)
-            self._iterations[kind](times, 10 * eps)
-            done, state = done + times, runtime.fetch(self.state)
+            self.iterate(done, max_iterations, eps, more is not None, convex)
+            state = runtime.fetch(self.state)
+            done = max(done + 1, int(state[COUNT]))
             if state[STOPPED] or not np.isfinite(state[SQUARE]):
                 break
         if state[STOPPED] == 3:  # the preconditioner is not positive definite
             return np.zeros_like(b), np.inf, int(state[COUNT]), None
         if not np.isfinite(state[SQUARE]):
             raise FloatingPointError("the stiffness of this state is not finite")
-        count = self._last = int(state[COUNT])
+        count = self.last = int(state[COUNT])
         negative = None
         if state[STOPPED] == 2:
             negative = runtime.fetch_row(self.p, 0)

@@ -59,6 +59,10 @@ class Multigrid(Preconditioner):
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
         self._contact = None
 
+    def updating(self) -> tuple[list, object]:
+        changes = self.potential.arrays.contacts or self.potential.pairs or self.potential.hosts
+        return ([], None) if changes else ([self.frames.part], self.frames.body)
+
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
         self.frames.update()

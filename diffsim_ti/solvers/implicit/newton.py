@@ -12,18 +12,21 @@ starts need that).
 Kane, Marsden, Ortiz, West 2000, doi:10.1002/1097-0207(20001210)49:10<1295::AID-NME993>3.0.CO;2-W.
 """
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from diffsim_ti.common.errors import NotConverged
-from diffsim_ti.inputs import diagonal_of
+from diffsim_ti.inputs import ConsistentMass, diagonal_of
 from diffsim_ti.mechanics.host_force import NONE, HostForces
 from diffsim_ti.mechanics.obstacles.collision_detection import Met
 from diffsim_ti.mechanics.stress.projection import Projection
-from diffsim_ti.mechanics.supports.free import Free, cleaned, linear_of, mask_of
+from diffsim_ti.mechanics.supports.free import Free, FreeDirections, cleaned, linear_of, mask_of
+from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
+from diffsim_ti.solvers.implicit.newton_kernels import BEFORE, DONE, FLOOR, PHASE, ROUND
 
 LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction that are doubled while Phi falls
 
@@ -66,6 +69,7 @@ class Newton:
     patience = 6  # times as many rounds as asked for, at most (`_goes_on`)
     steady = 10  # rounds that halve the residual while more than asked for are taken; 0: none are
     by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
+    detection = None  # of obstacles (obstacles/collision_detection.py); without, rounds are the host's
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
     def __init__(
@@ -114,15 +118,28 @@ class Newton:
         """
         self.report = report = NewtonReport()
         self.reports.append(report)
-        self.mass, self.inertial, self.loads, self._turning = mass, inertial, loads, False
+        self._turning = False
+        self.pose((mass, inertial, loads))
         u = self.potential.place(start)
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
-        self.preconditioner, self.stiffness = self.preconditioners(mass)
-        E, norm, rough, solved, far = self._evaluate(u), np.inf, False, False, np.abs(u).max(1, keepdims=True)
-        self.upright = bool(np.all(E[2] > 0))
-        most = self.max_iterations if rounds is None else rounds
+        E, norm, rough, solved, far = None, np.inf, False, False, np.abs(u).max(1, keepdims=True)
+        most, floor, self.upright, on_host = self.max_iterations if rounds is None else rounds, 0.0, None, bool(rounds)
         while self._goes_on(most, rounds is None):
+            device = None if on_host else self._on_device()
+            if device:
+                u, numbers = device(self, max(most - len(report.residuals), 1))
+                if numbers[PHASE] == DONE and not leave_saddles:
+                    return u
+                u, E, norm, floor = self.potential.place(u), None, numbers[BEFORE] or np.inf, numbers[FLOOR]
+                if numbers[ROUND]:
+                    report.residuals.pop()
+                on_host = True  # goes on with this round
+                continue
+            on_host = bool(rounds)
+            if E is None:
+                E = self._evaluate(u)
+                self.upright = bool(np.all(E[2] > 0)) if self.upright is None else self.upright
             (R, size), before = self._residual(u), norm
             rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far) + self.rigid.rounding
             floor = 4 * np.linalg.norm(self._rigidity() * rounding * self.moves)
@@ -163,6 +180,19 @@ class Newton:
             return u
         report.place = u
         raise NotConverged(self._why(report.residuals), report.residuals)
+
+    def _on_device(self) -> DeviceNewton | None:
+        """What takes rounds without the host; None where that takes part in forces or in linear solves."""
+        potential, preconditioner, static = self.potential, self.preconditioner, not diagonal_of(self.mass).any()
+        plain = self.detection and (isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections)
+        on_host = potential.pairs or potential.hosts or self.others or self.volumes or self.rigid
+        if not plain or on_host or isinstance(self.mass, ConsistentMass) or not preconditioner.solver.takes_rounds:
+            return None
+        if preconditioner.given_up or static and preconditioner.spent > 2 * preconditioner.patience:
+            return None
+        if preconditioner.rounds is None:
+            preconditioner.rounds = DeviceNewton(potential, preconditioner, self.detection)
+        return preconditioner.rounds
 
     def _why(self, done: list) -> str:
         """What a solve that failed says, and what helps: more rounds where they gained to the last."""
@@ -363,18 +393,33 @@ class Newton:
         """Change of Phi along a step without those of E and W."""
         return float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
 
-    def rise(self, u: np.ndarray, before: tuple, there: np.ndarray, problem: tuple) -> float:
-        """How much higher Phi is at another place than at u, where the energy was `before`. Forces without an energy do no
-        more work on the way than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+    def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[np.ndarray], float]:
+        """there -> how much higher Phi is at another place than at u. Forces without an energy do no more work on the way
+        than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+        self.pose(problem)
+        device = self._on_device()
+        if device:
+            device.stand(self, u)
+            return device.rise
+        self.potential.place(u)
+        E, _, J0 = self.potential.energy()
+
+        def rise(there: np.ndarray) -> float:
+            step = self.potential.place(there) - u
+            after, _, J = self.potential.energy()
+            if np.any((J0 > 0) & ~((J > 0.1 * J0) & (J < 10 * J0))):
+                return np.inf
+            change = after - E + self._against_loads(u, step)
+            if self.others:
+                change -= min(float((self.others.forces(u) * step).sum()), self.others.work(u, step))
+            return change
+
+        return rise
+
+    def pose(self, problem: tuple) -> None:
+        """What is solved: mass, inertial and loads of `solve`."""
         self.mass, self.inertial, self.loads = problem
-        step = self.potential.place(there) - u
-        (after, _, J), (E, _, J0) = self.potential.energy(), before
-        if np.any((J0 > 0) & ~((J > 0.1 * J0) & (J < 10 * J0))):
-            return np.inf
-        change = after - E + self._against_loads(u, step)
-        if self.others:
-            change -= min(float((self.others.forces(u) * step).sum()), self.others.work(u, step))
-        return change
+        self.preconditioner, self.stiffness = self.preconditioners(self.mass)
 
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in

@@ -3,9 +3,15 @@
 Both are functions of the present state alone, so that a run that is started again from a checkpoint takes the same steps.
 """
 
-import numpy as np
+from types import SimpleNamespace
 
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
 from diffsim_ti.mechanics.supports.free import Free, FreeBodies, FreeDirections, mask_of
+from diffsim_ti.runtime import kernels_of
+from diffsim_ti.solvers.implicit.cg_kernels import CGKernels
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 from diffsim_ti.solvers.implicit.factorised import Effort
 
@@ -17,9 +23,21 @@ class Preconditioner:
 
     spent, given_up, unfit, has_warned = 0, False, False, False
     quick = 1  # products with multigrid take so many times as long
+    rounds = None  # of Newton's method with it on the device (device_newton.py)
 
     def begin(self) -> None:
         self.spent, self.given_up, self.unfit = 0, False, False
+
+    def learn(self, residual: float, iterations: int) -> None:
+        """What a linear solve took, to a relative residual."""
+
+    def follow(self, u: np.ndarray) -> None:
+        """What `update` makes anew now and then, before what it does each time."""
+
+    def updating(self) -> tuple[list, object]:
+        """(what `update` does, as [(kernel, records, numbers)] of `Repeated`; whose `hard` is not zero where a vertex needs
+        the host all the same); nothing where that is needed anyway."""
+        return [], None
 
     @property
     def effort(self) -> Effort:
@@ -57,6 +75,18 @@ class BlockJacobi(Preconditioner):
             self._inverse = self.free.around(self._inverse)
         if self.solver:
             self.solver.put_inverse(self._inverse)
+
+    def updating(self) -> tuple[list, object]:
+        a, p, solver = self.potential.arrays, self.potential, self.solver
+        if isinstance(self.free, FreeDirections) or a.points > 1 or a.patches is not None:
+            return [], None
+        kernels, n = kernels_of(CGKernels, a.precision, solver.precision, solver.parallel, False, False), len(self.mass)
+        kind = runtime.PRECISIONS[solver.precision]
+        body = SimpleNamespace(hard=runtime.array(ti.i32, n), mass=runtime.array(kind, n), least=runtime.array(kind, n))
+        runtime.fill(body.mass, self.mass[:, 0])
+        runtime.fill(body.least, np.broadcast_to(self.least, (n, 1))[:, 0])
+        blocks = p.kernels.blocks, dict(scene=a, pass_=p, at=p, out=p.block_arrays), None
+        return [blocks, (kernels.invert, dict(cg=solver, body=body, out=p.block_arrays), None)], body
 
     def _inverted(self, D: np.ndarray) -> np.ndarray:
         least = np.broadcast_to(self.least, (len(D), 1))

@@ -22,7 +22,7 @@ class Frames:
         share = 1 / (np.bincount(at, np.repeat(points.volumes, self.count[1]), n) + 1e-300)
         gradients = points.gradients * points.volumes[:, None, None]
         self.turned = runtime.array(ROWS[3], 3 * n)
-        self._body = SimpleNamespace(
+        self.body = SimpleNamespace(
             nodes=runtime.upload(at, ti.i32),
             gradients=runtime.upload(gradients.reshape(-1, 3), ROWS[3]),
             strains=runtime.array(ROWS[3], 3 * len(points.volumes)),
@@ -32,13 +32,17 @@ class Frames:
             hard=runtime.array(ti.i32, n),
         )
         kernel = kernels_of(FrameKernels, potential.arrays.precision, parallel).frames
-        self._launch = kernel.bind(at=potential, body=self._body, frames=self)
+        self.part = (
+            kernel,
+            dict(at=potential, body=self.body, frames=self),
+            dict(zip(("points", "nodes", "vertices"), self.count)),
+        )
+        self._launch = kernel.bind(**self.part[1])
 
     def update(self) -> None:
         """To the displacement at which the potential is placed."""
-        points, nodes, vertices = self.count
-        self._launch(points=points, nodes=nodes, vertices=vertices)
-        hard = np.nonzero(runtime.fetch(self._body.hard))[0]
+        self._launch(**self.part[2])
+        hard = np.nonzero(runtime.fetch(self.body.hard))[0]
         if len(hard):
             R = self.matrices()
             R[hard] = rotations_of(self._means()[hard])
@@ -54,7 +58,7 @@ class Frames:
 
     def _means(self) -> np.ndarray:
         """Mean deformation gradients."""
-        b = {name: runtime.fetch(getattr(self._body, name)) for name in ("strains", "point", "start", "share")}
+        b = {name: runtime.fetch(getattr(self.body, name)) for name in ("strains", "point", "start", "share")}
         columns = b["strains"].reshape(-1, 9)[b["point"]]
         at = np.repeat(np.arange(self.count[2]), np.diff(b["start"]))
         sums = np.stack([np.bincount(at, columns[:, k], self.count[2]) for k in range(9)], 1) * b["share"][:, None]

@@ -83,6 +83,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.preconditioner, self.noted, self.collisions = Preconditioners(self), Noted(self), ObstacleCollisions(self)
         finders, more = (self.collisions.past, self.preconditioner), (others, self.volumes)
         self.newton = Newton(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
+        self.newton.detection = self.collisions.detection
         self.approach, self.closing = Approach(self), Closing(self)
         self.check_apart()
 
@@ -293,16 +294,15 @@ class ImplicitWorkspace(PrescribedInPasses):
         inside out or meet an obstacle. The solution of a pass is the minimum that descends from u: where inertia or loads
         would lead what is stiff or light there are others."""
         best, least = u, 0.0
-        if starts:
-            self.potential.place(u)
-            before = self.potential.energy()
+        rise_of = self.newton.rises_from(u, problem) if starts else None
         for start in starts:
             # surfaces are looked at together where they have not passed through each other
-            if not self.pairs and not self.newton.rise(u, before, start, problem) < least:
+            rise = 0.0 if self.pairs else rise_of(start)
+            if not self.pairs and not rise < least:
                 continue
             longest = min(self.collisions.past(u, start - u)[0], self.pairs_share(u, start - u))
             at = self.rigid.nearest(u + longest * (start - u))
-            rise = self.newton.rise(u, before, at, problem)
+            rise = rise_of(at) if self.pairs or longest < 1 else rise
             if rise < least and not (self.rigid and not self.newton.is_free(u, at - u)):  # it turns on another way
                 best, least = at, rise
         return best

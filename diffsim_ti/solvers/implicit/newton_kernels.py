@@ -1,0 +1,351 @@
+"""Kernels of rounds of Newton's method (newton.py), all of whose numbers stay on the device."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import taichi as ti
+
+from diffsim_ti.runtime import PRECISIONS, Kernel, kernels_of
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, LIMIT, NUMBERS, SQUARE, STOPPED, CGKernels
+
+A = ti.template()
+# places of numbers in `state`, behind those of conjugate gradients: what is done next; norms of the residual and what
+# measures them; of the line search; potential and the sum of its absolute parts, before and where it is tried; of the report
+(PHASE, NORM, BEFORE, FLOOR, ROUGH, SLOPE, FRACTION, FRESH, DOUBTED, ACCEPTED, RISE) = range(NUMBERS, NUMBERS + 11)
+(E, PARTS, E_TRIED, PARTS_TRIED, UPRIGHT, ROUND, PRODUCTS, TRIALS, HALVINGS, CUTS) = range(RISE + 1, RISE + 11)
+# what a solve is told: tolerances, limits, and numbers of `Newton`
+(TOLERANCE, EPS, MOST, INSIST, INEXACT, ROUGHEST, SHORTEST) = range(CUTS + 1, CUTS + 8)
+COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
+# phases: it is done, or the host has to go on; energies where rises are measured from, and of one; where a solve starts, a
+# trial of the line search, its residual, the preconditioner, conjugate gradients
+DONE, TROUBLE, BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE = range(9)
+WAITS = 4  # of STOPPED: conjugate gradients have not begun
+
+
+@dataclass(frozen=True)
+class NewtonKernels:
+    """scene: precision of displacements and energies; vectors: of all else; guided: whether vertices are fixed in some
+    directions only; contact: whether there are obstacles."""
+
+    scene: str
+    vectors: str
+    parallel: bool
+    guided: bool
+    contact: bool
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.vectors]
+
+    @cached_property
+    def cg(self) -> CGKernels:
+        return kernels_of(CGKernels, self.scene, self.vectors, self.parallel, self.guided, False)
+
+    def _kernel(self, name: str, function, **arrays) -> Kernel:
+        cg = dict(part="scalars2", state="scalars") | arrays.pop("cg", {})
+        sizes = ("chunks", "length", "nodes", "points", "points_length", "count")
+        return Kernel(name, function, self.vectors, dict(cg=cg) | arrays, dict.fromkeys(sizes, "int"))
+
+    @ti.func
+    def end(self, c, length, count):
+        return ti.min((c + 1) * length, count)
+
+    @ti.func
+    def is_trial(self, cg: A, plan: A):
+        s = ti.cast(cg.state[PHASE], ti.i32)
+        return (s >= BASE and s <= TRY) or (s == SOLVE and cg.state[STOPPED] == 1)
+
+    @ti.func
+    def is_judged(self, cg: A, plan: A):
+        return cg.state[PHASE] == JUDGE
+
+    @ti.func
+    def is_updated(self, cg: A, plan: A):
+        return cg.state[PHASE] == UPDATE
+
+    @ti.func
+    def is_solved(self, cg: A, plan: A):
+        return cg.state[STOPPED] == 0 and cg.state[COUNT] < cg.state[LIMIT]
+
+    @cached_property
+    def wanted(self) -> list[Kernel]:
+        """Whether something is tried, whether it may be taken, whether the preconditioner is to follow, whether conjugate
+        gradients go on, for `Repeated`."""
+        own = dict(cg=dict(state="scalars"))
+        asks = self.is_trial, self.is_judged, self.is_updated, self.is_solved
+        return [Kernel(function.__name__, function, self.vectors, own, {}) for function in asks]
+
+    # ---- line search -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def find_direction(self, cg: A, newton: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for c in range(plan.chunks):
+            slope = ti.cast(0, self.fp)
+            for i in range(c * plan.length, self.end(c, plan.length, plan.nodes)):
+                d = cg.x[0, i] * cg.state[NORM]
+                if ti.static(self.guided):
+                    d = self.cg.allowed(i, cg, d)
+                newton.d[i] = d
+                if ti.static(self.contact):
+                    newton.step[0, i] = self.cg.to(PRECISIONS[self.scene], d)
+                slope += self.cg.dot(newton.R[i], d)
+            cg.part[0, c] = slope
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            cg.state[FRESH] = ti.cast(0, self.fp)
+            if cg.state[PHASE] == SOLVE and cg.state[STOPPED] == 1:
+                cg.state[PHASE], cg.state[FRESH] = ti.cast(TRY, self.fp), ti.cast(1, self.fp)
+                self.cg.add_up(cg.part, 1, plan.chunks)
+                cg.state[SLOPE] = cg.part[0, 0]
+                cg.state[FRACTION] = ti.cast(1, self.fp)
+                cg.state[PRODUCTS] = cg.state[PRODUCTS] + cg.state[COUNT]
+
+    @cached_property
+    def direction(self) -> Kernel:
+        """d of a linear solve, and R . d."""
+        cg = dict(x="vectors2", free="scalars") | (dict(guide="ints", held="vectors2") if self.guided else {})
+        own = dict(d="vectors", R="vectors") | (dict(step=f"vectors2_{self.scene}") if self.contact else {})
+        return self._kernel("direction", self.find_direction, cg=cg, newton=own)
+
+    @ti.func
+    def shorten(self, cg: A, out: A, plan: A):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            if cg.state[FRESH] == 1:
+                for j in range(plan.count):
+                    cg.state[FRACTION] = ti.min(cg.state[FRACTION], ti.cast(out.found[j], self.fp))
+                if cg.state[FRACTION] < 1:
+                    cg.state[CUTS] = cg.state[CUTS] + ti.cast(1, self.fp)
+
+    @cached_property
+    def bound(self) -> Kernel:
+        """The longest step before an obstacle, of what each vertex may go."""
+        found = "singles" if self.scene == "f32" else "doubles"
+        return self._kernel("bound", self.shorten, out=dict(found=found))
+
+    @ti.func
+    def go(self, cg: A, newton: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.nodes):
+            if cg.state[PHASE] == BASE or cg.state[PHASE] == START:
+                u, most = self.cg.to(self.fp, at.u[0, i]), ti.cast(0, self.fp)
+                for k in ti.static(range(3)):
+                    most = ti.max(most, ti.abs(u[k]))
+                newton.far[i], newton.u[i] = most, u
+            if cg.state[PHASE] == TRY:
+                at.u[0, i] = self.cg.to(PRECISIONS[self.scene], newton.u[i] + newton.d[i] * cg.state[FRACTION])
+
+    @cached_property
+    def move(self) -> Kernel:
+        """To what is tried."""
+        own, at = dict(u="vectors", d="vectors", far="scalars"), dict(u=f"vectors2_{self.scene}")
+        return self._kernel("move", self.go, newton=own, at=at)
+
+    @ti.func
+    def sum_energies(self, c, cg: A, newton: A, at: A, plan: A):
+        """Of a chunk: energies, their sizes, tetrahedra whose volume falls too far or is not positive; inertia and loads;
+        rounding of strains that come from large u."""
+        zero = ti.cast(0, self.fp)
+        value, size, flat, turned, against, noise = zero, zero, zero, zero, zero, zero
+        for k in range(c * plan.points_length, self.end(c, plan.points_length, plan.points)):
+            e, J = ti.cast(at.elastic[k], self.fp), at.J[k]
+            value += e
+            size += ti.abs(e)
+            least, most = newton.J[k] * ti.cast(0.1, PRECISIONS[self.scene]), newton.J[k] * 10
+            if not J > least or (cg.state[PHASE] == PROBE and not J < most):
+                flat += ti.cast(cg.state[PHASE] != PROBE or newton.J[k] > 0, self.fp)
+            turned += ti.cast(not J > 0, self.fp)
+        for i in range(c * plan.length, self.end(c, plan.length, plan.nodes)):
+            e, u = ti.cast(at.contact[i], self.fp), self.cg.to(self.fp, at.u[0, i])
+            value += e
+            size += ti.abs(e)
+            step = u + newton.u[i] * ti.cast(-1, self.fp)
+            middle = (u + newton.u[i]) * ti.cast(0.5, self.fp) + newton.inertial[i] * ti.cast(-1, self.fp)
+            against += self.cg.dot(step, middle * cg.mass[i] + newton.loads[i] * ti.cast(-1, self.fp))
+            noise += newton.stiffness[i] * self.cg.dot(u, u)
+        cg.part[0, c], cg.part[1, c], cg.part[2, c], cg.part[3, c] = value, size, flat, turned
+        cg.part[4, c], cg.part[5, c] = against, noise
+
+    @ti.func
+    def decide(self, cg: A, plan: A):
+        """Whether what is tried lowers the potential (`Newton._search`)."""
+        self.cg.add_up(cg.part, 6, plan.chunks)
+        value, size = cg.part[0, 0], cg.part[1, 0]
+        cg.state[E_TRIED], cg.state[PARTS_TRIED], cg.state[DOUBTED] = value, size, ti.cast(0, self.fp)
+        cg.state[ACCEPTED] = ti.cast(0, self.fp)
+        change = value - cg.state[E] + cg.part[4, 0]
+        flat = cg.part[2, 0] > 0
+        if cg.state[PHASE] == BASE:
+            cg.state[E], cg.state[PARTS], cg.state[ACCEPTED] = value, size, ti.cast(1, self.fp)
+            cg.state[PHASE] = ti.cast(DONE, self.fp)
+        elif cg.state[PHASE] == PROBE:
+            cg.state[RISE], cg.state[PHASE] = change, ti.cast(DONE, self.fp)
+            if flat:
+                cg.state[RISE] = ti.cast(ti.math.inf, self.fp)
+        elif cg.state[PHASE] == START:
+            cg.state[UPRIGHT] = ti.cast(cg.part[3, 0] == 0, self.fp)
+            cg.state[PHASE], cg.state[TRIALS] = ti.cast(JUDGE, self.fp), ti.cast(1, self.fp)
+        else:
+            cg.state[TRIALS] = cg.state[TRIALS] + ti.cast(1, self.fp)
+            noise = cg.state[EPS] * 10 * (cg.state[PARTS] + size + cg.part[5, 0])
+            upright = cg.state[UPRIGHT] == 1 and cg.state[FRACTION] > cg.state[INSIST]
+            admissible = not (upright and flat)
+            if admissible and change <= cg.state[FRACTION] * cg.state[SLOPE] * ti.cast(-1e-4, self.fp):
+                cg.state[PHASE] = ti.cast(JUDGE, self.fp)
+            elif admissible and ti.abs(cg.state[SLOPE]) * cg.state[FRACTION] <= noise and change <= noise:
+                cg.state[PHASE], cg.state[DOUBTED] = ti.cast(JUDGE, self.fp), ti.cast(1, self.fp)
+            else:
+                self.halve(cg)
+
+    @ti.func
+    def halve(self, cg: A):
+        cg.state[PHASE], cg.state[FRACTION] = ti.cast(TRY, self.fp), cg.state[FRACTION] * ti.cast(0.5, self.fp)
+        cg.state[HALVINGS] = cg.state[HALVINGS] + ti.cast(1, self.fp)
+        if not cg.state[FRACTION] > cg.state[SHORTEST]:
+            cg.state[PHASE] = ti.cast(TROUBLE, self.fp)
+
+    @ti.func
+    def compare(self, cg: A, newton: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for c in range(plan.chunks):
+            self.sum_energies(c, cg, newton, at, plan)
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            if self.is_trial(cg, plan):
+                self.decide(cg, plan)
+        ti.loop_config(serialize=not self.parallel)
+        for k in range(plan.points):
+            if cg.state[ACCEPTED] == 1:
+                newton.J[k] = at.J[k]
+
+    @cached_property
+    def choose(self) -> Kernel:
+        """Whether what is tried is taken, its energies being there."""
+        values = "singles" if self.scene == "f32" else "doubles"
+        own = dict(u="vectors", inertial="vectors", loads="vectors", stiffness="scalars", J=values)
+        at = dict(u=f"vectors2_{self.scene}", elastic=values, contact=values, J=values)
+        return self._kernel("choose", self.compare, cg=dict(mass="scalars"), newton=own, at=at)
+
+    # ---- residual ----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def sum_residual(self, c, cg: A, newton: A, at: A, barriers: A, plan: A):
+        """Of a chunk: |R|^2, of what it is measured by, of rounding; R . d."""
+        zero = ti.cast(0, self.fp)
+        square, size, floor, slope = zero, zero, zero, zero
+        for i in range(c * plan.length, self.end(c, plan.length, plan.nodes)):
+            u, rigidity = self.cg.to(self.fp, at.u[0, i]), newton.stiffness[i]
+            inertia = (u + newton.inertial[i] * ti.cast(-1, self.fp)) * cg.mass[i]
+            R = self.cg.to(self.fp, at.y[0, i]) + newton.loads[i] + inertia * ti.cast(-1, self.fp)
+            R = self.cg.allowed(i, cg, R)
+            newton.R[i] = R
+            square += self.cg.dot(R, R)
+            slope += self.cg.dot(R, newton.d[i])
+            forces = ti.cast(at.size[i], self.fp)
+            size += forces * forces + self.cg.dot(newton.loads[i], newton.loads[i])
+            size += self.cg.dot(inertia, inertia) * cg.free[i]
+            far = newton.far[i]
+            for k in ti.static(range(3)):
+                far = ti.max(far, ti.abs(u[k]))
+                if ti.static(self.contact):
+                    for d in ti.static(range(3)):
+                        rigidity += ti.abs(ti.cast(barriers.blocks[d, i][k], self.fp))
+            rounding = rigidity * far * cg.state[EPS] * cg.free[i]
+            floor += rounding * rounding
+        cg.part[0, c], cg.part[1, c], cg.part[2, c], cg.part[3, c] = square, size, floor, slope
+
+    @ti.func
+    def take(self, cg: A, newton: A, plan: A):
+        """What is tried, and its residual is known: whether it is the last round, or how the next is solved
+        (`Newton.solve`, `Newton._forcing`)."""
+        one = ti.cast(1, self.fp)
+        if cg.state[FRACTION] <= cg.state[INSIST]:
+            cg.state[UPRIGHT] = ti.cast(0, self.fp)
+        cg.state[E], cg.state[PARTS] = cg.state[E_TRIED], cg.state[PARTS_TRIED]
+        cg.state[ACCEPTED], cg.state[BEFORE] = one, cg.state[NORM]
+        norm, size = ti.sqrt(cg.part[0, 0]), ti.sqrt(cg.part[1, 0])
+        floor = ti.sqrt(cg.part[2, 0]) * 4
+        cg.state[NORM], cg.state[FLOOR] = norm, floor
+        relative = norm
+        if size > 0:
+            relative = norm / size
+        newton.history[ti.cast(cg.state[ROUND], ti.i32)] = relative
+        cg.state[ROUND] = cg.state[ROUND] + one
+        solved = norm <= cg.state[TOLERANCE] * size + floor
+        if solved and (cg.state[ROUGH] == 0 or norm <= floor):
+            cg.state[PHASE] = ti.cast(DONE, self.fp)
+        elif cg.state[ROUND] > cg.state[MOST] or not norm - norm == 0:
+            cg.state[PHASE] = ti.cast(TROUBLE, self.fp)
+        else:
+            last = cg.state[TOLERANCE] * size / norm * ti.cast(0.3, self.fp)
+            hidden = floor / norm * ti.cast(0.3, self.fp)
+            exact = ti.min(cg.state[INEXACT], ti.sqrt(norm / size))
+            if last > cg.state[INEXACT] * ti.cast(0.03, self.fp):
+                exact = ti.min(exact, last)
+            exact = ti.max(exact, hidden)
+            forcing = exact
+            if not solved:
+                gained = one
+                if cg.state[BEFORE] > 0:
+                    gained = ti.min(norm / cg.state[BEFORE], one)
+                forcing = ti.max(exact, ti.min(cg.state[ROUGHEST], gained * gained * ti.cast(0.9, self.fp)))
+            cg.state[ROUGH] = ti.cast(0, self.fp)
+            if forcing > ti.max(cg.state[INEXACT], hidden):
+                cg.state[ROUGH] = one
+            forcing = ti.max(forcing, cg.state[EPS] * 10)
+            cg.state[LEAST], cg.state[PHASE] = forcing * forcing, ti.cast(UPDATE, self.fp)
+            cg.state[STOPPED], cg.state[COUNT], cg.state[SQUARE] = ti.cast(WAITS, self.fp), ti.cast(0, self.fp), one
+
+    @ti.func
+    def weigh(self, cg: A, newton: A, at: A, barriers: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for c in range(plan.chunks):
+            self.sum_residual(c, cg, newton, at, barriers, plan)
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            cg.state[ACCEPTED] = ti.cast(0, self.fp)
+            if cg.state[PHASE] == JUDGE:
+                self.cg.add_up(cg.part, 4, plan.chunks)
+                falls = cg.part[3, 0] >= cg.state[SLOPE] * ti.cast(-0.8, self.fp)
+                if cg.state[DOUBTED] == 1 and not falls:
+                    self.halve(cg)
+                else:
+                    self.take(cg, newton, plan)
+        ti.loop_config(serialize=not self.parallel)
+        for c in range(plan.chunks):
+            if cg.state[ACCEPTED] == 1:
+                for i in range(c * plan.length, self.end(c, plan.length, plan.nodes)):
+                    newton.u[i] = self.cg.to(self.fp, at.u[0, i])
+                    cg.r[0, i] = newton.R[i] / cg.state[NORM]
+                for k in range(c * plan.points_length, self.end(c, plan.points_length, plan.points)):
+                    newton.J[k] = at.J[k]
+
+    @cached_property
+    def judge(self) -> Kernel:
+        """R where something is tried, its forces being there; if that is taken, what the round solves: r = R / |R|."""
+        cg = dict(mass="scalars", free="scalars", r="vectors2")
+        cg |= dict(guide="ints", held="vectors2") if self.guided else {}
+        values = "singles" if self.scene == "f32" else "doubles"
+        own = dict.fromkeys(("far", "stiffness", "history"), "scalars")
+        own |= dict.fromkeys(("u", "d", "R", "inertial", "loads"), "vectors") | dict(J=values)
+        at = dict(u=f"vectors2_{self.scene}", y=f"vectors2_{self.scene}", size=values, J=values)
+        barriers = dict(blocks=f"vectors2_{self.scene}") if self.contact else {}
+        return self._kernel("judge", self.weigh, cg=cg, newton=own, at=at, barriers=barriers)
+
+    # ---- preconditioner ----------------------------------------------------------------------------------------------
+
+    @ti.func
+    def check(self, cg: A, body: A, plan: A):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            hard = 0
+            for i in range(plan.nodes):
+                hard = hard | body.hard[i]
+            if cg.state[PHASE] == UPDATE and hard == 0:
+                cg.state[PHASE], cg.state[STOPPED] = ti.cast(SOLVE, self.fp), ti.cast(0, self.fp)
+
+    @cached_property
+    def ready(self) -> Kernel:
+        """The preconditioner is of the present place, unless a vertex is too hard for it."""
+        return self._kernel("ready", self.check, body=dict(hard="ints"))
