@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.batch.batch_inputs import change_of, checked_values, spread_given
 from diffsim_ti.batch.frames import BatchFrames, LazyFrames
 from diffsim_ti.batch.set_values import gathered_scenes
+from diffsim_ti.batch.joined_sweep import JoinedSweep
 from diffsim_ti.batch.side_by_side import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeAdapter
@@ -93,7 +94,8 @@ class Batch(metaclass=Public):
         if lanes and self.why_not:
             raise ValueError(f"scenes cannot be computed side by side: {self.why_not}; leave out lanes=True")
         self.lanes = self.why_not is None if lanes is None else bool(lanes)
-        self.sweep = BatchSweep(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
+        kind = BatchSweep if self.solver.explicit else JoinedSweep
+        self.sweep = kind(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
         if self.sweep:
             self.sweep.run_substeps = self.one.sweep.run_substeps
 
@@ -155,10 +157,23 @@ class Batch(metaclass=Public):
             last_good[b] = max(0, int(np.argmin(good)) - 1) if not good.all() else last_good[b]
         for b in np.flatnonzero(last_good < self.num_frames - 1):
             u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
+        alone, errors = self._alone(values)
+        for b, own in alone.items():
+            u[b], v[b], last_good[b] = own.displacements, own.velocities, self._last_good(errors.get(b))
         resolution = self.sweep.resolutions()
         states = self._positions(values, u), v, u
-        frames = LazyFrames(self.num_scenes, lambda b: self._frames_of(values, b, states, times, resolution(b)))
-        return BatchFrames(self, values, frames, last_good, run, states=states)
+        make = lambda b: alone.get(b) or self._frames_of(values, b, states, times, resolution(b))  # noqa: E731
+        out = BatchFrames(self, values, LazyFrames(self.num_scenes, make), last_good, run, errors, states)
+        out.alone = tuple(alone)
+        return out
+
+    def _alone(self, values: dict) -> tuple[dict[int, Frames], dict[int, Exception]]:
+        """Frames of the scenes that the solves of all together left out, and the errors that stopped some."""
+        frames, errors = {}, {}
+        for b in self.sweep.left:
+            frames[b], error = self._one_by_one(values, b)
+            errors |= {b: error} if error else {}
+        return frames, errors
 
     def _warn_of_bent_faces(self, positions: np.ndarray) -> None:
         """Where faces of some frame lie farther from the triangles of their nodes than contact there may be taken for
@@ -196,20 +211,22 @@ class Batch(metaclass=Public):
         return frames
 
     def _by_turns(self, values: dict) -> BatchFrames:
-        frames, errors = [], {}
-        for b in range(self.num_scenes):
-            own = {name: value_of(value, b) for name, value in values.items()}
-            try:
-                frames.append(self.one.forward(**own))
-            except FloatingPointError as error:
-                errors[b] = error
-                run = Run(own, contacts=self.one.sweep.workspace.watch.seen_so_far(), error=error)
-                frames.append(self.one.frames_of(run))
-            except ValueError as error:
-                error.args = (f"scene {b}: {error}",)
-                raise
-        last_good = np.array([self._last_good(errors.get(b)) for b in range(self.num_scenes)])
-        return BatchFrames(self, values, frames, last_good, None, errors)
+        found = [self._one_by_one(values, b) for b in range(self.num_scenes)]
+        last_good = np.array([self._last_good(error) for _, error in found])
+        errors = {b: error for b, (_, error) in enumerate(found) if error}
+        return BatchFrames(self, values, [frames for frames, _ in found], last_good, None, errors)
+
+    def _one_by_one(self, values: dict, b: int) -> tuple[Frames, Exception | None]:
+        """(frames of scene b, run alone, what stopped it)"""
+        own = {name: value_of(value, b) for name, value in values.items()}
+        try:
+            return self.one.forward(**own), None
+        except FloatingPointError as error:
+            run = Run(own, contacts=self.one.sweep.workspace.watch.seen_so_far(), error=error)
+            return self.one.frames_of(run), error
+        except ValueError as error:
+            error.args = (f"scene {b}: {error}",)
+            raise
 
     def _last_good(self, error: Exception | None) -> int:
         """The last frame before an error."""
@@ -257,7 +274,8 @@ class Batch(metaclass=Public):
             warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero")
 
     def _vjp_side_by_side(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
-        shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive
+        shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive.copy()
+        alive[list(frames.alone)] = False
         by_u, by_v, direct = np.zeros(shape), np.zeros(shape), []
         of_states = given.keys() <= {"positions", "velocities"}  # which say nothing of inputs but by the states
         if of_states:
@@ -273,8 +291,13 @@ class Batch(metaclass=Public):
         derived = self.sweep.pull_back(frames.run, by_u, by_v)
         for part in derived.parts().values():
             if part is not None:
-                part[~frames.alive] = 0  # they have left no trace in others
-        return self._by_inputs(frames, derived.mapped(np.asarray), direct)
+                part[~alive] = 0  # they have left no trace in others
+        out = self._by_inputs(frames, derived.mapped(np.asarray), direct)
+        for b in set(frames.alone).intersection(np.flatnonzero(frames.alive).tolist()):
+            for name, own in self.one.vjp(frames[b], **{name: x[b] for name, x in given.items()}).items():
+                target = out[name] = np.array(out[name])
+                target[b if isinstance(frames.values[name], Own) else ...] += own
+        return out
 
     def _by_inputs(self, frames: BatchFrames, adjoint: Derived, direct: list) -> dict[str, np.ndarray]:
         """Gradients by the wanted inputs; what meets no number that scenes have of their own is summed over them first."""
@@ -328,12 +351,13 @@ class Batch(metaclass=Public):
         ]
         self._warn_of_dead(frames, "changes")
         out = {name: np.zeros((self.num_scenes, *x.shape(self.num_frames))) for name, x in self.outputs.items()}
-        if self.lanes:
+        if self.lanes and self.solver.explicit:
             inputs = self.scene.inputs
             derived = [inputs.derive_jvp(frames[b].inputs, own[b]) for b in range(self.num_scenes)]
             du, dv = self.sweep.push_forward(frames.run, derived)
+        by_one = not self.lanes or not self.solver.explicit
         for b in np.flatnonzero(frames.alive):
-            changes = self.one.tangents(frames[b], **own[b]) if not self.lanes else None
+            changes = self.one.tangents(frames[b], **own[b]) if by_one else None
             changes = changes or self.one.changes_of(frames[b], du[b], dv[b], own[b])
             for name, change in changes.items():
                 out[name][b] = change

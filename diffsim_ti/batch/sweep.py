@@ -121,6 +121,8 @@ class BatchSweep(Sweep):
         """{scene: the step in which it got behind an obstacle}"""
         return {b: int(self.solver.schedule.row(j)) for b, j in self._guard.crossed.items()}
 
+    left: tuple | list = ()  # scenes that are to be run alone
+
     def resolutions(self) -> Callable[[int], ContactResolution]:
         """What contacts of scene b did in the last run, worked out when it is asked for."""
         ws, derived = self.workspace, self.workspace.derived

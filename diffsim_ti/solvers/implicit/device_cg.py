@@ -20,6 +20,7 @@ class DeviceCG:
     """
 
     most_chunks, shortest = 256, 32
+    kernels_kind = CGKernels
     many = 50  # iterations in a launch on one thread, which stops by itself
 
     def __init__(self, potential, cycle, free: Free, parallel: bool):
@@ -78,7 +79,7 @@ class DeviceCG:
     def _iteration(self, more: bool, convex: bool):
         """(times, rounding) -> so many iterations."""
         potential, sizes, lanes, own = self.potential, self._sizes, runs_on_cpu(), dict(cg=self, at=self.potential)
-        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
+        kernels = kernels_of(self.kernels_kind, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
         before = [*before, (kernels.turn, own, sizes)]
         if self._is_one_kernel:
@@ -102,6 +103,18 @@ class DeviceCG:
 
         return iterate
 
+    def iterations_for(self, mass: Mass, more, convex: bool):
+        """`_iteration` of a system, whose mass and matrix are brought to the device."""
+        if more is not None:
+            self._put(more)
+        kind = more is not None, convex
+        if kind not in self._iterations:
+            self._iterations[kind] = self._iteration(*kind)
+        if mass is not self._filled:
+            runtime.fill(self.mass, mass[:, 0])
+            self._filled = mass
+        return self._iterations[kind]
+
     def __call__(
         self, mass: Mass, more, convex: bool, b: np.ndarray, tolerance: float, max_iterations: int, eps: float
     ):
@@ -113,14 +126,7 @@ class DeviceCG:
         size = np.linalg.norm(b)
         if size == 0:
             return np.zeros_like(b), 0.0, 0, None
-        if more is not None:
-            self._put(more)
-        kind = more is not None, convex
-        if kind not in self._iterations:
-            self._iterations[kind] = self._iteration(*kind)
-        if mass is not self._filled:
-            runtime.fill(self.mass, mass[:, 0])
-            self._filled = mass
+        iterate = self.iterations_for(mass, more, convex)
         runtime.fill(self.r, (b / size)[None])
         state = np.zeros(8)
         state[LEAST] = tolerance**2
@@ -128,7 +134,7 @@ class DeviceCG:
         done = 0
         while done < max_iterations:
             times = min(self._look or max(2, self._last - done, done), max_iterations - done)
-            self._iterations[kind](times, 10 * eps)
+            iterate(times, 10 * eps)
             done, state = done + times, runtime.fetch(self.state)
             if state[STOPPED] or not np.isfinite(state[SQUARE]):
                 break

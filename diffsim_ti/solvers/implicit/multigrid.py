@@ -46,8 +46,9 @@ class Multigrid(Preconditioner):
             aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest, self._ties)
         matrices, ways = [aggregated], []
         changes = potential.arrays.contacts or potential.pairs or potential.hosts  # on the finest level
-        if changes or len(rest) > self.direct:
-            matrices, ways = _aggregated(aggregated, _allowed(_rigid_motions(rest), allowed))
+        scenes = potential.arrays.num_scenes
+        if changes or len(rest) > scenes * self.direct:
+            matrices, ways = _aggregated(aggregated, _allowed(_rigid_motions(rest), allowed), scenes)
         if mesh.order == 2:
             matrices, ways = [matrix, *matrices], [up, *ways]
         self._at_rest = matrix.data[diagonal]
@@ -83,9 +84,9 @@ class Multigrid(Preconditioner):
         return (z if T is None else (T @ z.ravel()).reshape(z.shape)) * self.free
 
 
-def _aggregated(matrix, motions: np.ndarray) -> tuple[list, list]:
+def _aggregated(matrix, motions: np.ndarray, scenes: int = 1) -> tuple[list, list]:
     """(matrices of all levels, ways from each to the one before) by smoothed aggregation, which leaves rigid motions to the
-    coarse ones."""
+    coarse ones; as many levels as one of so many scenes takes."""
     import pyamg
 
     state = np.random.get_state()
@@ -96,7 +97,7 @@ def _aggregated(matrix, motions: np.ndarray) -> tuple[list, list]:
             B=motions,
             strength=("symmetric", {"theta": 0.08}),
             improve_candidates=(("block_gauss_seidel", {"sweep": "symmetric", "iterations": 2}), None),
-            max_coarse=min(100, matrix.shape[0] // (4 * matrix.blocksize[0])),
+            max_coarse=min(100 * scenes, matrix.shape[0] // (4 * matrix.blocksize[0])),
         ).levels
     finally:
         np.random.set_state(state)

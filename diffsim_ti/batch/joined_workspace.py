@@ -1,0 +1,102 @@
+"""A run of an implicit solver of all scenes of a batch at once."""
+
+import warnings
+
+import numpy as np
+
+from diffsim_ti.batch.joined_hosts import joined_hosts, of_each
+from diffsim_ti.batch.joined_newton import JoinedNewton
+from diffsim_ti.batch.joined_potential import JoinedCollisions, JoinedPotential, JoinedPreconditioners
+from diffsim_ti.batch.joined_scene import JoinedArrays, joined_derived, of_scenes
+from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.supports.free import held_as
+from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
+
+
+class JoinedWorkspace(ImplicitWorkspace):
+    """left: (scenes,), those that are to be run alone, for they left the usual course of a solve (joined_newton.py)."""
+
+    arrays_kind, potential_kind, newton_kind = JoinedArrays, JoinedPotential, JoinedNewton
+    collisions_kind, preconditioners_kind = JoinedCollisions, JoinedPreconditioners
+
+    def __init__(self, solver, each: list[Derived]):
+        self.num_scenes, self.left = len(each), np.zeros(len(each), bool)
+        super().__init__(solver, each)
+        self.energy_watch = None
+
+    def load(self, each: list[Derived]) -> None:
+        self.each = each
+        self.left[:] = False
+        self.hosts = joined_hosts(self.scene.one, self.num_scenes)
+        super().load(joined_derived(each))
+
+    def restart(self) -> None:
+        self.left[:] = False
+        super().restart()
+
+    def leave(self, which: np.ndarray) -> None:
+        """Give scenes up."""
+        self.left |= which
+
+    @property
+    def rate(self) -> float:
+        at = self.arrays.features().drag
+        return float(self.each[0].parameters[at]) if at >= 0 else 0.0
+
+    def balance(self):
+        return None
+
+    # ---- what passes are told ----------------------------------------------------------------------------------------
+
+    def gravity_of(self, values) -> np.ndarray:
+        g = of_scenes(values.parameters, self.num_scenes)[:, self.arrays.features().gravity :][:, :3]
+        return np.repeat(g, self.arrays.vertices_of_one, axis=0)
+
+    def _host_values(self):
+        return of_each(self.each)
+
+    def _add_forces(self, rows, out, j, stage):
+        if rows is not None:
+            share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
+            for own, target in zip(of_scenes(rows, self.num_scenes, 1), of_scenes(out, self.num_scenes)):
+                target[acts_at] += self.solver.schedule.load(own, j, share, keyed)
+        return out
+
+    def add_loads(self, rows_adj, j, stage, by_vertices) -> None:
+        share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
+        for own, felt in zip(of_scenes(rows_adj, self.num_scenes, 1), of_scenes(by_vertices, self.num_scenes)):
+            self.solver.schedule.add_load(own, j, share, keyed, felt[acts_at])
+
+    # ---- a pass ------------------------------------------------------------------------------------------------------
+
+    def _solve(self, j, u, held, starts, problem, stage) -> np.ndarray:
+        going, newton = ~self.left, self.newton
+        newton.going = going
+        starts = [held_as(self.free, held, u + self.linear * (start - u)) for start in starts]
+        near = self._in_front(u, held)
+        best, least = near, np.zeros(self.num_scenes)
+        if starts:
+            self.potential.place(near)
+            before = self.potential.energies()
+        for start in starts:
+            share = newton._spread(self.collisions.past(near, start - near))
+            there = near + share * (start - near)
+            rise = newton.rises(near, before, there, problem)
+            better = rise < least
+            best, least = np.where(newton._spread(better), there, best), np.minimum(rise, least)
+        there, solved = newton.solve_all(best, problem, ~self.left, stage.static)
+        upright = newton.upright
+        if not upright.all():
+            solved &= upright
+        if stage.static and newton.rounds > self.noted.usual and not self.arrays.contacts:
+            solved[:] = False  # what a run alone says of branches that are left
+        self.leave(~solved)
+        return np.where(newton._spread(self.left), u, there)
+
+    def _in_front(self, u, held) -> np.ndarray:
+        """`held`, where obstacles that come to the body within the pass meet nothing; other scenes are given up."""
+        collisions = self.collisions
+        step, drift = held - u, collisions.drift(collisions.before, collisions.at_stage)
+        if step.any() or drift.any():
+            self.leave(collisions.detection.shares(u, step, collisions.before, drift) < 1)
+        return np.where(self.newton._spread(self.left), u, held)
