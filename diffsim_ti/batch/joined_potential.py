@@ -119,7 +119,8 @@ class JoinedPreconditioners(Preconditioners):
     """As those of one scene, whose linear systems are solved together."""
 
     def make(self, kind, size, mass):
-        made = super().make(kind, size, mass)
+        ws = self.ws
+        made = kind(ws.potential, mass, ws.free, size, ws.parallel and not runtime.runs_on_cpu())
         made.solver = JoinedCG(made.potential, getattr(made, "cycle", None), made.free, self.ws.parallel)
         return made
 

@@ -86,8 +86,16 @@ class Multigrid(Preconditioner):
 
 def _aggregated(matrix, motions: np.ndarray, scenes: int = 1) -> tuple[list, list]:
     """(matrices of all levels, ways from each to the one before) by smoothed aggregation, which leaves rigid motions to the
-    coarse ones; as many levels as one of so many scenes takes."""
+    coarse ones. Of several scenes those of the first say the ways of all."""
     import pyamg
+
+    if scenes > 1:
+        n = matrix.shape[0] // scenes
+        one = matrix.tocsr()[:n, :n].tobsr(matrix.blocksize)
+        ways, matrices = [_repeated(P, scenes) for P in _aggregated(one, motions[:n])[1]], [matrix]
+        for P in ways:
+            matrices.append((P.T @ matrices[-1] @ P).tobsr((P.blocksize[1],) * 2))
+        return matrices, ways
 
     state = np.random.get_state()
     np.random.seed(0)  # pyamg estimates a spectral radius from a random vector
@@ -97,11 +105,22 @@ def _aggregated(matrix, motions: np.ndarray, scenes: int = 1) -> tuple[list, lis
             B=motions,
             strength=("symmetric", {"theta": 0.08}),
             improve_candidates=(("block_gauss_seidel", {"sweep": "symmetric", "iterations": 2}), None),
-            max_coarse=min(100 * scenes, matrix.shape[0] // (4 * matrix.blocksize[0])),
+            max_coarse=min(100, matrix.shape[0] // (4 * matrix.blocksize[0])),
         ).levels
     finally:
         np.random.set_state(state)
     return [matrix, *(level.A for level in levels[1:])], [level.P for level in levels[:-1]]
+
+
+def _repeated(M, count: int):
+    """The block-diagonal matrix of so many M."""
+    from scipy.sparse import bsr_matrix
+
+    k, columns = len(M.indices), M.shape[1] // M.blocksize[1]
+    each = np.arange(count)[:, None]
+    start = np.append((M.indptr[:-1] + k * each).ravel(), k * count)
+    shape = M.shape[0] * count, M.shape[1] * count
+    return bsr_matrix((np.tile(M.data, (count, 1, 1)), (M.indices + columns * each).ravel(), start), shape=shape)
 
 
 def as_blocks(M):
