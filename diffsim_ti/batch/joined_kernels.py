@@ -80,6 +80,15 @@ class JoinedKernels(PotentialKernels):
         return Kernel(name, body, self.law.precision, own, {n: kernel._kinds[n] for n in kernel.numbers})
 
     @ti.func
+    def is_wanted(self, at: A, plan: A):
+        return at.skip[0] == 0
+
+    @cached_property
+    def wanted(self) -> Kernel:
+        """Whether a scene is, for `Piecewise`."""
+        return Kernel("wanted", self.is_wanted, self.law.precision, dict(at=dict(skip="ints")), {})
+
+    @ti.func
     def products(self, scene: A, pass_: A, at: A, out: A, plan: A):
         items = plan.num_items // at.skip.shape[0]
         ti.loop_config(serialize=not self.parallel)

@@ -6,7 +6,7 @@ Hessian, a line search that finds nothing, rounds that are used up) is given up 
 
 import numpy as np
 
-from diffsim_ti.batch.joined_scene import of_scenes
+from diffsim_ti.inputs import ConsistentMass
 from diffsim_ti.solvers.implicit.newton import Newton
 
 
@@ -27,6 +27,7 @@ class JoinedNewton(Newton):
         """(minimisers, whether each scene came to its own)."""
         self.mass, self.inertial, self.loads = problem
         self.going = going = going.copy()
+        self.potential.only(np.ones(len(going), bool))
         u = self.potential.place(start)
         self.preconditioner, self.stiffness = self.preconditioners(self.mass)
         B, far = len(going), np.abs(u).max(1, keepdims=True)
@@ -44,6 +45,7 @@ class JoinedNewton(Newton):
             if not left.any():
                 break
             rounds += 1
+            self.potential.only(left)
             self.preconditioner.update(u)
             forcing = np.array([self._forcing(*x) if on else 1.0 for *x, on in zip(norm, before, small, size, floor, left)])
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -55,6 +57,7 @@ class JoinedNewton(Newton):
             cuts += cut
             left &= moved
         self.rounds = rounds
+        self.potential.only(going)
         if leave_saddles and solved.any() and not self.others:
             solved &= self._stable(u, solved)
         return u, solved
@@ -65,8 +68,11 @@ class JoinedNewton(Newton):
 
     def system(self) -> tuple:
         """(diagonal mass, matrix of blocks or None) that join the potential's Hessian."""
-        mass, more, _ = self.operator().on_device()
-        return mass, more
+        mass, at, parts = self.mass, self.potential.held_at, []
+        if isinstance(mass, ConsistentMass):
+            parts, mass = [mass.blocks()], np.zeros((len(at), 1))
+        parts += [part.matrix(at) for part in (*self.potential.hosts, *self.others)]
+        return mass, sum(parts[1:], parts[0]) if parts else None
 
     def _stable(self, u, solved) -> np.ndarray:
         """Whether Phi falls in no direction at u, as `Newton._downhill` asks."""
@@ -93,6 +99,7 @@ class JoinedNewton(Newton):
         cut, E0 = left & (share < 1), before
         after = E0
         while open_.any():
+            self.potential.only(open_)
             trial = self.potential.place(u + self._spread(share) * d)
             after = self._evaluate_all()
             step = trial - u
@@ -117,10 +124,11 @@ class JoinedNewton(Newton):
             given_up = open_ & (share <= self.shortest)
             open_ &= ~given_up
             share = np.where(given_up, 0.0, share)
-        there = u + self._spread(np.where(moved, share, 0.0)) * d
-        if (left & ~moved).any():
-            there = self.potential.place(there)
+        if (left & ~moved).any():  # these stay
+            self.potential.only(left & ~moved)
+            self.potential.place(u + self._spread(np.where(moved, share, 0.0)) * d)
             after = self._evaluate_all()
+        self.potential.only(moved)
         return self.potential.held_at, after, moved, cut
 
     def _work(self, u, step) -> np.ndarray:
@@ -132,6 +140,7 @@ class JoinedNewton(Newton):
     def rises(self, u, before: tuple, there, problem: tuple) -> np.ndarray:
         """`rise` of each scene."""
         self.mass, self.inertial, self.loads = problem
+        self.potential.only(self.going)
         step = self.potential.place(there) - u
         (after, _, J), (E, _, J0) = self.potential.energies(), before
         with np.errstate(invalid="ignore"):

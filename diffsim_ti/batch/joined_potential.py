@@ -4,18 +4,20 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.batch.joined_cg import JoinedCG
+from diffsim_ti.batch.joined_cg import COUNTING, COUNTS, WHOLE, JoinedCG
 from diffsim_ti.batch.joined_kernels import JoinedKernels, SweptOfScenes
 from diffsim_ti.batch.joined_scene import of_scenes
+from diffsim_ti.mechanics.energy.kernels import PotentialKernels
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
 from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
+from diffsim_ti.runtime import Piecewise, kernels_of
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.state.obstacle_poses import Moment
 
 
 class JoinedPotential(Potential):
-    """Energies are those of each scene; products of scenes with a 1 in `skip` are left out."""
+    """Energies are those of each scene; scenes with a 1 in `skip` are left out."""
 
     kernels_kind = JoinedKernels
 
@@ -23,6 +25,24 @@ class JoinedPotential(Potential):
         super().__init__(arrays, *more)
         self.poses = runtime.array(arrays.vector, arrays.num_scenes * arrays.poses.size)
         self.skip = runtime.array(ti.i32, arrays.num_scenes)
+
+    by_scene = "energy", "forces", "contact_blocks"  # that go through scenes one by one on the processor (piecewise.py)
+
+    def launch(self, name, lanes=True, **records):
+        if name not in self.by_scene or not runtime.runs_on_cpu():
+            return super().launch(name, lanes, **records)
+        a, count = self.arrays, self.arrays.num_scenes
+        if name not in self._launches:
+            one = kernels_of(PotentialKernels, a.law, a.features().of_state(), False, a.in_lanes)
+            parts = [(self.kernels.wanted, self._records), (getattr(one, name), self._records | records)]
+            whole = WHOLE | ({("scene", "coefficients")} if a.features().uniform else set())
+            self._launches[name] = Piecewise(f"{name}_of_scenes", parts, count, whole, COUNTING, lanes and a.in_vectors)
+        sizes = {n: x // count if n in COUNTS else x for n, x in self.sizes().items()}
+        self._launches[name](1, {}, sizes)
+
+    def only(self, scenes: np.ndarray) -> None:
+        """Let what follows be of some scenes, a mask; of others what was found before stays."""
+        runtime.fill(self.skip, ~scenes)
 
     def energies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(energy [J], the sum of its absolute parts) of each scene, J at each point, shape (scenes, points)."""

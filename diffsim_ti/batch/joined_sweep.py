@@ -45,6 +45,7 @@ class JoinedAdjoint(ImplicitAdjoint):
         if not b.any():
             return b
         if self._preconditioner is None:
+            ws.potential.only(~ws.left)
             self._preconditioner, _ = ws.preconditioner(self.mass)
             self._preconditioner.update(self.u_star)
         newton.mass, going = self.mass, ~ws.left

@@ -32,11 +32,18 @@ def _why_not_joined(solver) -> str | None:
     if solver.loose:
         return f"but for contact {solver.loose}"
     values = scene.inputs.derive(scene.inputs.at_times([0.0, solver.dt]))
-    hosts = host_forces(scene)
-    hosts.restrict(scene.supports.freedom(scene.mesh.num_vertices), values.rest)
-    hosts.take(values)
-    loads = [type(x).__name__ for x in hosts if not x.has_energy or x.matrix(0 * values.rest) is None]
-    return f"linear solves of {' and '.join(loads)} are its own" if loads else None
+    hosts, u = host_forces(scene).take(values), values.displacement
+    free = scene.supports.freedom(scene.mesh.num_vertices)
+    hosts.restrict(free, values.rest)
+    w = np.einsum("kij,kj->ki", free, np.random.default_rng(0).standard_normal(u.shape))
+    own = [type(x).__name__ for x in hosts if not (x.symmetric and _is_matrix(x, u, w))]
+    return f"the Hessian of {' and '.join(own)} is no symmetric sparse matrix" if own else None
+
+
+def _is_matrix(host, u: np.ndarray, w: np.ndarray) -> bool:
+    """Whether the product with w is that of the matrix that a host force knows."""
+    matrix, product = host.matrix(u), host.product(u, w)
+    return matrix is not None and np.allclose(matrix @ w.ravel(), product.ravel(), 1e-9, 1e-9 * np.abs(product).max())
 
 
 def _tables(scene) -> bool:

@@ -350,4 +350,6 @@ class SceneArrays:
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
         """Blocks of volumes; repetitions in a patch have none, nor what is rigid."""
         blocks = self.to_blocks(self.with_stress(volumes))
-        return blocks if isinstance(self.place, slice) else blocks * self.alone.reshape(-1, LANES)
+        if isinstance(self.place, slice):
+            return blocks
+        return blocks * np.repeat(self.alone.reshape(-1, LANES), self.points, axis=0)
