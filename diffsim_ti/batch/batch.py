@@ -289,11 +289,13 @@ class Batch(metaclass=Public):
                 if part is not None:
                     target[b] = part
         derived = self.sweep.pull_back(frames.run, by_u, by_v)
+        alone = {*frames.alone, *self.sweep.left}  # the second: whose linear solve did not come to its end
+        alive[list(alone)] = False
         for part in derived.parts().values():
             if part is not None:
                 part[~alive] = 0  # they have left no trace in others
         out = self._by_inputs(frames, derived.mapped(np.asarray), direct)
-        for b in set(frames.alone).intersection(np.flatnonzero(frames.alive).tolist()):
+        for b in sorted(alone.intersection(np.flatnonzero(frames.alive).tolist())):
             for name, own in self.one.vjp(frames[b], **{name: x[b] for name, x in given.items()}).items():
                 target = out[name] = np.array(out[name])
                 target[b if isinstance(frames.values[name], Own) else ...] += own

@@ -194,8 +194,8 @@ class JoinedCG(DeviceCG):
         )
 
     def __call__(self, mass, more, b, tolerances, going, max_iterations: int, eps: float):
-        """(x, solved, iterations of each scene): b of shape (scenes n, 3); tolerances, going: (scenes,). Not solved is a scene
-        that meets a direction of negative curvature, or is not there after so many iterations."""
+        """(x, solved, negative, iterations of each scene): b of shape (scenes n, 3); tolerances, going: (scenes,). A scene that
+        meets a direction of negative curvature has the x before it or, if it is the first, the preconditioned b."""
         rows = b.reshape(self.scenes, -1)
         size = np.linalg.norm(rows, axis=1)
         wanted = going & (size > 0)
@@ -212,6 +212,7 @@ class JoinedCG(DeviceCG):
             done, state = done + times, runtime.fetch(self.state).reshape(state.shape)
         count, ended = state[:, COUNT].astype(int), state[:, STOPPED] == DONE
         self._last = int(count.max(initial=1))
-        known = (wanted & (count > 0))[:, None]
-        x = np.where(known, runtime.fetch_row(self.x, 0).reshape(self.scenes, -1) * size[:, None], 0.0)
-        return x.reshape(-1, 3), ended | ~wanted, count
+        negative, known = wanted & (state[:, STOPPED] == NEGATIVE), wanted & (count > 0)
+        x, first = (runtime.fetch_row(own, 0).reshape(self.scenes, -1) for own in (self.x, self.p))
+        x = np.where((negative & (count == 1))[:, None], first, x) * size[:, None]
+        return np.where(known[:, None], x, 0.0).reshape(-1, 3), ended | ~wanted, negative, count

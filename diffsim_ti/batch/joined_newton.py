@@ -1,7 +1,7 @@
 """Newton's method for all scenes of a batch at once, each with its own steps, tolerances and end.
 
-What is done here is the usual course of Newton (solvers/implicit/newton.py) of one scene. A scene that leaves it (an indefinite
-Hessian, a line search that finds nothing, rounds that are used up) is given up here, and run alone (batch/batch.py).
+What is done here is the usual course of Newton (solvers/implicit/newton.py) of one scene. A scene that leaves it (a line search
+that finds nothing, rounds that are used up, of statics an indefinite Hessian) is given up here, and run alone (batch/batch.py).
 """
 
 import numpy as np
@@ -50,8 +50,8 @@ class JoinedNewton(Newton):
             forcing = np.array([self._forcing(*x) if on else 1.0 for *x, on in zip(norm, before, small, size, floor, left)])
             with np.errstate(divide="ignore", invalid="ignore"):
                 rough = forcing > np.maximum(self.inexact, 0.3 * floor / norm)
-            d, found, count = self._direction_all(R * self._spread(left), np.maximum(forcing, 10 * self.eps), left)
-            left &= found
+            d, found, down, count = self._direction_all(R * self._spread(left), np.maximum(forcing, 10 * self.eps), left)
+            left &= found | (down & (not leave_saddles))
             self.products += int(count.max(initial=0))
             u, E, moved, cut = self._search_all(u, d * self._spread(left), R, E, left)
             cuts += cut

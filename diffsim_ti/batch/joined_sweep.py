@@ -51,7 +51,7 @@ class JoinedAdjoint(ImplicitAdjoint):
         newton.mass, going = self.mass, ~ws.left
         mass, more = newton.system()
         tolerances = np.full(len(going), self.tolerance)
-        x, solved, _ = self._preconditioner.solver(mass, more, b, tolerances, going, 20 * len(b), self.eps)
+        x, solved, *_ = self._preconditioner.solver(mass, more, b, tolerances, going, 20 * len(b), self.eps)
         ws.leave(~solved)
         return x * ws.free
 
