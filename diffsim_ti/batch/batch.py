@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.batch.batch_inputs import change_of, checked_values, spread_given
 from diffsim_ti.batch.frames import BatchFrames, LazyFrames
-from diffsim_ti.batch.set_values import gathered_scenes
 from diffsim_ti.batch.joined_sweep import JoinedSweep
+from diffsim_ti.batch.set_values import gathered_scenes
 from diffsim_ti.batch.side_by_side import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeAdapter
@@ -29,6 +29,7 @@ from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FAR, FacesBend
 from diffsim_ti.state.schedule import UnequalSteps
+from diffsim_ti.terms import Drag
 
 
 class Batch(metaclass=Public):
@@ -108,7 +109,8 @@ class Batch(metaclass=Public):
         return made_again, (Batch, own)
 
     def __repr__(self) -> str:
-        how = "side by side" if self.lanes else "one after another"
+        why = f", for {self.why_not}," if self.why_not else ""
+        how = "side by side" if self.lanes else f"one after another{why}"
         return f"Batch({self.num_scenes} scenes {how} of {self.one!r})"
 
     @property
@@ -129,12 +131,21 @@ class Batch(metaclass=Public):
         inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
         values = checked_values(self.one, inputs, self.num_scenes)
         self._fit(values)
-        run = (self._side_by_side if self.lanes else self._by_turns)(values)
+        run = (self._side_by_side if self.lanes and self._share_steps(values) else self._by_turns)(values)
         run.sets = sets
         dead = np.flatnonzero(~run.alive)
         if raise_errors and dead.size:
             raise run.error(int(dead[0]))
         return run
+
+    def _share_steps(self, values: dict) -> bool:
+        """Whether the steps of all scenes are one equation: implicit ones have one rate of drag."""
+        drag = None if self.solver.explicit else self.scene.term(Drag)
+        name = self.scene.input_names(drag)["drag_rate"] if drag else None
+        if drag and isinstance(values[name], Own) and np.ptp(values[name]) > 0:
+            warn(f"scenes that differ in {name} take implicit steps one after the other")
+            return False
+        return True
 
     def _fit(self, values: dict) -> None:
         """Let the stiffest scene choose substeps that were left to the solver, and refuse values that need more."""
@@ -150,7 +161,8 @@ class Batch(metaclass=Public):
         u, v = self.sweep.states()
         self._warn_of_bent_faces(self._positions(values, u))
         last_good, crossed = np.full(self.num_scenes, self.num_frames - 1), self.sweep.crossed()
-        for b in {*np.flatnonzero(~self._sound(u[:, -1], v[:, -1])), *crossed}:
+        broken = np.flatnonzero(~self._sound(u[:, -1], v[:, -1])) if self.solver.explicit else ()
+        for b in {*broken, *crossed}:
             good = self._sound(u[b], v[b])
             if b in crossed:
                 good[crossed[b] // self.save_every + 1 :] = False
@@ -262,7 +274,7 @@ class Batch(metaclass=Public):
                 raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {x.shape}")
             check_finite(name, x[frames.alive], self.save_every)
         self._warn_of_dead(frames, "gradients")
-        out = (self._vjp_side_by_side if self.lanes else self._vjp_by_turns)(frames, given)
+        out = (self._vjp_by_turns if frames.run is None else self._vjp_side_by_side)(frames, given)
         for name in out.keys() & frames.sets.keys():
             out[name] = gathered_scenes(out[name], frames.values[name], *frames.sets[name])
         return with_shape(out, self.one.sweep.wants_shape)

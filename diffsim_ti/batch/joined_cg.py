@@ -194,8 +194,8 @@ class JoinedCG(DeviceCG):
         )
 
     def __call__(self, mass, more, b, tolerances, going, max_iterations: int, eps: float):
-        """(x, solved, negative, iterations of each scene): b of shape (scenes n, 3); tolerances, going: (scenes,). A scene that
-        meets a direction of negative curvature has the x before it or, if it is the first, the preconditioned b."""
+        """(x, solved, negative, iterations of each scene): b of shape (scenes n, 3); tolerances, going: (scenes,). A scene
+        that meets a direction of negative curvature has the x before it or, if it is the first, the preconditioned b."""
         rows = b.reshape(self.scenes, -1)
         size = np.linalg.norm(rows, axis=1)
         wanted = going & (size > 0)

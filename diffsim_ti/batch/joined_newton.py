@@ -1,7 +1,8 @@
 """Newton's method for all scenes of a batch at once, each with its own steps, tolerances and end.
 
-What is done here is the usual course of Newton (solvers/implicit/newton.py) of one scene. A scene that leaves it (a line search
-that finds nothing, rounds that are used up, of statics an indefinite Hessian) is given up here, and run alone (batch/batch.py).
+What is done here is the usual course of Newton (solvers/implicit/newton.py) of one scene. A scene that leaves it (a line
+search that finds nothing, rounds that are used up, of statics an indefinite Hessian) is given up here, and run alone
+(batch/batch.py).
 """
 
 import numpy as np
@@ -41,21 +42,30 @@ class JoinedNewton(Newton):
             floor, norm = 4 * np.sqrt(self._dot(stiff, stiff)), np.sqrt(self._dot(R, R))
             small = norm <= self.tolerance * size + floor
             solved |= left & small & (~rough | (norm <= floor))
-            left &= ~solved & np.isfinite(norm) & (rounds < np.minimum(self.max_iterations + cuts, self.patience * self.max_iterations))
+            left &= (
+                ~solved
+                & np.isfinite(norm)
+                & (rounds < np.minimum(self.max_iterations + cuts, self.patience * self.max_iterations))
+            )
             if not left.any():
                 break
             rounds += 1
             self.potential.only(left)
             self.preconditioner.update(u)
-            forcing = np.array([self._forcing(*x) if on else 1.0 for *x, on in zip(norm, before, small, size, floor, left)])
+            forcing = np.array(
+                [self._forcing(*x) if on else 1.0 for *x, on in zip(norm, before, small, size, floor, left)]
+            )
             with np.errstate(divide="ignore", invalid="ignore"):
                 rough = forcing > np.maximum(self.inexact, 0.3 * floor / norm)
-            d, found, down, count = self._direction_all(R * self._spread(left), np.maximum(forcing, 10 * self.eps), left)
+            d, found, down, count = self._direction_all(
+                R * self._spread(left), np.maximum(forcing, 10 * self.eps), left
+            )
             left &= found | (down & (not leave_saddles))
             self.products += int(count.max(initial=0))
             u, E, moved, cut = self._search_all(u, d * self._spread(left), R, E, left)
             cuts += cut
-            left &= moved
+            resting = left & ~moved & (small | (norm <= 100 * floor))  # rounding has the last word
+            solved, left = solved | resting, left & moved
         self.rounds = rounds
         self.potential.only(going)
         if leave_saddles and solved.any() and not self.others:
@@ -63,8 +73,8 @@ class JoinedNewton(Newton):
         return u, solved
 
     def _direction_all(self, R, forcing, left) -> tuple:
-        mass, more = self.system()
-        return self.preconditioner.solver(mass, more, R, forcing, left, min(10 * R.shape[0], self.preconditioner.patience), self.eps)
+        most = min(10 * len(R) // len(left), self.preconditioner.patience)
+        return self.preconditioner.solver(*self.system(), R, forcing, left, most, self.eps)
 
     def system(self) -> tuple:
         """(diagonal mass, matrix of blocks or None) that join the potential's Hessian."""

@@ -143,5 +143,3 @@ class JoinedPreconditioners(Preconditioners):
         made = kind(ws.potential, mass, ws.free, size, ws.parallel and not runtime.runs_on_cpu())
         made.solver = JoinedCG(made.potential, getattr(made, "cycle", None), made.free, self.ws.parallel)
         return made
-
-

@@ -10,7 +10,6 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.supports.free import held_as
 from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
 
-
 BODY = "coefficients", "mass", "parameters", "rest", "gradients", "volumes", "element_masses"
 
 

@@ -24,8 +24,12 @@ def why_not(solver) -> str | None:
 def _why_not_joined(solver) -> str | None:
     """The same of scenes whose implicit steps are solved together (joined_newton.py)."""
     scene = solver.scene
-    terms = dict(self_contact=scene.term(SelfContact), contact_by_pairs=any(t.primitives is not None for t in scene.terms))
-    terms |= dict(mesh_obstacles=_tables(scene), reduced_sets_or_ties=scene.reduced, chambers_of_given_volume=scene.holds_volumes)
+    terms = dict(
+        self_contact=scene.term(SelfContact), contact_by_pairs=any(t.primitives is not None for t in scene.terms)
+    )
+    terms |= dict(
+        mesh_obstacles=_tables(scene), reduced_sets_or_ties=scene.reduced, chambers_of_given_volume=scene.holds_volumes
+    )
     there = [name.replace("_", " ") for name, some in terms.items() if some]
     if there:
         return f"it has {' and '.join(there)}"

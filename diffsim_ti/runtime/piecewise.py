@@ -32,9 +32,9 @@ class Piecewise:
     """Kernels one after the other, again and again in one launch, for each of `count` bodies: `launch(times, numbers of each
     kernel)`, as of one body.
 
-    parts: [(kernel, records)] as of `Repeated`, with kernels of one thread and the arrays of all bodies. The body of the first
-    says whether the others are still wanted of a body. whole: {(bundle, array)} that bodies share, or to which `start`s of
-    rows lead. counting: {(bundle, array): (bundle, array)}, whole numbers that say places in the second one.
+    parts: [(kernel, records)] as of `Repeated`, with kernels of one thread and the arrays of all bodies. The body of the
+    first says whether the others are still wanted of a body. whole: {(bundle, array)} that bodies share, or to which the
+    `start`s of rows lead. counting: {(bundle, array): (bundle, array)}, whole numbers that say places in the second one.
     """
 
     def __init__(self, name: str, parts: list, count: int, whole: set, counting: dict, vectorized: bool):

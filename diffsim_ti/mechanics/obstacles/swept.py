@@ -11,7 +11,6 @@ import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
 from diffsim_ti.runtime import Kernel, traced
-from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, needed
 from diffsim_ti.state.obstacle_poses import MORE
 from diffsim_ti.terms.obstacles import turning

@@ -79,7 +79,9 @@ class DeviceCG:
     def _iteration(self, more: bool, convex: bool):
         """(times, rounding) -> so many iterations."""
         potential, sizes, lanes, own = self.potential, self._sizes, runs_on_cpu(), dict(cg=self, at=self.potential)
-        kernels = kernels_of(self.kernels_kind, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
+        kernels = kernels_of(
+            self.kernels_kind, potential.arrays.precision, self.precision, self.parallel, self.guided, more
+        )
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
         before = [*before, (kernels.turn, own, sizes)]
         if self._is_one_kernel:
