@@ -24,8 +24,10 @@ class JoinedNewton(Newton):
         """A number of each scene for each vertex, shape (num_vertices, 1)."""
         return np.repeat(x, len(self.moves) // len(self.going))[:, None]
 
-    def solve_all(self, start: np.ndarray, problem: tuple, going: np.ndarray, leave_saddles: bool) -> tuple:
-        """(minimisers, whether each scene came to its own)."""
+    def solve_all(
+        self, start, problem: tuple, going: np.ndarray, leave_saddles: bool, rounds: int | None = None
+    ) -> tuple:
+        """(minimisers, whether each scene came to its own), as `Newton.solve` of each scene that is `going`."""
         self.mass, self.inertial, self.loads = problem
         self.going = going = going.copy()
         self.potential.only(np.ones(len(going), bool))
@@ -34,7 +36,7 @@ class JoinedNewton(Newton):
         B, far = len(going), np.abs(u).max(1, keepdims=True)
         E, norm, rough = self._evaluate_all(), np.full(B, np.inf), np.zeros(B, bool)
         self.upright = (E[2] > 0).all(1)
-        solved, left, cuts, rounds, self.products = np.zeros(B, bool), going.copy(), np.zeros(B, int), 0, 0
+        solved, left, cuts, self.rounds = np.zeros(B, bool), going.copy(), np.zeros(B, int), 0
         while True:
             (R, size), before = self._residual_all(u), norm
             rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far)
@@ -42,14 +44,13 @@ class JoinedNewton(Newton):
             floor, norm = 4 * np.sqrt(self._dot(stiff, stiff)), np.sqrt(self._dot(R, R))
             small = norm <= self.tolerance * size + floor
             solved |= left & small & (~rough | (norm <= floor))
-            left &= (
-                ~solved
-                & np.isfinite(norm)
-                & (rounds < np.minimum(self.max_iterations + cuts, self.patience * self.max_iterations))
-            )
+            if rounds is not None:
+                solved |= left & np.isfinite(norm) & ((norm <= self.roughly * size) | (self.rounds >= rounds))
+            most = np.minimum(self.max_iterations + cuts, self.patience * self.max_iterations)
+            left &= ~solved & np.isfinite(norm) & (self.rounds < most)
             if not left.any():
                 break
-            rounds += 1
+            self.rounds += 1
             self.potential.only(left)
             self.preconditioner.update(u)
             forcing = np.array(
@@ -57,16 +58,12 @@ class JoinedNewton(Newton):
             )
             with np.errstate(divide="ignore", invalid="ignore"):
                 rough = forcing > np.maximum(self.inexact, 0.3 * floor / norm)
-            d, found, down, count = self._direction_all(
-                R * self._spread(left), np.maximum(forcing, 10 * self.eps), left
-            )
+            d, found, down, _ = self._direction_all(R * self._spread(left), np.maximum(forcing, 10 * self.eps), left)
             left &= found | (down & (not leave_saddles))
-            self.products += int(count.max(initial=0))
             u, E, moved, cut = self._search_all(u, d * self._spread(left), R, E, left)
             cuts += cut
             resting = left & ~moved & (small | (norm <= 100 * floor))  # rounding has the last word
             solved, left = solved | resting, left & moved
-        self.rounds = rounds
         self.potential.only(going)
         if leave_saddles and solved.any() and not self.others:
             solved &= self._stable(u, solved)

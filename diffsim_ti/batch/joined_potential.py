@@ -70,11 +70,11 @@ class JoinedDetection(CollisionDetection):
         scenes = self.a.num_scenes
         return of_scenes(runtime.fetch(self._out.found).astype(np.float64), scenes).min(1, initial=most)
 
-    def shares(self, u, step, places, drifts=0.0, most: float = 1.0) -> np.ndarray:
+    def shares(self, u, step, places, drifts=0.0, most: float = 1.0, kept: float = 0.1) -> np.ndarray:
         """`share` of each scene."""
         if not self.terms or not (np.any(step) or np.any(drifts)):
             return np.full(self.a.num_scenes, most)
-        self.share(u, step, places, drifts, most)
+        self.share(u, step, places, drifts, most, kept)
         return self._lowest(most)
 
     def are_apart(self, u, places) -> np.ndarray:
@@ -114,6 +114,11 @@ class JoinedCollisions(ObstacleCollisions):
         if not len(before):
             return after - before
         return np.concatenate([poses.drift(*own) for own in zip(of_scenes(before, count), of_scenes(after, count))])
+
+    def moved(self, places, drift, shares: np.ndarray) -> np.ndarray:
+        """Where obstacles are when each scene has done a share of the drift."""
+        each = zip(of_scenes(places, len(shares)), of_scenes(drift, len(shares)), shares)
+        return np.concatenate([self.ws.arrays.poses.moved(*own) for own in each])
 
     def at_end(self, j):
         arrays, moment = self.ws.arrays, self.end_of(j)

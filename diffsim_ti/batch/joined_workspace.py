@@ -7,6 +7,7 @@ from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_potential import JoinedCollisions, JoinedPotential, JoinedPreconditioners
 from diffsim_ti.batch.joined_scene import JoinedArrays, joined_derived, of_scenes
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.supports.free import held_as
 from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
 
@@ -82,7 +83,8 @@ class JoinedWorkspace(ImplicitWorkspace):
         newton.going = going
         self.potential.only(going)
         starts = [held_as(self.free, held, u + self.linear * (start - u)) for start in starts]
-        near = self._in_front(u, held)
+        near = self._in_front(u, held, starts, problem)
+        newton.going = ~self.left
         best, least = near, np.zeros(self.num_scenes)
         if starts:
             self.potential.place(near)
@@ -102,10 +104,49 @@ class JoinedWorkspace(ImplicitWorkspace):
         self.leave(~solved)
         return np.where(newton._spread(self.left), u, there)
 
-    def _in_front(self, u, held) -> np.ndarray:
-        """`held`, where obstacles that come to the body within the pass meet nothing; other scenes are given up."""
-        collisions = self.collisions
-        step, drift = held - u, collisions.drift(collisions.before, collisions.at_stage)
-        if step.any() or drift.any():
-            self.leave(collisions.detection.shares(u, step, collisions.before, drift) < 1)
-        return np.where(self.newton._spread(self.left), u, held)
+    def _in_front(self, u, held, starts, problem) -> np.ndarray:
+        """As Approach of one scene: `held`, or where bodies stand in front of obstacles that come to them within the pass.
+        Scenes of which none is found are given up."""
+        collisions, spread = self.collisions, self.newton._spread
+        before, after = collisions.before, collisions.at_stage
+        step, drift = held - u, collisions.drift(before, after)
+        if not (step.any() or drift.any()):
+            return held
+        free = collisions.detection.shares(u, step, before, drift) == 1
+        near, meets = np.where(spread(free), held, u), ~free & ~self.left
+        if not meets.any():
+            return near
+        collisions.put(before)
+        self.potential.only(meets)
+        self.potential.place(held)
+        energies = self.potential.energies()
+        for start in starts:
+            led = meets & (collisions.detection.shares(u, start - u, before, drift) == 1)
+            led &= self.newton.rises(held, energies, start, problem) <= 0
+            near, meets = np.where(spread(led), start, near), meets & ~led
+        near = self._in_parts(near, step, before, drift, problem, meets)
+        collisions.put(after)
+        return near
+
+    def _in_parts(self, place, step, before, drift, problem, meets) -> np.ndarray:
+        """Obstacles and held vertices of some scenes come as far as the way is free, bodies make room, and so on."""
+        collisions, newton, count = self.collisions, self.newton, self.num_scenes
+        done, stuck = np.zeros(count), np.zeros(count, int)
+        for _ in range(Approach.most_parts):
+            if not meets.any():
+                break
+            left = np.where(meets, 1 - done, 0.0)
+            poses, along = collisions.moved(before, drift, done), newton._spread(left) * step
+            ahead = drift * np.repeat(left, len(drift) // count)[:, None]
+            share = collisions.detection.shares(place, along, poses, ahead, kept=Approach.kept)
+            place, done = place + newton._spread(share) * along, done + share * left
+            meets = meets & (share < 1)
+            stuck = np.where(share * left < Approach.least, stuck + 1, 0)
+            self.leave(meets & (stuck > Approach.patience))
+            meets &= ~self.left
+            collisions.put(collisions.moved(before, drift, done))
+            there, roomy = newton.solve_all(place, problem, meets, False, Approach.rounds)
+            self.leave(meets & ~roomy)
+            place, meets = np.where(newton._spread(meets), there, place), meets & roomy
+        self.leave(meets)
+        return place
