@@ -37,9 +37,10 @@ class Batch(metaclass=Public):
 
     solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.
     scenes: how many, >= 1.
-    lanes: None, side by side where the scene allows it, else one after the other: eight scenes simultaneously in the
-    lanes of vector units on CPUs, each on threads of its own on GPUs, neighbouring scenes on neighbouring ones. True:
-    ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and
+    lanes: None, side by side where the scene allows it, else one after the other. Explicit steps: eight scenes
+    simultaneously in the lanes of vector units on CPUs, each on threads of its own on GPUs, neighbouring scenes on
+    neighbouring ones. Implicit and static ones: all scenes in one Newton's method, each with its own line search and end.
+    True: ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and
     `why_not` what keeps the scene from it.
     runs: as of `Rollout`, for `run` under `ti.ad.Tape`.
 
@@ -47,12 +48,13 @@ class Batch(metaclass=Public):
     length `scenes` in front. Gradients and tangents of inputs that were given once have their shape, gradients being summed
     over scenes in their order; of others they have the leading axis. Numbers of tetrahedra may be given by named sets, each
     set once or with the axis, `youngs_modulus={"soft": [1e4, 2e4], "stiff": 1e6}`; gradients have the same names. At equal
-    steps the states of a scene are, bit for bit, those of a `Rollout` of it alone, whatever its neighbours, its place among
-    them and the number of threads.
+    steps the states of a scene are those of a `Rollout` of it alone: of explicit solvers bit for bit, whatever its
+    neighbours, its place among them and the number of threads, of others to the solver's tolerance.
 
     Scenes fail alone (`BatchFrames.alive`): the gradient of one that did is zero, with a warning. Side by side a failure is
     a frame that is not finite or whose vertices cross the body within a substep, or a vertex behind an obstacle; gains of
-    energy that a `Rollout` warns of are not looked for.
+    energy that a `Rollout` warns of are not looked for. Where a solve of all implicit scenes gives one up, it is run alone
+    (`BatchFrames.alone`).
 
     Freeman et al. 2021, Brax (leading axes of scenes), arXiv:2106.13281.
     Raises ValueError for shapes that fit neither, or both, saying which there are.
