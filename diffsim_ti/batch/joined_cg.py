@@ -184,7 +184,7 @@ class JoinedCG(DeviceCG):
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
         product = kernels_of(PotentialKernels, a.law, a.features().of_state(), False, a.in_lanes).product
         parts = [(kernels.wanted, own, {}), *before, (kernels.turn, own, self._sizes)]
-        parts += [(product, self.potential._records, self.potential.sizes()), (kernels.step, own, self._sizes)]
+        parts += [(product, self.potential.multiplying[1], self.potential.sizes()), (kernels.step, own, self._sizes)]
         whole = WHOLE | ({("scene", "coefficients")} if a.features().uniform else set())
         run = Piecewise("cg_of_scenes", [x[:2] for x in parts], per, whole, COUNTING, True)
         each = [{n: x // per if n in COUNTS else x for n, x in numbers.items()} for _, _, numbers in parts]

@@ -77,7 +77,7 @@ class JoinedKernels(PotentialKernels):
     def _kernel(self, name, body, reads_law=True, **arrays):
         kernel = super()._kernel(name, body, reads_law, **arrays)
         own = kernel.arrays | dict(scene=kernel.arrays["scene"] | dict(scene_of="ints"))
-        return Kernel(name, body, self.law.precision, own, {n: kernel._kinds[n] for n in kernel.numbers})
+        return Kernel(name, body, self.law.precision, own, {n: kernel.kinds[n] for n in kernel.numbers})
 
     @ti.func
     def is_wanted(self, at: A, plan: A):
@@ -118,7 +118,7 @@ class SweptOfScenes(SeesOneScene, SweptKernels):
     def _kernel(self, name, body):
         kernel = super()._kernel(name, body)
         own = kernel.arrays | dict(scene=kernel.arrays["scene"] | dict(scene_of="ints"))
-        return Kernel(name, body, self.precision, own, {n: kernel._kinds[n] for n in kernel.numbers})
+        return Kernel(name, body, self.precision, own, {n: kernel.kinds[n] for n in kernel.numbers})
 
     @traced
     def share_of_one(self, g, k, i, scene, way, at, most, kept):

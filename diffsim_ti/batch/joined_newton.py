@@ -20,7 +20,7 @@ class JoinedNewton(Newton):
     def _dot(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.einsum("bi,bi->b", self._rows(a), self._rows(b))
 
-    def _spread(self, x: np.ndarray) -> np.ndarray:
+    def spread(self, x: np.ndarray) -> np.ndarray:
         """A number of each scene for each vertex, shape (num_vertices, 1)."""
         return np.repeat(x, len(self.moves) // len(self.going))[:, None]
 
@@ -58,9 +58,9 @@ class JoinedNewton(Newton):
             )
             with np.errstate(divide="ignore", invalid="ignore"):
                 rough = forcing > np.maximum(self.inexact, 0.3 * floor / norm)
-            d, found, down, _ = self._direction_all(R * self._spread(left), np.maximum(forcing, 10 * self.eps), left)
+            d, found, down, _ = self._direction_all(R * self.spread(left), np.maximum(forcing, 10 * self.eps), left)
             left &= found | (down & (not leave_saddles))
-            u, E, moved, cut = self._search_all(u, d * self._spread(left), R, E, left)
+            u, E, moved, cut = self._search_all(u, d * self.spread(left), R, E, left)
             cuts += cut
             resting = left & ~moved & (small | (norm <= 100 * floor))  # rounding has the last word
             solved, left = solved | resting, left & moved
@@ -107,7 +107,7 @@ class JoinedNewton(Newton):
         after = E0
         while open_.any():
             self.potential.only(open_)
-            trial = self.potential.place(u + self._spread(share) * d)
+            trial = self.potential.place(u + self.spread(share) * d)
             after = self._evaluate_all()
             step = trial - u
             change = after[0] - E0[0] + self._against_loads_all(u, step)
@@ -133,7 +133,7 @@ class JoinedNewton(Newton):
             share = np.where(given_up, 0.0, share)
         if (left & ~moved).any():  # these stay
             self.potential.only(left & ~moved)
-            self.potential.place(u + self._spread(np.where(moved, share, 0.0)) * d)
+            self.potential.place(u + self.spread(np.where(moved, share, 0.0)) * d)
             after = self._evaluate_all()
         self.potential.only(moved)
         return self.potential.held_at, after, moved, cut

@@ -26,7 +26,8 @@ OF_ALL = "displacement", "velocity", "mass", "rest", "surface", "gradients", "vo
 
 def joined_scene(scene, count: int):
     """A scene of `count` bodies like that of another scene, whose inputs and terms stay those of one."""
-    out, n = scene._twin(), scene.mesh.num_vertices
+    out, n = object.__new__(type(scene)), scene.mesh.num_vertices
+    vars(out).update(vars(scene))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is to be said of the mesh was said of that of one
         out.mesh = TetrahedralMesh.joined([scene.mesh] * count)

@@ -90,11 +90,11 @@ class JoinedWorkspace(ImplicitWorkspace):
             self.potential.place(near)
             before = self.potential.energies()
         for start in starts:
-            share = newton._spread(self.collisions.past(near, start - near))
+            share = newton.spread(self.collisions.past(near, start - near))
             there = near + share * (start - near)
             rise = newton.rises(near, before, there, problem)
             better = rise < least
-            best, least = np.where(newton._spread(better), there, best), np.minimum(rise, least)
+            best, least = np.where(newton.spread(better), there, best), np.minimum(rise, least)
         there, solved = newton.solve_all(best, problem, ~self.left, stage.static)
         upright = newton.upright
         if not upright.all():
@@ -102,12 +102,12 @@ class JoinedWorkspace(ImplicitWorkspace):
         if stage.static and newton.rounds > self.noted.usual and not self.arrays.contacts:
             solved[:] = False  # what a run alone says of branches that are left
         self.leave(~solved)
-        return np.where(newton._spread(self.left), u, there)
+        return np.where(newton.spread(self.left), u, there)
 
     def _in_front(self, u, held, starts, problem) -> np.ndarray:
         """As Approach of one scene: `held`, or where bodies stand in front of obstacles that come to them within the pass.
         Scenes of which none is found are given up."""
-        collisions, spread = self.collisions, self.newton._spread
+        collisions, spread = self.collisions, self.newton.spread
         before, after = collisions.before, collisions.at_stage
         step, drift = held - u, collisions.drift(before, after)
         if not (step.any() or drift.any()):
@@ -136,10 +136,10 @@ class JoinedWorkspace(ImplicitWorkspace):
             if not meets.any():
                 break
             left = np.where(meets, 1 - done, 0.0)
-            poses, along = collisions.moved(before, drift, done), newton._spread(left) * step
+            poses, along = collisions.moved(before, drift, done), newton.spread(left) * step
             ahead = drift * np.repeat(left, len(drift) // count)[:, None]
             share = collisions.detection.shares(place, along, poses, ahead, kept=Approach.kept)
-            place, done = place + newton._spread(share) * along, done + share * left
+            place, done = place + newton.spread(share) * along, done + share * left
             meets = meets & (share < 1)
             stuck = np.where(share * left < Approach.least, stuck + 1, 0)
             self.leave(meets & (stuck > Approach.patience))
@@ -147,6 +147,6 @@ class JoinedWorkspace(ImplicitWorkspace):
             collisions.put(collisions.moved(before, drift, done))
             there, roomy = newton.solve_all(place, problem, meets, False, Approach.rounds)
             self.leave(meets & ~roomy)
-            place, meets = np.where(newton._spread(meets), there, place), meets & roomy
+            place, meets = np.where(newton.spread(meets), there, place), meets & roomy
         self.leave(meets)
         return place
