@@ -167,7 +167,7 @@ class JoinedCG(DeviceCG):
     def __init__(self, potential, cycle, free, parallel: bool):
         super().__init__(potential, cycle, free, parallel)
         scenes = self.scenes = potential.arrays.num_scenes
-        n, self.by_scene = self.nodes // scenes, runtime.runs_on_cpu()
+        n, self.by_scene = self.nodes // scenes, potential.arrays.by_scene
         self.length = max(self.shortest, -(-n // max(self.most_chunks // scenes, 1)))
         self.chunks = scenes * -(-n // self.length)
         fp = PRECISIONS[self.precision]

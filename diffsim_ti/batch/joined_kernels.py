@@ -10,33 +10,25 @@ from diffsim_ti.mechanics.energy.kernels import PotentialKernels
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
 from diffsim_ti.mechanics.obstacles.swept import SweptKernels
 from diffsim_ti.runtime import Bundle, Kernel, at, let, traced
-from diffsim_ti.state.obstacle_poses import MORE
 
 A = ti.template()
-
-
-@traced
-def with_own(record, b, **sizes):
-    """A record whose arrays of these names are those of scene b, of which each has so many numbers."""
-    own = {name: Numbers(getattr(record, name), let(b * size)) for name, size in sizes.items() if hasattr(record, name)}
-    return Bundle(**vars(record) | own)
 
 
 class SeesOneScene:
     """Functions of obstacles at vertex i, which see the numbers of its scene."""
 
-    @property
-    def num_rows(self) -> int:
-        """Of poses of one scene."""
-        return 3 * self.num_obstacles + MORE * sum(g.count for g in self.features.groups if g.force.turns)
-
     @traced
     def seen_at(self, i, scene, *more):
         """The scene of vertex i, and of other records the numbers of that."""
-        b = let(at(scene.scene_of, i))
-        sizes = dict(parameters=self.features.num_parameters, poses=self.num_rows)
-        sizes |= dict(places=self.num_rows // 3, drifts=self.num_rows // 3)
-        return [with_own(record, b, **sizes) for record in (scene, *more)]
+        vertices = scene.scene_of.shape[0] - 1
+        b, count = let(at(scene.scene_of, i)), let(at(scene.scene_of, vertices))
+        return [self._own(record, b, count) for record in (scene, *more)]
+
+    @traced
+    def _own(self, record, b, count):
+        there = {name: x for name, x in vars(record).items() if name in ("parameters", "poses", "places", "drifts")}
+        own = {name: Numbers(x, let(b * (x.shape[0] // count))) for name, x in there.items()}
+        return Bundle(**vars(record) | own)
 
 
 @dataclass(frozen=True)

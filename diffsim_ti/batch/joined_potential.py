@@ -15,6 +15,8 @@ from diffsim_ti.runtime import Piecewise, kernels_of
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.state.obstacle_poses import Moment
 
+BY_SCENE = "energy", "forces", "contact_blocks"  # kernels that leave out scenes which rest
+
 
 class JoinedPotential(Potential):
     """Energies are those of each scene; scenes with a 1 in `skip` are left out."""
@@ -26,10 +28,8 @@ class JoinedPotential(Potential):
         self.poses = runtime.array(arrays.vector, arrays.num_scenes * arrays.poses.size)
         self.skip = runtime.array(ti.i32, arrays.num_scenes)
 
-    by_scene = "energy", "forces", "contact_blocks"  # that go through scenes one by one on the processor (piecewise.py)
-
     def launch(self, name, lanes=True, **records):
-        if name not in self.by_scene or not runtime.runs_on_cpu():
+        if name not in BY_SCENE or not self.arrays.by_scene:
             return super().launch(name, lanes, **records)
         a, count = self.arrays, self.arrays.num_scenes
         if name not in self._launches:
@@ -145,6 +145,6 @@ class JoinedPreconditioners(Preconditioners):
 
     def make(self, kind, size, mass):
         ws = self.ws
-        made = kind(ws.potential, mass, ws.free, size, ws.parallel and not runtime.runs_on_cpu())
+        made = kind(ws.potential, mass, ws.free, size, ws.parallel and not ws.arrays.by_scene)
         made.solver = JoinedCG(made.potential, getattr(made, "cycle", None), made.free, self.ws.parallel)
         return made

@@ -66,12 +66,19 @@ def of_scenes(joined: np.ndarray, count: int, axis: int = 0) -> np.ndarray:
 
 
 class JoinedArrays(SceneArrays):
-    """The numbers of all scenes; blocks of eight tetrahedra are of one scene each."""
+    """The numbers of all scenes; blocks of eight tetrahedra are of one scene each.
+
+    by_scene: whether a thread takes a scene through kernels of one scene (runtime/piecewise.py), as on the processor; else
+    each loop of a kernel goes through all scenes.
+    """
+
+    by_scene = property(lambda self: runtime.runs_on_cpu())
 
     def __init__(self, scene, *more):
         self.num_scenes = scene.num_scenes
         super().__init__(scene, *more)
-        self.scene_of = runtime.upload(np.repeat(np.arange(self.num_scenes), self.vertices_of_one), ti.i32)
+        of_vertices = np.repeat(np.arange(self.num_scenes), self.vertices_of_one)
+        self.scene_of = runtime.upload(np.append(of_vertices, self.num_scenes), ti.i32)  # the last: how many
 
     def _order_tetrahedra(self, scene) -> None:
         one, count = scene.one.mesh, scene.num_scenes
