@@ -79,4 +79,5 @@ def joined_hosts(scene, count: int) -> HostForces:
 
 
 def of_each(each: list) -> SimpleNamespace:
+    """What the host forces of each scene take."""
     return SimpleNamespace(each=each)

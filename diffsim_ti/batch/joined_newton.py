@@ -27,16 +27,17 @@ class JoinedNewton(Newton):
     def solve_all(
         self, start, problem: tuple, going: np.ndarray, leave_saddles: bool, rounds: int | None = None
     ) -> tuple:
-        """(minimisers, whether each scene came to its own), as `Newton.solve` of each scene that is `going`."""
+        """(minimisers, whether each scene came to its own), as `Newton.solve` of each scene that is `going`; `rounds`: those
+        that each took."""
         self.mass, self.inertial, self.loads = problem
         self.going = going = going.copy()
         self.potential.only(np.ones(len(going), bool))
         u = self.potential.place(start)
         self.preconditioner, self.stiffness = self.preconditioners(self.mass)
         B, far = len(going), np.abs(u).max(1, keepdims=True)
-        E, norm, rough = self._evaluate_all(), np.full(B, np.inf), np.zeros(B, bool)
+        E, norm, rough = self.potential.energies(), np.full(B, np.inf), np.zeros(B, bool)
         self.upright = (E[2] > 0).all(1)
-        solved, left, cuts, self.rounds = np.zeros(B, bool), going.copy(), np.zeros(B, int), 0
+        solved, left, cuts, self.rounds = np.zeros(B, bool), going.copy(), *np.zeros((2, B), int)
         while True:
             (R, size), before = self._residual_all(u), norm
             rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far)
@@ -50,7 +51,7 @@ class JoinedNewton(Newton):
             left &= ~solved & np.isfinite(norm) & (self.rounds < most)
             if not left.any():
                 break
-            self.rounds += 1
+            self.rounds += left
             self.potential.only(left)
             self.preconditioner.update(u)
             forcing = np.array(
@@ -87,9 +88,6 @@ class JoinedNewton(Newton):
         self.preconditioner.update(u)
         return self._direction_all(probe * self.free, np.full(len(solved), 1e-3), solved)[1]
 
-    def _evaluate_all(self) -> tuple:
-        return self.potential.energies()
-
     def _residual_all(self, u):
         f, sizes = self.potential.forces()
         inertia = self.mass * (u - self.inertial)
@@ -108,7 +106,7 @@ class JoinedNewton(Newton):
         while open_.any():
             self.potential.only(open_)
             trial = self.potential.place(u + self.spread(share) * d)
-            after = self._evaluate_all()
+            after = self.potential.energies()
             step = trial - u
             change = after[0] - E0[0] + self._against_loads_all(u, step)
             if self.others:
@@ -134,7 +132,7 @@ class JoinedNewton(Newton):
         if (left & ~moved).any():  # these stay
             self.potential.only(left & ~moved)
             self.potential.place(u + self.spread(np.where(moved, share, 0.0)) * d)
-            after = self._evaluate_all()
+            after = self.potential.energies()
         self.potential.only(moved)
         return self.potential.held_at, after, moved, cut
 

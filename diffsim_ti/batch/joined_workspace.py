@@ -96,11 +96,9 @@ class JoinedWorkspace(ImplicitWorkspace):
             better = rise < least
             best, least = np.where(newton.spread(better), there, best), np.minimum(rise, least)
         there, solved = newton.solve_all(best, problem, ~self.left, stage.static)
-        upright = newton.upright
-        if not upright.all():
-            solved &= upright
-        if stage.static and newton.rounds > self.noted.usual and not self.arrays.contacts:
-            solved[:] = False  # what a run alone says of branches that are left
+        solved &= newton.upright
+        if stage.static and not self.arrays.contacts:
+            solved &= newton.rounds <= self.noted.usual  # else a run alone says whether a branch was left
         self.leave(~solved)
         return np.where(newton.spread(self.left), u, there)
 
