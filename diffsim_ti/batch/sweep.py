@@ -91,8 +91,21 @@ class BatchSweep(Sweep):
         if values.derived is None:
             own = {name: x for name, x in values.items() if isinstance(x, Own)}
             changed = [{name: x[b] for name, x in own.items()} for b in range(self.num_scenes)]
-            values.derived = self.scene.inputs.derive_each(self.values_of(values, 0), changed)
+            try:
+                values.derived = self.scene.inputs.derive_each(self.values_of(values, 0), changed)
+            except ValueError:
+                self._name_scene(values)
+                raise
         return values.derived
+
+    def _name_scene(self, values: BatchValues) -> None:
+        """Raise what the first scene says whose values are refused."""
+        for b in range(self.num_scenes):
+            try:
+                self.scene.inputs.derive(self.values_of(values, b))
+            except ValueError as error:
+                error.args = (f"scene {b}: {error}",)
+                raise
 
     def _make_workspace(self, derived):
         return BatchWorkspace(self.solver, derived)
