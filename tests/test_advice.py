@@ -144,8 +144,8 @@ def relaxing(*outputs) -> None:
 # (file, part of the message): (what provokes it, the same as it advises)
 FOLLOWED = {
     ("batch/batch.py", "leave out lanes=True"): (
-        lambda: ds.Batch(ds.BDF2Solver(scene(), dt=1e-3), 2, 2, lanes=True),
-        lambda: ds.Batch(ds.BDF2Solver(scene(), dt=1e-3), 2, 2),
+        lambda: ds.Batch(ds.BDF2Solver(scene(terms=[ds.SelfContact()]), dt=1e-3), 2, 2, lanes=True),
+        lambda: ds.Batch(ds.BDF2Solver(scene(terms=[ds.SelfContact()]), dt=1e-3), 2, 2),
     ),
     ("scene/locking.py", "where {} tetrahedra lock"): (lambda: scene(**WIDE), lambda: scene(**WIDE, volume="patches")),
     ("materials/patch_law.py", "averages energies, but"): (

@@ -10,6 +10,7 @@ from gradient_fuzz.loads import load, over_time
 from gradient_fuzz.ties import tie
 
 import diffsim_ti as ds
+from diffsim_ti.batch.joined_scene import JoinedArrays
 from diffsim_ti.diff_simulator import rollout_frames
 
 MESH = ds.TetrahedralMesh.create_box(3, 0.1)
@@ -398,12 +399,12 @@ def test_outputs_of_all_scenes(lanes):
 
 
 def test_scenes_by_turns_where_lanes_do_not_serve():
-    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Gravity(-9.8)], precision="f64")
-    solver = ds.ImplicitEulerSolver(scene, dt=5e-3)
-    with pytest.raises(ValueError, match="the solver is not explicit"):
+    solver = ds.ImplicitEulerSolver(simple(1).scene.replace(terms=[ds.SelfContact()]), dt=5e-3)
+    with pytest.raises(ValueError, match="side by side: it has self contact; leave out lanes=True"):
         ds.Batch(solver, 2, 3, lanes=True)
     batch = ds.Batch(solver, 2, 3)
-    assert not batch.lanes and "explicit" in batch.why_not
+    assert not batch.lanes and batch.why_not in repr(batch)
+    batch = ds.Batch(simple(1).solver, 2, 3, lanes=False)
     E = np.array([1e4, 2e4, 3e4])
     frames = batch.forward(youngs_modulus=E)
     seed = np.random.default_rng(0).normal(size=frames.positions.shape)
@@ -412,6 +413,76 @@ def test_scenes_by_turns_where_lanes_do_not_serve():
         alone = batch.one.forward(youngs_modulus=E[b])
         np.testing.assert_array_equal(alone.positions, frames.positions[b])
         assert gradients["youngs_modulus"][b] == batch.one.vjp(alone, seed[b])["youngs_modulus"]
+
+
+SLAP = np.zeros((3, len(MESH.vertices), 3))
+SLAP[1, :, 1] = -3000.0  # [m/s], in one scene of three
+
+
+def implicit(kind: str, **options) -> tuple[ds.Batch, dict]:
+    """A batch of implicit or static scenes, and numbers that they have of their own."""
+    law, own = ds.StableNeoHookean(1e5, 0.3), dict(youngs_modulus=[6e4, 1e5, 1.7e5])
+    exact = dict(tolerance=1e-9)
+    if kind in ("Euler", "as on a card", "midpoint", "slapped"):
+        scene = ds.Scene(MESH, law, terms=[ds.Gravity(), ds.Ground(LOW - 1e-3, friction=0.4)], precision="f64")
+        start = np.broadcast_to([0.3, -0.3, 0.0], SLAP.shape) if kind != "slapped" else SLAP
+        own |= dict(
+            friction=[0.1, 0.4, 0.0], ground_height=LOW - np.array([1e-3, 2e-3, 5e-4]), initial_velocities=start
+        )
+        own |= dict(gravity=[[0, -9.8, 0], [1, -5, 0], [0, -12, 1]])
+        midpoint, euler = (
+            ds.ImplicitMidpointSolver(scene, dt=0.001, **exact),
+            ds.ImplicitEulerSolver(scene, dt=0.005, **exact),
+        )
+        return ds.Batch(midpoint if kind == "midpoint" else euler, 4, 3, gradients="all", **options), own
+    pull = ds.Traction(lambda t: (100 * t, 0, 300 * np.cos(30 * t)), surface="ymax")
+    muscle = ds.Muscle(fibre=(0, 1, 0), stress=2e4, activation=0.5)
+    scene = ds.Scene(MESH, law, terms=[ds.Gravity(), pull, muscle], fixed={"ymin": "xyz", "xmin": "x"}, precision="f64")
+    solver = ds.StaticSolver(scene, **exact) if kind == "statics" else ds.BDF2Solver(scene, dt=0.01, **exact)
+    return ds.Batch(solver, 2, 3, gradients="all", **options), own | dict(activation=[0.1, 0.5, 0.9])
+
+
+@pytest.mark.parametrize("kind", ["Euler", "as on a card", "midpoint", "BDF2", "statics", "slapped"])
+def test_implicit_scenes_are_solved_together(kind, monkeypatch):
+    """As one by one, to the tolerance of the solver; of a scene that fails, its error, and nothing in the others."""
+    if kind == "as on a card":
+        monkeypatch.setattr(JoinedArrays, "by_scene", False)
+    found, seeds = [], np.random.default_rng(0).normal(size=(2, 3, 2, len(MESH.vertices), 3))
+    for lanes in (True, False):
+        batch, own = implicit(kind, lanes=lanes)
+        frames = batch.forward(**own)
+        alive = kind != "slapped" or np.array([True, False, True])
+        assert (frames.alive == alive).all() and frames.alone == ((1,) if kind == "slapped" and lanes else ())
+        with pytest.warns(UserWarning, match="gradients are zero") if kind == "slapped" else warnings.catch_warnings():
+            found.append((frames, batch.vjp(frames, *seeds)))
+    (together, gradients), (by_turns, expected) = found
+    np.testing.assert_allclose(together.displacements, by_turns.displacements, rtol=0, atol=1e-9)
+    for name, gradient in gradients.items():
+        np.testing.assert_allclose(
+            gradient, expected[name], rtol=0, atol=1e-6 * np.abs(expected[name]).max(), err_msg=name
+        )
+    if kind == "slapped":
+        assert type(together.error(1)) is type(by_turns.error(1)) and "step 0" in str(together.error(1))
+
+
+def test_steps_of_implicit_scenes_go_on_from_their_ends():
+    whole, own = implicit("Euler")
+    batch, start = ds.Batch(whole.solver, 1, 3), own.pop("initial_velocities")
+    state = dict(initial_velocities=start)
+    for _ in range(4):
+        state = batch.forward(**own, **state).end
+    frames = whole.forward(**own, initial_velocities=start)
+    np.testing.assert_allclose(state["initial_positions"], frames.positions[:, -1], rtol=0, atol=1e-8)
+
+
+def test_scenes_of_other_drag_take_implicit_steps_by_turns():
+    scene = ds.Scene(MESH, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), ds.Drag(1.0)], precision="f64")
+    batch = ds.Batch(ds.ImplicitEulerSolver(scene, dt=0.01), 2, 2)
+    with pytest.warns(UserWarning, match="differ in drag_rate take implicit steps one after the other"):
+        frames = batch.forward(drag_rate=[0.5, 2.0])
+    speed = frames.velocities[:, -1, 0, 1]
+    np.testing.assert_allclose(speed, -0.0981 * (1 + np.exp([-0.005, -0.02])), rtol=1e-6)
+    assert batch.vjp(frames, velocities=np.ones(frames.velocities.shape))["drag_rate"].shape == (2,)
 
 
 def test_a_control_loop_goes_on_from_its_ends():

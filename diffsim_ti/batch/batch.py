@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.batch.batch_inputs import change_of, checked_values, spread_given
 from diffsim_ti.batch.frames import BatchFrames, LazyFrames
+from diffsim_ti.batch.joined_sweep import JoinedSweep
 from diffsim_ti.batch.set_values import gathered_scenes
 from diffsim_ti.batch.side_by_side import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
@@ -28,6 +29,7 @@ from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FAR, FacesBend
 from diffsim_ti.state.schedule import UnequalSteps
+from diffsim_ti.terms import Drag
 
 
 class Batch(metaclass=Public):
@@ -35,9 +37,10 @@ class Batch(metaclass=Public):
 
     solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.
     scenes: how many, >= 1.
-    lanes: None, side by side where the scene allows it, else one after the other: eight scenes simultaneously in the
-    lanes of vector units on CPUs, each on threads of its own on GPUs, neighbouring scenes on neighbouring ones. True:
-    ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and
+    lanes: None, side by side where the scene allows it, else one after the other. Explicit steps: eight scenes
+    simultaneously in the lanes of vector units on CPUs, each on threads of its own on GPUs, neighbouring scenes on
+    neighbouring ones. Implicit and static ones: all scenes in one Newton's method, each with its own line search and end.
+    True: ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and
     `why_not` what keeps the scene from it.
     runs: as of `Rollout`, for `run` under `ti.ad.Tape`.
 
@@ -45,12 +48,13 @@ class Batch(metaclass=Public):
     length `scenes` in front. Gradients and tangents of inputs that were given once have their shape, gradients being summed
     over scenes in their order; of others they have the leading axis. Numbers of tetrahedra may be given by named sets, each
     set once or with the axis, `youngs_modulus={"soft": [1e4, 2e4], "stiff": 1e6}`; gradients have the same names. At equal
-    steps the states of a scene are, bit for bit, those of a `Rollout` of it alone, whatever its neighbours, its place among
-    them and the number of threads.
+    steps the states of a scene are those of a `Rollout` of it alone: of explicit solvers bit for bit, whatever its
+    neighbours, its place among them and the number of threads, of others to the solver's tolerance.
 
     Scenes fail alone (`BatchFrames.alive`): the gradient of one that did is zero, with a warning. Side by side a failure is
     a frame that is not finite or whose vertices cross the body within a substep, or a vertex behind an obstacle; gains of
-    energy that a `Rollout` warns of are not looked for.
+    energy that a `Rollout` warns of are not looked for. Where a solve of all implicit scenes gives one up, it is run alone
+    (`BatchFrames.alone`).
 
     Freeman et al. 2021, Brax (leading axes of scenes), arXiv:2106.13281.
     Raises ValueError for shapes that fit neither, or both, saying which there are.
@@ -93,7 +97,8 @@ class Batch(metaclass=Public):
         if lanes and self.why_not:
             raise ValueError(f"scenes cannot be computed side by side: {self.why_not}; leave out lanes=True")
         self.lanes = self.why_not is None if lanes is None else bool(lanes)
-        self.sweep = BatchSweep(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
+        kind = BatchSweep if self.solver.explicit else JoinedSweep
+        self.sweep = kind(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
         if self.sweep:
             self.sweep.run_substeps = self.one.sweep.run_substeps
 
@@ -106,7 +111,8 @@ class Batch(metaclass=Public):
         return made_again, (Batch, own)
 
     def __repr__(self) -> str:
-        how = "side by side" if self.lanes else "one after another"
+        why = f", for {self.why_not}," if self.why_not else ""
+        how = "side by side" if self.lanes else f"one after another{why}"
         return f"Batch({self.num_scenes} scenes {how} of {self.one!r})"
 
     @property
@@ -127,12 +133,21 @@ class Batch(metaclass=Public):
         inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
         values = checked_values(self.one, inputs, self.num_scenes)
         self._fit(values)
-        run = (self._side_by_side if self.lanes else self._by_turns)(values)
+        run = (self._side_by_side if self.lanes and self._share_steps(values) else self._by_turns)(values)
         run.sets = sets
         dead = np.flatnonzero(~run.alive)
         if raise_errors and dead.size:
             raise run.error(int(dead[0]))
         return run
+
+    def _share_steps(self, values: dict) -> bool:
+        """Whether the steps of all scenes are one equation: implicit ones have one rate of drag."""
+        drag = None if self.solver.explicit else self.scene.term(Drag)
+        name = self.scene.input_names(drag)["drag_rate"] if drag else None
+        if drag and isinstance(values[name], Own) and np.ptp(values[name]) > 0:
+            warn(f"scenes that differ in {name} take implicit steps one after the other")
+            return False
+        return True
 
     def _fit(self, values: dict) -> None:
         """Let the stiffest scene choose substeps that were left to the solver, and refuse values that need more."""
@@ -148,17 +163,31 @@ class Batch(metaclass=Public):
         u, v = self.sweep.states()
         self._warn_of_bent_faces(self._positions(values, u))
         last_good, crossed = np.full(self.num_scenes, self.num_frames - 1), self.sweep.crossed()
-        for b in {*np.flatnonzero(~self._sound(u[:, -1], v[:, -1])), *crossed}:
+        broken = np.flatnonzero(~self._sound(u[:, -1], v[:, -1])) if self.solver.explicit else ()
+        for b in {*broken, *crossed}:
             good = self._sound(u[b], v[b])
             if b in crossed:
                 good[crossed[b] // self.save_every + 1 :] = False
             last_good[b] = max(0, int(np.argmin(good)) - 1) if not good.all() else last_good[b]
         for b in np.flatnonzero(last_good < self.num_frames - 1):
             u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
+        alone, errors = self._alone(values)
+        for b, own in alone.items():
+            u[b], v[b], last_good[b] = own.displacements, own.velocities, self._last_good(errors.get(b))
         resolution = self.sweep.resolutions()
         states = self._positions(values, u), v, u
-        frames = LazyFrames(self.num_scenes, lambda b: self._frames_of(values, b, states, times, resolution(b)))
-        return BatchFrames(self, values, frames, last_good, run, states=states)
+        make = lambda b: alone.get(b) or self._frames_of(values, b, states, times, resolution(b))  # noqa: E731
+        out = BatchFrames(self, values, LazyFrames(self.num_scenes, make), last_good, run, errors, states)
+        out.alone = tuple(alone)
+        return out
+
+    def _alone(self, values: dict) -> tuple[dict[int, Frames], dict[int, Exception]]:
+        """Frames of the scenes that the solves of all together left out, and the errors that stopped some."""
+        frames, errors = {}, {}
+        for b in self.sweep.left:
+            frames[b], error = self._one_by_one(values, b)
+            errors |= {b: error} if error else {}
+        return frames, errors
 
     def _warn_of_bent_faces(self, positions: np.ndarray) -> None:
         """Where faces of some frame lie farther from the triangles of their nodes than contact there may be taken for
@@ -196,20 +225,22 @@ class Batch(metaclass=Public):
         return frames
 
     def _by_turns(self, values: dict) -> BatchFrames:
-        frames, errors = [], {}
-        for b in range(self.num_scenes):
-            own = {name: value_of(value, b) for name, value in values.items()}
-            try:
-                frames.append(self.one.forward(**own))
-            except FloatingPointError as error:
-                errors[b] = error
-                run = Run(own, contacts=self.one.sweep.workspace.watch.seen_so_far(), error=error)
-                frames.append(self.one.frames_of(run))
-            except ValueError as error:
-                error.args = (f"scene {b}: {error}",)
-                raise
-        last_good = np.array([self._last_good(errors.get(b)) for b in range(self.num_scenes)])
-        return BatchFrames(self, values, frames, last_good, None, errors)
+        found = [self._one_by_one(values, b) for b in range(self.num_scenes)]
+        last_good = np.array([self._last_good(error) for _, error in found])
+        errors = {b: error for b, (_, error) in enumerate(found) if error}
+        return BatchFrames(self, values, [frames for frames, _ in found], last_good, None, errors)
+
+    def _one_by_one(self, values: dict, b: int) -> tuple[Frames, Exception | None]:
+        """(frames of scene b, run alone, what stopped it)"""
+        own = {name: value_of(value, b) for name, value in values.items()}
+        try:
+            return self.one.forward(**own), None
+        except FloatingPointError as error:
+            run = Run(own, contacts=self.one.sweep.workspace.watch.seen_so_far(), error=error)
+            return self.one.frames_of(run), error
+        except ValueError as error:
+            error.args = (f"scene {b}: {error}",)
+            raise
 
     def _last_good(self, error: Exception | None) -> int:
         """The last frame before an error."""
@@ -245,7 +276,7 @@ class Batch(metaclass=Public):
                 raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {x.shape}")
             check_finite(name, x[frames.alive], self.save_every)
         self._warn_of_dead(frames, "gradients")
-        out = (self._vjp_side_by_side if self.lanes else self._vjp_by_turns)(frames, given)
+        out = (self._vjp_by_turns if frames.run is None else self._vjp_side_by_side)(frames, given)
         for name in out.keys() & frames.sets.keys():
             out[name] = gathered_scenes(out[name], frames.values[name], *frames.sets[name])
         return with_shape(out, self.one.sweep.wants_shape)
@@ -257,7 +288,8 @@ class Batch(metaclass=Public):
             warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero")
 
     def _vjp_side_by_side(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
-        shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive
+        shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive.copy()
+        alive[list(frames.alone)] = False
         by_u, by_v, direct = np.zeros(shape), np.zeros(shape), []
         of_states = given.keys() <= {"positions", "velocities"}  # which say nothing of inputs but by the states
         if of_states:
@@ -271,10 +303,17 @@ class Batch(metaclass=Public):
                 if part is not None:
                     target[b] = part
         derived = self.sweep.pull_back(frames.run, by_u, by_v)
+        alone = {*frames.alone, *self.sweep.left}  # the second: whose linear solve did not come to its end
+        alive[list(alone)] = False
         for part in derived.parts().values():
             if part is not None:
-                part[~frames.alive] = 0  # they have left no trace in others
-        return self._by_inputs(frames, derived.mapped(np.asarray), direct)
+                part[~alive] = 0  # they have left no trace in others
+        out = self._by_inputs(frames, derived.mapped(np.asarray), direct)
+        for b in sorted(alone.intersection(np.flatnonzero(frames.alive).tolist())):
+            for name, own in self.one.vjp(frames[b], **{name: x[b] for name, x in given.items()}).items():
+                target = out[name] = np.array(out[name])
+                target[b if isinstance(frames.values[name], Own) else ...] += own
+        return out
 
     def _by_inputs(self, frames: BatchFrames, adjoint: Derived, direct: list) -> dict[str, np.ndarray]:
         """Gradients by the wanted inputs; what meets no number that scenes have of their own is summed over them first."""
@@ -328,12 +367,13 @@ class Batch(metaclass=Public):
         ]
         self._warn_of_dead(frames, "changes")
         out = {name: np.zeros((self.num_scenes, *x.shape(self.num_frames))) for name, x in self.outputs.items()}
-        if self.lanes:
+        if self.lanes and self.solver.explicit:
             inputs = self.scene.inputs
             derived = [inputs.derive_jvp(frames[b].inputs, own[b]) for b in range(self.num_scenes)]
             du, dv = self.sweep.push_forward(frames.run, derived)
+        by_one = not self.lanes or not self.solver.explicit
         for b in np.flatnonzero(frames.alive):
-            changes = self.one.tangents(frames[b], **own[b]) if not self.lanes else None
+            changes = self.one.tangents(frames[b], **own[b]) if by_one else None
             changes = changes or self.one.changes_of(frames[b], du[b], dv[b], own[b])
             for name, change in changes.items():
                 out[name][b] = change

@@ -68,6 +68,7 @@ class BatchFrames(Sequence, metaclass=Public):
         self.outputs = {name: np.stack([one.outputs[name] for one in frames]) for name in batch.one.computed}
         self.sets: dict = {}  # inputs that were given by named sets
         self._errors: dict[int, Exception] = errors or {}
+        self.alone: tuple[int, ...] = ()  # scenes that were run by themselves (joined_newton.py)
 
     def __len__(self) -> int:
         return len(self._frames)

@@ -91,8 +91,21 @@ class BatchSweep(Sweep):
         if values.derived is None:
             own = {name: x for name, x in values.items() if isinstance(x, Own)}
             changed = [{name: x[b] for name, x in own.items()} for b in range(self.num_scenes)]
-            values.derived = self.scene.inputs.derive_each(self.values_of(values, 0), changed)
+            try:
+                values.derived = self.scene.inputs.derive_each(self.values_of(values, 0), changed)
+            except ValueError:
+                self._name_scene(values)
+                raise
         return values.derived
+
+    def _name_scene(self, values: BatchValues) -> None:
+        """Raise what the first scene says whose values are refused."""
+        for b in range(self.num_scenes):
+            try:
+                self.scene.inputs.derive(self.values_of(values, b))
+            except ValueError as error:
+                error.args = (f"scene {b}: {error}",)
+                raise
 
     def make_workspace(self, derived):
         return BatchWorkspace(self.solver, derived)
@@ -120,6 +133,8 @@ class BatchSweep(Sweep):
     def crossed(self) -> dict[int, int]:
         """{scene: the step in which it got behind an obstacle}"""
         return {b: int(self.solver.schedule.row(j)) for b, j in self._guard.crossed.items()}
+
+    left: tuple | list = ()  # scenes that are to be run alone
 
     def resolutions(self) -> Callable[[int], ContactResolution]:
         """What contacts of scene b did in the last run, worked out when it is asked for."""

@@ -36,7 +36,7 @@ class FrameArrays(NamedTuple):
 class Workspace:
     """What every solver's run needs; `advance` is the solver's own."""
 
-    pairs_kind = SurfacePairs
+    pairs_kind, arrays_kind = SurfacePairs, SceneArrays
     first_step = 0  # steps that were done before this run, for reports
     potential = None  # of implicit steps
     chambers = None  # of explicit steps
@@ -53,7 +53,7 @@ class Workspace:
         self.substep = solver.substep  # length of the passes that were last looked after [s]
         self.owner = runtime.program()
         explicit = solver.explicit
-        self.arrays = SceneArrays(self.scene, solver.stages_contact, explicit, not explicit, bend)
+        self.arrays = self.arrays_kind(self.scene, solver.stages_contact, explicit, not explicit, bend)
         self.parallel = solver.runs_parallel()
         self.pairs = pairs_of(self.pairs_kind, self.arrays, self.parallel)
         self.state = self.history(1)

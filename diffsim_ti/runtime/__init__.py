@@ -45,6 +45,7 @@ from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
 from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, Repeated, array_types, kernel, kernels_of
 from diffsim_ti.runtime.language import Bundle, Expr, assign, at, each_lane, let, spread, traced, variable
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
+from diffsim_ti.runtime.piecewise import Piecewise
 from diffsim_ti.runtime.repeated_loops import can_repeat
 from diffsim_ti.runtime.start import (
     NUMPY,

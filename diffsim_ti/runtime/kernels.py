@@ -73,7 +73,7 @@ class Kernel:
         law = getattr(owner, "law", None) or getattr(getattr(owner, "element", None), "law", None)
         self.of_law = f" of {law.title}" if hasattr(law, "title") else ""
         self.options["title"] = f"the kernel {name}{self.of_law}"
-        self.body, self._types, self._kinds = body, array_types(precision), numbers
+        self.body, self._types, self.kinds = body, array_types(precision), numbers
         first, call, arguments = self.call("body", {})
         self.kernel = _compiled(name, arguments, [*first, call], dict(body=body))
 
@@ -90,10 +90,10 @@ class Kernel:
             mine = {a: names.get((bundle, a), f"{prefix}{bundle}_{a}") for a in own}
             arguments |= {mine[a]: types[kind] for a, kind in own.items()}
             bundles.append(f"Bundle({', '.join(f'{a}={argument}' for a, argument in mine.items())})")
-        arguments |= {prefix + n: types[kind] for n, kind in self._kinds.items()}
+        arguments |= {prefix + n: types[kind] for n, kind in self.kinds.items()}
         # a GPU takes one task more, of one thread, for the bounds of each loop, but one for all that are read before them
-        first = [] if runs_on_cpu() else [n for n, kind in self._kinds.items() if kind == "int"]
-        numbers = ", ".join(f"{n}={prefix}{n}_" if n in first else f"{n}={prefix}{n}" for n in self._kinds)
+        first = [] if runs_on_cpu() else [n for n, kind in self.kinds.items() if kind == "int"]
+        numbers = ", ".join(f"{n}={prefix}{n}_" if n in first else f"{n}={prefix}{n}" for n in self.kinds)
         lines = [f"{prefix}{n}_ = {prefix}{n}" for n in first]
         return lines, f"{body}({', '.join([*bundles, f'Bundle({numbers})'])})", arguments
 

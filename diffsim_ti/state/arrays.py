@@ -70,6 +70,13 @@ class SceneArrays:
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
         self.rows: dict[str, np.ndarray | None] = {}  # numbers as the device has them, of steps too
 
+    num_scenes = 1  # whose bodies are pieces of the mesh (batch/joined_scene.py)
+
+    @property
+    def vertices_of_one(self) -> int:
+        """Vertices of a scene."""
+        return self.num_vertices // self.num_scenes
+
     def _order_tetrahedra(self, scene) -> None:
         """`order`: the tetrahedron in each lane; `place`: the lane of each; `num_places`: lanes to go through."""
         m = scene.mesh.num_tetrahedra
@@ -343,4 +350,6 @@ class SceneArrays:
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
         """Blocks of volumes; repetitions in a patch have none, nor what is rigid."""
         blocks = self.to_blocks(self.with_stress(volumes))
-        return blocks if isinstance(self.place, slice) else blocks * self.alone.reshape(-1, LANES)
+        if isinstance(self.place, slice):
+            return blocks
+        return blocks * np.repeat(self.alone.reshape(-1, LANES), self.points, axis=0)

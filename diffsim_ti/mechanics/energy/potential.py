@@ -8,10 +8,11 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import StressPoints
-from diffsim_ti.mechanics.energy.kernels import potential_kernels
+from diffsim_ti.mechanics.energy.kernels import PotentialKernels
 from diffsim_ti.mechanics.host_force import NONE
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.patch_coupling import PatchCoupling
+from diffsim_ti.runtime import kernels_of
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
@@ -24,7 +25,7 @@ class Potential:
 
     def __init__(self, arrays, tetrahedra: np.ndarray, parallel: bool, pairs=None):
         self.arrays, self.tetrahedra, self.pairs, a = arrays, tetrahedra, pairs, arrays
-        self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
+        self.kernels = self.kernels_for(a.features(), parallel)
         n, m = a.num_vertices, a.num_places
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))  # displacement, direction, result
         self.has_friction = bool(a.features().rough)
@@ -41,6 +42,12 @@ class Potential:
         self.rate = runtime.array(a.fp, 1) if a.law.viscous else None
         self.hosts = NONE  # host forces that have an energy: set by whom a time is known
         self.rigid: RigidSets | None = None  # sets that do not deform: set by whom passes are known
+
+    kernels_kind = PotentialKernels
+
+    def kernels_for(self, features, parallel: bool) -> PotentialKernels:
+        """Those of a scene with such features."""
+        return kernels_of(self.kernels_kind, self.arrays.law, features.of_state(), parallel, self.arrays.in_lanes)
 
     @property
     def surface_friction(self):

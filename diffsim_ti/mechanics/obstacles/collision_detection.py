@@ -7,8 +7,9 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.obstacles.swept import swept_kernels
+from diffsim_ti.mechanics.obstacles.swept import SweptKernels
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
+from diffsim_ti.runtime import kernels_of
 
 
 @dataclass(frozen=True)
@@ -33,11 +34,12 @@ class CollisionDetection:
     """
 
     far, kept = 1e30, 0.1  # of the distance, or of the width if that is less, where an obstacle is met
+    kernels_kind = SweptKernels
 
     def __init__(self, arrays, parallel: bool):
         self.a, a = arrays, arrays
         self.terms, mesh = a.contacts, a.mesh
-        self.kernels = swept_kernels(a.features(), a.precision, parallel)
+        self.kernels = kernels_of(self.kernels_kind, a.features().of_state(), a.precision, parallel)
         self.vertices, self.count = mesh.surface_vertices, len(mesh.surface_vertices)
         self.way = SimpleNamespace(
             vertices=runtime.upload(self.vertices, ti.i32),

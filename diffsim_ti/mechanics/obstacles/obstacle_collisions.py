@@ -17,9 +17,11 @@ class ObstacleCollisions:
     """Of a workspace. rows: of its obstacles in the pass (state/obstacle_poses.py); before, at_stage: displacements of
     theirs where the pass begins and where it takes forces."""
 
+    detection_kind = CollisionDetection
+
     def __init__(self, workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
-        self.detection = CollisionDetection(workspace.arrays, workspace.parallel)
+        self.detection = self.detection_kind(workspace.arrays, workspace.parallel)
 
     # ---- in a pass ---------------------------------------------------------------------------------------------------
 
@@ -48,7 +50,11 @@ class ObstacleCollisions:
     def at_end(self, j: int) -> np.ndarray:
         """Displacements of the obstacles at the end of pass j."""
         arrays = self.ws.arrays
-        return arrays.poses.value(arrays.rows["path"], self.moment(j, Stage(1.0)))[::3]
+        return arrays.poses.value(arrays.rows["path"], self.end_of(j))[::3]
+
+    def end_of(self, j: int) -> Moment:
+        """The end of pass j."""
+        return self.moment(j, Stage(1.0))
 
     # ---- on the way of a step ----------------------------------------------------------------------------------------
 

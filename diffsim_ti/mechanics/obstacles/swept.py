@@ -10,8 +10,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
-from diffsim_ti.runtime import Kernel, kernels_of, traced
-from diffsim_ti.state.features import Features
+from diffsim_ti.runtime import Kernel, traced
 from diffsim_ti.state.numbers import SCENE, needed
 from diffsim_ti.state.obstacle_poses import MORE
 from diffsim_ti.terms.obstacles import turning
@@ -146,8 +145,3 @@ class SweptKernels(ObstacleFunctions):
     def distances(self) -> Kernel:
         """Distances below `most`, at the places and displacements given."""
         return self._kernel("distances", self.all_distances)
-
-
-def swept_kernels(features: Features, precision: str, parallel: bool) -> SweptKernels:
-    """Kernels for a scene's features."""
-    return kernels_of(SweptKernels, features.of_state(), precision, parallel)

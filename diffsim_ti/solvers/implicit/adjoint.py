@@ -12,7 +12,6 @@ from diffsim_ti import runtime
 from diffsim_ti.common.blas_threads import one_blas_thread
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.record import ChamberRecord
-from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, SharesAdjoint
 from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
@@ -31,8 +30,8 @@ class ImplicitAdjoint(RecordedPasses):
         super().__init__(workspace)
         a = workspace.arrays
         self.features = a.features(density, shape)
-        self.kernels = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
         self.numbers, p = Adjoint(a, self.features), workspace.potential
+        self.kernels = p.kernels_for(self.features, workspace.parallel)
         n, num_obstacles = a.num_vertices, len(a.obstacles)
         self.potential = p
         self.lag = runtime.array(a.vector, 2, n if p.has_friction else 1)
@@ -165,11 +164,10 @@ class ImplicitAdjoint(RecordedPasses):
             by_place, by_friction, by_begin = ws.potential.surface_friction.vjp(ws.potential.held_at, by_star)
             reaction, by_x, by_lag = reaction + by_place, by_x + by_friction, by_lag + by_begin
         share = ws.load_share(j, s)
-        self.gravity += share * (ws.mass * by_star).sum(0)
+        self.gravity = self.gravity + share * self._sum(ws.mass * by_star)
         self._add_mass(by_star, self.weight(share))
         if self.forces is not None:
-            felt, keyed = share * by_star[ws.dead_loads.acts_at], ws.dead_loads.keyed
-            ws.solver.schedule.add_load(self.forces, j, ws.share_at_stage(j, s), keyed, felt)
+            ws.add_loads(self.forces, j, s, share * by_star)
         # where inertia starts from
         inertial = self.mass * by_star
         reaction = reaction - inertial  # fixed vertices are felt by their neighbours' inertia too
@@ -178,16 +176,17 @@ class ImplicitAdjoint(RecordedPasses):
             by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
             by_lag, x_adj = by_lag + by_first, x_adj + by_first_x
         if self.path is not None:
-            by_poses = runtime.fetch(self.poses).astype(np.float64).sum(1)
+            by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64))
             by_poses = by_poses + (0.0 if seen is None else seen[2])
             if ws.pairs and ws.pairs.obstacles:
                 by_poses = by_poses + ws.pairs.obstacles.take_rows()
             ws.collisions.vjp(by_poses, j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
-        self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()
+        by_rate = db0 * y_adj * self.v + de0 * q_free * self.v_star + de1 * q_free * self.y
         if self.before is not None:
-            self.rate += db1 * (y_adj * self.before[1]).sum()
+            by_rate += db1 * y_adj * self.before[1]
+        self.rate = self.rate + self._sum(by_rate).sum(-1)
         u_adj = s.a0 * x_adj + (1 - s.c0) * p_free + by_lag
         v_adj = s.b0 * y_adj
         if ws.rigid:
@@ -202,6 +201,16 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.strains:
             by_u, by_before = ws.strains.vjp(s, self.u, self.before, self)
             self.p, self.pending[0] = self.p + by_u, self.pending[0] + by_before
+
+    @staticmethod
+    def _sum(x: np.ndarray) -> np.ndarray:
+        """Of vectors of all vertices."""
+        return x.sum(0)
+
+    @staticmethod
+    def _sum_of_poses(rows: np.ndarray) -> np.ndarray:
+        """Of what each vertex has of the rows of obstacles."""
+        return rows.sum(1)
 
     def _add_mass(self, by_star: np.ndarray, weight: np.ndarray) -> None:
         """Adds the adjoints of masses: weight, per mass, works on by_star."""

@@ -22,6 +22,7 @@ class DeviceCG:
     """
 
     most_chunks, shortest = 256, 32
+    kernels_kind = CGKernels
     many = 50  # iterations in a launch on one thread, which stops by itself
 
     def __init__(self, potential, cycle, free: Free, parallel: bool):
@@ -83,7 +84,8 @@ class DeviceCG:
     def parts(self, more: bool) -> list:
         """An iteration, as [(kernel, records, numbers)] of `Repeated`."""
         potential, own = self.potential, dict(cg=self, at=self.potential)
-        kernels = kernels_of(CGKernels, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
+        kind = self.kernels_kind
+        kernels = kernels_of(kind, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
         before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
         return [*before, (*potential.multiplying, None), (kernels.step, own, None)]
@@ -116,11 +118,22 @@ class DeviceCG:
             runtime.fill(self.mass, mass[:, 0])
             self._filled = mass
 
-    def iterate(self, done: int, most: int, eps: float, more: bool = False, convex: bool = False) -> None:
-        """Some of at most so many iterations, of which some are done."""
+    def iterations(self, more: bool, convex: bool) -> Callable:
+        """(times, rounding) -> so many iterations; more: whether a matrix joins the Hessian."""
         if (more, convex) not in self._iterations:
             self._iterations[more, convex] = self._iteration(more, convex)
-        self._iterations[more, convex](min(self._look or max(2, self.last - done, done), most - done), 10 * eps)
+        return self._iterations[more, convex]
+
+    def iterate(self, done: int, most: int, eps: float, more: bool = False, convex: bool = False) -> None:
+        """Some of at most so many iterations, of which some are done."""
+        times = min(self._look or max(2, self.last - done, done), most - done)
+        self.iterations(more, convex)(times, 10 * eps)
+
+    def put_system(self, mass: Mass, more) -> None:
+        """Bring the mass and the matrix of a system, if it has one, to the device."""
+        if more is not None:
+            self._put(more)
+        self.put_mass(mass)
 
     def __call__(
         self, mass: Mass, more, convex: bool, b: np.ndarray, tolerance: float, max_iterations: int, eps: float
@@ -133,9 +146,7 @@ class DeviceCG:
         size = np.linalg.norm(b)
         if size == 0:
             return np.zeros_like(b), 0.0, 0, None
-        if more is not None:
-            self._put(more)
-        self.put_mass(mass)
+        self.put_system(mass, more)
         runtime.fill(self.r, (b / size)[None])
         state = np.zeros(ROOM)
         state[LEAST], state[LIMIT] = tolerance**2, max_iterations

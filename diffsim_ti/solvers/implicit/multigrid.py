@@ -47,8 +47,9 @@ class Multigrid(Preconditioner):
             aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest, self._ties)
         matrices, ways = [aggregated], []
         changes = potential.arrays.contacts or potential.pairs or potential.hosts  # on the finest level
-        if changes or len(rest) > self.direct:
-            matrices, ways = _aggregated(aggregated, _allowed(_rigid_motions(rest), allowed))
+        scenes = potential.arrays.num_scenes
+        if changes or len(rest) > scenes * self.direct:
+            matrices, ways = _aggregated(aggregated, _allowed(_rigid_motions(rest), allowed), scenes)
         if mesh.order == 2:
             matrices, ways = [matrix, *matrices], [up, *ways]
         self._at_rest = matrix.data[diagonal]
@@ -89,10 +90,18 @@ class Multigrid(Preconditioner):
         return (z if T is None else (T @ z.ravel()).reshape(z.shape)) * self.free
 
 
-def _aggregated(matrix, motions: np.ndarray) -> tuple[list, list]:
+def _aggregated(matrix, motions: np.ndarray, scenes: int = 1) -> tuple[list, list]:
     """(matrices of all levels, ways from each to the one before) by smoothed aggregation, which leaves rigid motions to the
-    coarse ones."""
+    coarse ones. Of several scenes those of the first say the ways of all."""
     import pyamg
+
+    if scenes > 1:
+        n = matrix.shape[0] // scenes
+        one = matrix.tocsr()[:n, :n].tobsr(matrix.blocksize)
+        ways, matrices = [_repeated(P, scenes) for P in _aggregated(one, motions[:n])[1]], [matrix]
+        for P in ways:
+            matrices.append((P.T @ matrices[-1] @ P).tobsr((P.blocksize[1],) * 2))
+        return matrices, ways
 
     state = np.random.get_state()
     np.random.seed(0)  # pyamg estimates a spectral radius from a random vector
@@ -107,6 +116,17 @@ def _aggregated(matrix, motions: np.ndarray) -> tuple[list, list]:
     finally:
         np.random.set_state(state)
     return [matrix, *(level.A for level in levels[1:])], [level.P for level in levels[:-1]]
+
+
+def _repeated(M, count: int):
+    """The block-diagonal matrix of so many M."""
+    from scipy.sparse import bsr_matrix
+
+    k, columns = len(M.indices), M.shape[1] // M.blocksize[1]
+    each = np.arange(count)[:, None]
+    start = np.append((M.indptr[:-1] + k * each).ravel(), k * count)
+    shape = M.shape[0] * count, M.shape[1] * count
+    return bsr_matrix((np.tile(M.data, (count, 1, 1)), (M.indices + columns * each).ravel(), start), shape=shape)
 
 
 def as_blocks(M):

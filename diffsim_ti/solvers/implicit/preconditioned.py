@@ -29,10 +29,14 @@ class Preconditioners:
             kind = Multigrid if self._wants_multigrid(size, mass) else BodyBlocks if ws.scene.reduced else BlockJacobi
             if len(self._kept) > 5:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = kind(ws.potential, mass, ws.free, size, ws.parallel), size
+            self._kept[key] = self.make(kind, size, mass), size
         kept, size = self._kept[key]
         kept.begin()
         return kept, size + size_of
+
+    def make(self, kind: type, size: np.ndarray, mass: np.ndarray):
+        """A preconditioner of a kind."""
+        return kind(self.ws.potential, mass, self.ws.free, size, self.ws.parallel)
 
     def _rounded(self, inertia: np.ndarray) -> np.ndarray:
         """c m, of unequal steps for the nearest power of four of c, so that some preconditioners serve all steps."""
@@ -47,4 +51,4 @@ class Preconditioners:
         if self.ws.solver.preconditioner != "auto":
             return self.ws.solver.preconditioner == "multigrid"
         ratio = np.max(size[mass > 0] / mass[mass > 0], initial=0.0) if mass.any() else np.inf
-        return len(size) > self.small and ratio > self.stiff
+        return self.ws.arrays.vertices_of_one > self.small and ratio > self.stiff

@@ -51,8 +51,12 @@ class PrescribedInPasses(Workspace):
         """Set host forces and growth of pass j; of statics a share of what it lays on."""
         self.applied_share = share if stage.static else 1.0
         if self.hosts:
-            self.hosts.take(self.arrays.now, self.instant(j, stage))
+            self.hosts.take(self._host_values(), self.instant(j, stage))
         self.grow(j, stage)
+
+    def _host_values(self) -> Derived:
+        """What host forces take their numbers from."""
+        return self.arrays.now
 
     def reached(self, j: int, stage: Stage, share: float) -> float:
         """Share of its step to which a share of pass j leads."""
@@ -138,12 +142,16 @@ class PrescribedInPasses(Workspace):
         """Number of pass j, also of the steps of a run that come one by one."""
         return self.first_step * int(np.max(self.solver.schedule.substeps)) + j
 
+    def gravity_of(self, values: Derived) -> np.ndarray:
+        """Gravity [m/s^2], one vector or one for each vertex; there is some."""
+        return values.parameters[self.arrays.features().gravity :][:3]
+
     def loads(self, j: int, stage: Stage) -> np.ndarray:
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
         values, features = self.arrays.values, self.arrays.features()
         out = np.zeros_like(values.displacement)
         if features.gravity >= 0:
-            out += self.mass * values.parameters[features.gravity :][:3]
+            out += self.mass * self.gravity_of(values)
         out = self._add_forces(self.arrays.rows["forces"], out, j, stage)
         return out * self.load_share(j, stage)
 
@@ -156,7 +164,7 @@ class PrescribedInPasses(Workspace):
             return inertial + shift, np.zeros_like(loads)
         values, features = self.arrays.values, self.arrays.features()
         if features.gravity >= 0:
-            inertial = inertial + values.parameters[features.gravity :][:3] / stage.inertia
+            inertial = inertial + self.gravity_of(values) / stage.inertia
         return inertial, self.applied_forces(self.arrays.rows["forces"], j, stage)
 
     def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:
@@ -164,6 +172,11 @@ class PrescribedInPasses(Workspace):
             share, keyed = self.share_at_stage(j, stage), self.dead_loads.keyed
             out[self.dead_loads.acts_at] += self.solver.schedule.load(rows, j, share, keyed)
         return out
+
+    def add_loads(self, rows_adj: np.ndarray, j: int, stage: Stage, by_vertices: np.ndarray) -> None:
+        """Adjoint of `_add_forces`."""
+        share, keyed = self.share_at_stage(j, stage), self.dead_loads.keyed
+        self.solver.schedule.add_load(rows_adj, j, share, keyed, by_vertices[self.dead_loads.acts_at])
 
     def applied_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
         """Given forces on each vertex in pass j [N], from rows of them or of their tangent, without weight."""

@@ -55,10 +55,9 @@ class RecordedPasses:
 
     def weight(self, share: float) -> np.ndarray:
         """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""
-        features, values = self.ws.arrays.features(), self.ws.arrays.values
         out = -self.stage.inertia * (self.u_star - self.x - self.stage.gamma * self.y)
-        if features.gravity >= 0:
-            out = out + share * values.parameters[features.gravity :][:3]
+        if self.ws.arrays.features().gravity >= 0:
+            out = out + share * self.ws.gravity_of(self.ws.arrays.values)
         return out
 
     @property

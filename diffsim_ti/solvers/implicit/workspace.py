@@ -44,7 +44,8 @@ class TwoStepHistory(History):
 class ImplicitWorkspace(PrescribedInPasses):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
-    pairs_kind = ImplicitPairs
+    pairs_kind, potential_kind, newton_kind = ImplicitPairs, Potential, Newton
+    collisions_kind, preconditioners_kind = ObstacleCollisions, Preconditioners
     enough = 20  # rounds with which a solution that was not found is found by load stepping
 
     def __init__(self, solver, derived, bend=0.0):
@@ -60,7 +61,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         self._launches.clear()
         super().load(derived)
         if not self._launches.get("potential"):
-            self.potential = Potential(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
+            self.potential = self.potential_kind(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
             self.strains = FrozenStrains(self) if self.potential.held is not None else None
         a = self.arrays
@@ -80,9 +81,10 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.potential.hosts, others = self.hosts.with_energy, self.hosts.without_energy
         self.volumes = self.volume_constraints(eps)
         self.multipliers = {}  # the pressures [Pa] that each pass ended with
-        self.preconditioner, self.noted, self.collisions = Preconditioners(self), Noted(self), ObstacleCollisions(self)
+        self.preconditioner, self.noted = self.preconditioners_kind(self), Noted(self)
+        self.collisions = self.collisions_kind(self)
         finders, more = (self.collisions.past, self.preconditioner), (others, self.volumes)
-        self.newton = Newton(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
+        self.newton = self.newton_kind(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
         self.newton.detection = self.collisions.detection
         self.approach, self.closing = Approach(self), Closing(self)
         self.check_apart()

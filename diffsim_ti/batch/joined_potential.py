@@ -1,0 +1,150 @@
+"""The potential energy of all scenes of a batch, its preconditioners, and what obstacles let pass."""
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.batch.joined_cg import COUNTING, COUNTS, WHOLE, JoinedCG
+from diffsim_ti.batch.joined_kernels import JoinedKernels, SweptOfScenes
+from diffsim_ti.batch.joined_scene import of_scenes
+from diffsim_ti.mechanics.energy.kernels import PotentialKernels
+from diffsim_ti.mechanics.energy.potential import Potential
+from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
+from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
+from diffsim_ti.runtime import Piecewise, kernels_of
+from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
+from diffsim_ti.state.obstacle_poses import Moment
+
+BY_SCENE = "energy", "forces", "contact_blocks"  # kernels that leave out scenes which rest
+
+
+class JoinedPotential(Potential):
+    """Energies are those of each scene; scenes with a 1 in `skip` are left out."""
+
+    kernels_kind = JoinedKernels
+
+    def __init__(self, arrays, *more):
+        super().__init__(arrays, *more)
+        self.poses = runtime.array(arrays.vector, arrays.num_scenes * arrays.poses.size)
+        self.skip = runtime.array(ti.i32, arrays.num_scenes)
+
+    def launch(self, name, lanes=True, **records):
+        if name not in BY_SCENE or not self.arrays.by_scene:
+            return super().launch(name, lanes, **records)
+        a, count = self.arrays, self.arrays.num_scenes
+        if name not in self._launches:
+            one = kernels_of(PotentialKernels, a.law, a.features().of_state(), False, a.in_lanes)
+            parts = [(self.kernels.wanted, self._records), (getattr(one, name), self._records | records)]
+            whole = WHOLE | ({("scene", "coefficients")} if a.features().uniform else set())
+            self._launches[name] = Piecewise(f"{name}_of_scenes", parts, count, whole, COUNTING, lanes and a.in_vectors)
+        sizes = {n: x // count if n in COUNTS else x for n, x in self.sizes().items()}
+        self._launches[name](1, {}, sizes)
+
+    def only(self, scenes: np.ndarray) -> None:
+        """Let what follows be of some scenes, a mask; of others what was found before stays."""
+        runtime.fill(self.skip, ~scenes)
+
+    def energies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(energy [J], the sum of its absolute parts) of each scene, J at each point, shape (scenes, points)."""
+        self.launch("energy", lanes=False)
+        count = self.arrays.num_scenes
+        parts = [of_scenes(runtime.fetch(x).astype(np.float64), count) for x in (self.elastic, self.contact)]
+        parts += [part.energies(self.held_at) for part in self.hosts]
+        J = of_scenes(runtime.fetch(self.J), count)
+        return sum(x.sum(1) for x in parts), sum(np.abs(x).sum(1) for x in parts), J
+
+    def product(self, w, convex=False):
+        runtime.fill(self.skip, 0)
+        return super().product(w, convex)
+
+
+class JoinedDetection(CollisionDetection):
+    kernels_kind = SweptOfScenes
+
+    def __init__(self, arrays, parallel: bool):
+        super().__init__(arrays, parallel)
+        rows = arrays.num_scenes * (arrays.poses.size // 3)
+        self.way.places, self.way.drifts = (runtime.array(arrays.vector, rows) for _ in range(2))
+
+    def _lowest(self, most: float) -> np.ndarray:
+        scenes = self.a.num_scenes
+        return of_scenes(runtime.fetch(self.found.found).astype(np.float64), scenes).min(1, initial=most)
+
+    def shares(self, u, step, places, drifts=0.0, most: float = 1.0, kept: float = 0.1) -> np.ndarray:
+        """`share` of each scene."""
+        if not self.terms or not (np.any(step) or np.any(drifts)):
+            return np.full(self.a.num_scenes, most)
+        self.share(u, step, places, drifts, most, kept)
+        return self._lowest(most)
+
+    def are_apart(self, u, places) -> np.ndarray:
+        """Whether no vertex of a scene is in an obstacle."""
+        if not self.terms:
+            return np.ones(self.a.num_scenes, bool)
+        self.nearest(u, places)
+        return self._lowest(1e-30) >= 1e-30
+
+
+class JoinedCollisions(ObstacleCollisions):
+    """Of all scenes, whose rows stand one after the other."""
+
+    detection_kind = JoinedDetection
+
+    def _paths(self, path) -> np.ndarray | list:
+        count = self.ws.arrays.num_scenes
+        return [None] * count if path is None else of_scenes(path, count, axis=1)
+
+    def begin(self, j, stage):
+        poses, moment = self.ws.arrays.poses, self.moment(j, stage)
+        paths = self._paths(self.ws.arrays.rows["path"])
+        for path in paths:
+            poses.check(path, moment)
+        self.rows = np.concatenate([poses.value(path, moment) for path in paths])
+        self.at_stage, self.before = self.rows[::3].copy(), self.rows[1::3].copy()
+
+    def vjp(self, rows_adj, j, stage, path_adj):
+        moment, count = self.moment(j, stage), self.ws.arrays.num_scenes
+        paths, own = self._paths(self.ws.arrays.rows["path"]), self._paths(path_adj)
+        for path, rows, adjoint in zip(paths, of_scenes(rows_adj, count), own):
+            self.ws.arrays.poses.vjp(path, rows, moment, adjoint)
+
+    def drift(self, before, after) -> np.ndarray:
+        """How obstacles of all scenes go from places to others."""
+        count, poses = self.ws.arrays.num_scenes, self.ws.arrays.poses
+        if not len(before):
+            return after - before
+        return np.concatenate([poses.drift(*own) for own in zip(of_scenes(before, count), of_scenes(after, count))])
+
+    def moved(self, places, drift, shares: np.ndarray) -> np.ndarray:
+        """Where obstacles are when each scene has done a share of the drift."""
+        each = zip(of_scenes(places, len(shares)), of_scenes(drift, len(shares)), shares)
+        return np.concatenate([self.ws.arrays.poses.moved(*own) for own in each])
+
+    def at_end(self, j):
+        arrays, moment = self.ws.arrays, self.end_of(j)
+        return np.concatenate([arrays.poses.value(path, moment)[::3] for path in self._paths(arrays.rows["path"])])
+
+    def past(self, u, step, most: float = 1.0) -> np.ndarray:
+        """How far along a step each scene meets no obstacle."""
+        return self.detection.shares(u, step, self.rows[::3], most=most)
+
+    def check_end(self, j, u_star, u_next):
+        drift = self.drift(self.rows[::3], self.at_end(j))
+        self.ws.leave(self.detection.shares(u_star, u_next - u_star, self.rows[::3], drift) < 1)
+
+    def check_apart(self):
+        arrays, schedule = self.ws.arrays, self.ws.solver.schedule
+        begin = Moment(schedule, 0, schedule.begin(0), schedule.begin(0))
+        places = np.concatenate([arrays.poses.value(path, begin)[::3] for path in self._paths(arrays.rows["path"])])
+        u = runtime.fetch_row(self.ws.state.u, 0)
+        self.ws.leave(~self.detection.are_apart(u, places) | ~np.isfinite(of_scenes(u, arrays.num_scenes).sum((1, 2))))
+
+
+class JoinedPreconditioners(Preconditioners):
+    """As those of one scene, whose linear systems are solved together."""
+
+    def make(self, kind, size, mass):
+        ws = self.ws
+        made = kind(ws.potential, mass, ws.free, size, ws.parallel and not ws.arrays.by_scene)
+        made.solver = JoinedCG(made.potential, getattr(made, "cycle", None), made.free, self.ws.parallel)
+        return made

@@ -1,0 +1,150 @@
+"""A run of an implicit solver of all scenes of a batch at once."""
+
+import numpy as np
+
+from diffsim_ti.batch.joined_hosts import joined_hosts, of_each
+from diffsim_ti.batch.joined_newton import JoinedNewton
+from diffsim_ti.batch.joined_potential import JoinedCollisions, JoinedPotential, JoinedPreconditioners
+from diffsim_ti.batch.joined_scene import JoinedArrays, joined_derived, of_scenes
+from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.obstacles.approach import Approach
+from diffsim_ti.mechanics.supports.free import held_as
+from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
+
+BODY = "coefficients", "mass", "parameters", "rest", "gradients", "volumes", "element_masses"
+
+
+class JoinedWorkspace(ImplicitWorkspace):
+    """left: (scenes,), those that are to be run alone, for they left the usual course of a solve (joined_newton.py)."""
+
+    arrays_kind, potential_kind, newton_kind = JoinedArrays, JoinedPotential, JoinedNewton
+    collisions_kind, preconditioners_kind = JoinedCollisions, JoinedPreconditioners
+
+    def __init__(self, solver, each: list[Derived]):
+        self.num_scenes, self.left = len(each), np.zeros(len(each), bool)
+        super().__init__(solver, each)
+        self.energy_watch = None
+
+    def load(self, each: list[Derived]) -> None:
+        self.each, values = each, joined_derived(each)
+        if self.potential and self._same_bodies(values) and not self.arrays.load(values):  # a control loop
+            self.restart()
+            self.check_apart()
+            return
+        self.hosts = joined_hosts(self.scene.one, self.num_scenes)
+        super().load(values)
+
+    def _same_bodies(self, values: Derived) -> bool:
+        """Whether only states and what is given by steps are other than those that are loaded."""
+        known = self.arrays.values
+        return all(np.array_equal(getattr(known, name), getattr(values, name)) for name in BODY)
+
+    def restart(self) -> None:
+        self.left[:] = False
+        super().restart()
+
+    def leave(self, which: np.ndarray) -> None:
+        """Give scenes up."""
+        self.left |= which
+
+    @property
+    def rate(self) -> float:
+        at = self.arrays.features().drag
+        return float(self.each[0].parameters[at]) if at >= 0 else 0.0
+
+    def balance(self):
+        return None
+
+    # ---- what passes are told ----------------------------------------------------------------------------------------
+
+    def gravity_of(self, values) -> np.ndarray:
+        g = of_scenes(values.parameters, self.num_scenes)[:, self.arrays.features().gravity :][:, :3]
+        return np.repeat(g, self.arrays.vertices_of_one, axis=0)
+
+    def _host_values(self):
+        return of_each(self.each)
+
+    def _add_forces(self, rows, out, j, stage):
+        if rows is not None:
+            share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
+            for own, target in zip(of_scenes(rows, self.num_scenes, 1), of_scenes(out, self.num_scenes)):
+                target[acts_at] += self.solver.schedule.load(own, j, share, keyed)
+        return out
+
+    def add_loads(self, rows_adj, j, stage, by_vertices) -> None:
+        share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
+        for own, felt in zip(of_scenes(rows_adj, self.num_scenes, 1), of_scenes(by_vertices, self.num_scenes)):
+            self.solver.schedule.add_load(own, j, share, keyed, felt[acts_at])
+
+    # ---- a pass ------------------------------------------------------------------------------------------------------
+
+    def _solve(self, j, u, held, starts, problem, stage) -> np.ndarray:
+        going, newton = ~self.left, self.newton
+        newton.going = going
+        self.potential.only(going)
+        starts = [held_as(self.free, held, u + self.linear * (start - u)) for start in starts]
+        near = self._in_front(u, held, starts, problem)
+        newton.going = ~self.left
+        best, least = near, np.zeros(self.num_scenes)
+        if starts:
+            self.potential.place(near)
+            before = self.potential.energies()
+        for start in starts:
+            share = newton.spread(self.collisions.past(near, start - near))
+            there = near + share * (start - near)
+            rise = newton.rises(near, before, there, problem)
+            better = rise < least
+            best, least = np.where(newton.spread(better), there, best), np.minimum(rise, least)
+        there, solved = newton.solve_all(best, problem, ~self.left, stage.static)
+        solved &= newton.upright
+        if stage.static and not self.arrays.contacts:
+            solved &= newton.rounds <= self.noted.usual  # else a run alone says whether a branch was left
+        self.leave(~solved)
+        return np.where(newton.spread(self.left), u, there)
+
+    def _in_front(self, u, held, starts, problem) -> np.ndarray:
+        """As Approach of one scene: `held`, or where bodies stand in front of obstacles that come to them within the pass.
+        Scenes of which none is found are given up."""
+        collisions, spread = self.collisions, self.newton.spread
+        before, after = collisions.before, collisions.at_stage
+        step, drift = held - u, collisions.drift(before, after)
+        if not (step.any() or drift.any()):
+            return held
+        free = collisions.detection.shares(u, step, before, drift) == 1
+        near, meets = np.where(spread(free), held, u), ~free & ~self.left
+        if not meets.any():
+            return near
+        collisions.put(before)
+        self.potential.only(meets)
+        self.potential.place(held)
+        energies = self.potential.energies()
+        for start in starts:
+            led = meets & (collisions.detection.shares(u, start - u, before, drift) == 1)
+            led &= self.newton.rises(held, energies, start, problem) <= 0
+            near, meets = np.where(spread(led), start, near), meets & ~led
+        near = self._in_parts(near, step, before, drift, problem, meets)
+        collisions.put(after)
+        return near
+
+    def _in_parts(self, place, step, before, drift, problem, meets) -> np.ndarray:
+        """Obstacles and held vertices of some scenes come as far as the way is free, bodies make room, and so on."""
+        collisions, newton, count = self.collisions, self.newton, self.num_scenes
+        done, stuck = np.zeros(count), np.zeros(count, int)
+        for _ in range(Approach.most_parts):
+            if not meets.any():
+                break
+            left = np.where(meets, 1 - done, 0.0)
+            poses, along = collisions.moved(before, drift, done), newton.spread(left) * step
+            ahead = drift * np.repeat(left, len(drift) // count)[:, None]
+            share = collisions.detection.shares(place, along, poses, ahead, kept=Approach.kept)
+            place, done = place + newton.spread(share) * along, done + share * left
+            meets = meets & (share < 1)
+            stuck = np.where(share * left < Approach.least, stuck + 1, 0)
+            self.leave(meets & (stuck > Approach.patience))
+            meets &= ~self.left
+            collisions.put(collisions.moved(before, drift, done))
+            there, roomy = newton.solve_all(place, problem, meets, False, Approach.rounds)
+            self.leave(meets & ~roomy)
+            place, meets = np.where(newton.spread(meets), there, place), meets & roomy
+        self.leave(meets)
+        return place
