@@ -212,14 +212,23 @@ def test_up_to_a_stretch_the_volume_hardly_changes():
         library["RTV615"].up_to(4)
 
 
+RUNS = {
+    "rollout": lambda solver: ds.Rollout(solver, 1).forward(),
+    "simulator": lambda solver: ds.Simulator(solver).step(),
+    "lanes": lambda solver: ds.Batch(solver, 1, 2, lanes=True).forward(),
+    "turns": lambda solver: ds.Batch(solver, 1, 2, lanes=False).forward(),
+}
+
+
+@pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("stretch, warned", [(1.9, False), (2.1, True)])
-def test_a_run_beyond_the_range_warns(stretch, warned):
+def test_a_run_beyond_the_range_warns(run, stretch, warned):
     mesh = ds.TetrahedralMesh.create_cube(2)
     start = mesh.vertices * [stretch, stretch**-0.5, stretch**-0.5]
-    scene = ds.Scene(mesh, library["Ecoflex 00-30"].up_to(2.0), initial_positions=start, volume="patches")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-5), 1).forward()
+        scene = ds.Scene(mesh, library["Ecoflex 00-30"].up_to(2.0), initial_positions=start)
+        RUNS[run](ds.SemiImplicitSolver(scene, dt=1e-5))
     assert any("is valid to stretch 2, and tetrahedron" in str(w.message) for w in said) == warned
 
 

@@ -21,7 +21,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
-from diffsim_ti.rollout.frames import Frames, check_finite
+from diffsim_ti.rollout.frames import Frames, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
@@ -158,6 +158,8 @@ class Batch(metaclass=Public):
         resolution = self.sweep.resolutions()
         states = self._positions(values, u), v, u
         frames = LazyFrames(self.num_scenes, lambda b: self._frames_of(values, b, states, times, resolution(b)))
+        if np.isfinite(self.scene.material.valid_to):
+            any(warn_of_large_stretch(frames[b]) for b in range(self.num_scenes))
         return BatchFrames(self, values, frames, last_good, run, states=states)
 
     def _warn_of_bent_faces(self, positions: np.ndarray) -> None:
