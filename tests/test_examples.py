@@ -87,6 +87,7 @@ def test_measured_beam(tmp_path, capsys, monkeypatch):
     """Recordings that it makes itself, seen by a tilted camera: numbers come back, and the weight's motion is foretold."""
     beam = example("identify/measured_beam")
     monkeypatch.setattr(beam, "EDGE", 8e-3)
+    monkeypatch.setattr(beam, "EVERY", 20)
     truth, tilt = dict(youngs_modulus=2.2e5, drag_rate=9.0), Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
     rng = np.random.default_rng(0)
     for name, mass, share in (("gravity_a", 0.0, 0.1), ("load40_a", 0.04, 0.2)):

@@ -39,6 +39,7 @@ STEP = 0.01  # [s]; the recordings have 100 Hz
 EDGE = 3e-3  # [m] thickness of the cells that bear the weight
 LEAD, SPAN = 0.01, 1.2  # [s] from the start of the simulation to the release, and of what is fitted
 WINDOWS = ((1, 4), (4, 7))  # steps in which the support carries a share of the weight that is not known
+EVERY = 2  # samples to a picture of a film
 NOISE = 1e-4  # [m] of a marker's height
 SLOW = 1.0  # [s] of the branch by which the beam creeps after it has come to rest, in every kind
 SHARES = {"drag": 0.0, "Kelvin-Voigt": 2.0, "relaxation": 0.25}  # of a fast branch, where the search begins
@@ -48,6 +49,7 @@ FAST = {
     "relaxation": 0.01,
 }  # [s]; in a millisecond a branch is Kelvin-Voigt's viscosity
 KINDS = tuple(SHARES)
+DAMPS = ("drag_rate", "prony_shares[0]")  # what damps most
 LOSS = "loss factor"  # of Kelvin-Voigt's viscosity, whose time goes with the period
 
 
@@ -198,6 +200,13 @@ class Fit:
     effective: float  # residuals that count as independent
     unknowns: int
 
+    @property
+    def spread(self) -> np.ndarray:
+        """Of rest, frequency and decay, relative half widths by those of E and of what damps."""
+        ends = (self.intervals[name] for name in self.intervals if name in ("youngs_modulus", *DAMPS))
+        E, damping = ((high - low) / (high + low) for low, high in ends)
+        return np.array([E, E / 2, damping])
+
     def akaike(self, effective: float) -> float:
         """n log(misfit^2) + 2 unknowns; Akaike 1974, doi:10.1109/TAC.1974.1100705."""
         return effective * np.log((self.misfit / NOISE) ** 2) + 2 * self.unknowns
@@ -333,8 +342,9 @@ def misfit(prediction: Prediction, recording: Recording) -> float:
     return float(min(np.sqrt(np.mean((one - wanted) ** 2)) for one in simulated))
 
 
-def compare(predictions: dict, chosen: str, recordings: list[Recording], straight: np.ndarray) -> dict:
-    """Prints what was measured, and beside it what each kind of damping predicts. Returns relative errors of the chosen."""
+def compare(predictions: dict, chosen: str, spread: np.ndarray, recordings: list[Recording], straight) -> dict:
+    """Prints what was measured, and beside it what each kind of damping predicts. spread: how far rest, frequency and decay
+    may be off, relatively, by the intervals of the fit. Returns relative errors of the chosen."""
     seen = []
     for one in recordings:
         rest, own = (1e3 * float((one.rest - of)[:, 2].mean()) for of in (straight, one.start))
@@ -350,9 +360,10 @@ def compare(predictions: dict, chosen: str, recordings: list[Recording], straigh
         words = f"misfit of the motion {1e3 * off:.2f} mm"
         print(f"  by {kind}: rest {rest:.2f} mm, {frequency:.3f} Hz, decay {decay:.2f} 1/s; {words}")
     errors = dict(zip(("rest", "frequency", "decay"), numbers[chosen] / np.mean(seen, 0) - 1))
-    low, high = np.min([*numbers.values()], 0), np.max([*numbers.values()], 0)
+    each = np.array([x * (1 + sign * spread) for x in numbers.values() for sign in (-1, 1)])
+    low, high = each.min(0), each.max(0)
     spans = [f"{name} {x:+.1%} ({a:.3g} to {b:.3g})" for (name, x), a, b in zip(errors.items(), low, high)]
-    print(f"  {chosen}, less what was measured (all kinds that explain the fitted ones): {', '.join(spans)}")
+    print(f"  {chosen} over what was measured (intervals of all kinds that explain the fitted): {', '.join(spans)}")
     return errors
 
 
@@ -376,16 +387,15 @@ def draw(path: Path, pairs: list, straight: np.ndarray) -> None:
         rest, frame = 1e3 * prediction.rest, 1.96e3 * LENGTH * recording.frame_error
         axis.axhspan(rest - frame, rest + frame, color="0.9", zorder=0)
         axis.set(xlim=(-0.05, prediction.times[-1]), ylabel="height [mm]", title=f"{recording.name}: {words}")
-    axes[-1, 0].set_xlabel(
-        "time since the release [s]; dots: markers, lines: simulated, grey: simulated rest, as wide as the camera's frame "
-        "is uncertain"
-    )
+    words = "dots: measured, lines: simulated, grey: simulated rest and how far the camera's frame may be off"
+    axes[-1, 0].set_xlabel(f"time since the release [s]; {words}")
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
 
-def film(path: Path, recording: Recording, prediction: Prediction, words: str) -> None:
-    """The simulated beam from the side, its markers and the measured ones, four times as slow."""
+def film(path: Path, recording: Recording, prediction: Prediction, words: str, straight: np.ndarray) -> None:
+    """The simulated beam from the side, its markers and the measured ones, four times as slow; straight: places of these
+    on the straight beam."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -394,14 +404,14 @@ def film(path: Path, recording: Recording, prediction: Prediction, words: str) -
 
     stand_off = (TIP - np.clip(TIP, [-LENGTH, 0, 0], [0, SIDE, SIDE]))[:, [0, 2]]
     chosen = (recording.times > -0.02) & (recording.times < prediction.times[-1])
-    times, measured = recording.times[chosen], recording.tip[chosen][..., [0, 2]]
+    times, measured = recording.times[chosen], (recording.tip[chosen] - straight + TIP)[..., [0, 2]]
     shown = np.minimum(np.searchsorted(prediction.times, times), len(prediction.times) - 1)
-    figure, axis = plt.subplots(figsize=(6, 3.4), layout="constrained")
+    figure, axis = plt.subplots(figsize=(6, 4), gridspec_kw=dict(left=0.12, bottom=0.14))
     (beam,) = axis.fill(*(1e3 * prediction.outline[0]).T, color="tab:blue", alpha=0.3)
     (simulated,) = axis.plot([], [], "o", mfc="none", color="tab:blue", label="simulated")
     (seen,) = axis.plot([], [], ".", color="tab:red", label="measured")
-    axis.set(xlim=(-105, 15), ylim=(-35, 45), aspect="equal", xlabel="along the beam [mm]", ylabel="height [mm]")
-    axis.legend(loc="upper left")
+    axis.set(xlim=(-105, 15), ylim=(-30, 50), aspect="equal", xlabel="along the beam [mm]", ylabel="height [mm]")
+    axis.legend(loc="lower left")
 
     def show(k: int):
         beam.set_xy(1e3 * prediction.outline[shown[k]])
@@ -409,7 +419,7 @@ def film(path: Path, recording: Recording, prediction: Prediction, words: str) -
         seen.set_data(*(1e3 * measured[k]).T)
         axis.set_title(f"{recording.name}: {words}; {times[k]:.2f} s", fontsize=9)
 
-    FuncAnimation(figure, show, range(0, len(times))).save(path, PillowWriter(fps=25), dpi=80)
+    FuncAnimation(figure, show, range(0, len(times), EVERY)).save(path, PillowWriter(fps=25 / EVERY), dpi=80)
     plt.close(figure)
 
 
@@ -424,7 +434,7 @@ def main(
 ) -> dict:
     """Returns each kind's `Fit`, the name of the best, and relative errors of each mass that was predicted.
 
-    Writes a picture and a film of each recording to the folder `output`.
+    Writes a picture, and films of what was predicted, to the folder `output`.
 
     mass [kg]: of the recordings with a weight; default: what the digits in a file's name say, in grams.
     """
@@ -464,12 +474,12 @@ def main(
         if weight and "Kelvin-Voigt" in kinds:
             chosen = LOSS
             predictions[LOSS] = predict(fits["Kelvin-Voigt"], cells, weight, flat=True)
-        errors[weight] = compare(predictions, chosen, group, straight)
+        errors[weight] = compare(predictions, chosen, fits[best].spread, group, straight)
         pairs += [(one, predictions[chosen], words) for one in group]
     if output:
         draw(Path(output) / "measured_beam.png", pairs, straight)
-        for one, prediction, words in pairs:
-            film(Path(output) / f"{one.name}.gif", one, prediction, words)
+        for one, prediction, words in pairs[len(light) :]:
+            film(Path(output) / f"{one.name}.gif", one, prediction, words, straight)
     return dict(fits=fits, best=best, errors=errors)
 
 
