@@ -47,6 +47,10 @@ FORMS = {
     "force and way": table(
         ["Width (mm);6", "Thickness (mm);3", "Length (mm);33", "", "Extension (mm);Load (N)"], 33 * STRAIN, 18 * STRESS
     ),
+    "rows that come twice": table(["strain;stress (kgf/cm²)"], *np.repeat([STRAIN, STRESS / 0.0980665], 2, axis=1)),
+    "force over an area": table(
+        ["Length (mm);33", "Cross-section (cm^2);0.18", "Extension (mm);Force (kN)"], 33 * STRAIN, 0.018 * STRESS
+    ),
     "empty lines and remarks": "\n\n".join(
         ["strain;stress (MPa)", *table([], STRAIN, STRESS).splitlines(), "end of test;;"]
     ),
