@@ -21,25 +21,8 @@ TARGETS = dict(low=0.03, all=0.06)  # held-out errors that a law must keep, of t
 PENALTY = 1.1  # by which another number must lessen the held-out error
 POINTS, BLOCKS, HALVES = 200, 10, 8  # of a curve; that alternate in held-out fits; that intervals leave out half of
 QUANTILE = 2.776  # Student's, 95 %, of HALVES / 2 degrees of freedom
-EXPONENTS = (
-    -8.0,
-    -5.0,
-    -3.0,
-    -2.0,
-    -1.0,
-    -0.5,
-    0.3,
-    0.6,
-    1.0,
-    1.5,
-    2.0,
-    2.5,
-    3.0,
-    4.0,
-    6.0,
-    8.0,
-    10.0,
-)  # of first guesses
+# of Ogden's terms, from which the best are refined
+EXPONENTS = (-8.0, -5.0, -3.0, -2.0, -1.0, -0.5, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 8.0, 10.0)
 
 
 def principal_stretches(stretch, kind: str) -> np.ndarray:
