@@ -47,6 +47,10 @@ FORMS = {
     "force and way": table(
         ["Width (mm);6", "Thickness (mm);3", "Length (mm);33", "", "Extension (mm);Load (N)"], 33 * STRAIN, 18 * STRESS
     ),
+    "rows that come twice": table(["strain;stress (kgf/cm²)"], *np.repeat([STRAIN, STRESS / 0.0980665], 2, axis=1)),
+    "force over an area": table(
+        ["Length (mm);33", "Cross-section (cm^2);0.18", "Extension (mm);Force (kN)"], 33 * STRAIN, 0.018 * STRESS
+    ),
     "empty lines and remarks": "\n\n".join(
         ["strain;stress (MPa)", *table([], STRAIN, STRESS).splitlines(), "end of test;;"]
     ),
@@ -165,7 +169,9 @@ def test_every_rubber_of_the_library_keeps_what_it_promises(name):
     assert mu == pytest.approx(material.shear_modulus, rel=1e-4) and lam + 2 / 3 * mu == pytest.approx(1e9)
 
 
-@pytest.mark.parametrize("name", ["RTV615", "Ecoflex 00-30", "Dragon Skin 30", "Dragon Skin FX Pro Slacker"])
+@pytest.mark.parametrize(
+    "name", ["RTV615", "Dragon Skin 10 Medium", "Dragon Skin 30", "Platsil Gel 10", "Dragon Skin FX Pro Slacker"]
+)
 def test_laws_as_they_run_are_elliptic_and_follow_the_closed_form(name):
     """The acoustic tensor n . d2psi/dF2 . n is positive in every direction, in every kind of tension up to `valid_to`."""
     material, rng = library[name], np.random.default_rng(1)
@@ -212,14 +218,23 @@ def test_up_to_a_stretch_the_volume_hardly_changes():
         library["RTV615"].up_to(4)
 
 
+RUNS = {
+    "rollout": lambda solver: ds.Rollout(solver, 1).forward(),
+    "simulator": lambda solver: ds.Simulator(solver).step(),
+    "lanes": lambda solver: ds.Batch(solver, 1, 2, lanes=True).forward(),
+    "turns": lambda solver: ds.Batch(solver, 1, 2, lanes=False).forward(),
+}
+
+
+@pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("stretch, warned", [(1.9, False), (2.1, True)])
-def test_a_run_beyond_the_range_warns(stretch, warned):
+def test_a_run_beyond_the_range_warns(run, stretch, warned):
     mesh = ds.TetrahedralMesh.create_cube(2)
     start = mesh.vertices * [stretch, stretch**-0.5, stretch**-0.5]
-    scene = ds.Scene(mesh, library["Ecoflex 00-30"].up_to(2.0), initial_positions=start, volume="patches")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-5), 1).forward()
+        scene = ds.Scene(mesh, library["Ecoflex 00-30"].up_to(2.0), initial_positions=start)
+        RUNS[run](ds.SemiImplicitSolver(scene, dt=1e-5))
     assert any("is valid to stretch 2, and tetrahedron" in str(w.message) for w in said) == warned
 
 

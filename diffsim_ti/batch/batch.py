@@ -22,7 +22,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
-from diffsim_ti.rollout.frames import Frames, check_finite
+from diffsim_ti.rollout.frames import Frames, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
@@ -177,7 +177,10 @@ class Batch(metaclass=Public):
         resolution = self.sweep.resolutions()
         states = self._positions(values, u), v, u
         make = lambda b: alone.get(b) or self._frames_of(values, b, states, times, resolution(b))  # noqa: E731
-        out = BatchFrames(self, values, LazyFrames(self.num_scenes, make), last_good, run, errors, states)
+        frames = LazyFrames(self.num_scenes, make)
+        if np.isfinite(self.scene.material.valid_to):
+            any(warn_of_large_stretch(frames[b]) for b in range(self.num_scenes))
+        out = BatchFrames(self, values, frames, last_good, run, errors, states)
         out.alone = tuple(alone)
         return out
 

@@ -36,6 +36,10 @@ class J2Law(EnergyLaw):
     last_without_lam = (0.0, 1.0)
 
     @property
+    def lanes(self):
+        return not (self.kinematic and self.fp == ti.f32)  # LLVM fails on the adjoint in lanes of float32
+
+    @property
     def coefficient_names(self):
         own = ("saturation_stress", "saturation_exponent") * self.saturating + ("kinematic_hardening",) * self.kinematic
         return ("mu", "yield_stress", "hardening", *own, "bulk_modulus")
@@ -147,7 +151,7 @@ class J2Plasticity(Material):
     numbers. The stress of a step has a potential, whose Hessian is the consistent tangent of implicit and static solves; the
     latter follow the steps of a run, whatever their dt. Gradients are exact but where a point just reaches its yield stress:
     there the slope jumps from that of elastic to that of plastic loading, and one of both is given.
-    Linear tetrahedra lock in plastic flow: take mesh.quadratic() or volume="patches".
+    Linear tetrahedra lock in plastic flow: take mesh.quadratic(), alone where flow is large and narrow, or volume="patches".
     `PlasticStrain`, `Dissipation` and `ElasticEnergy` show what a run has done.
     Simo, Hughes, Computational Inelasticity, 1998, ch. 9, doi:10.1007/b98904; Eterovic, Bathe 1990, A hyperelastic-based
     large strain elasto-plastic constitutive formulation with combined isotropic-kinematic hardening,

@@ -40,10 +40,11 @@ class OgdenLaw(EnergyLaw):
 class Ogden(Material):
     """psi = sum_k mu_k/a_k (sum_i l_i^a_k - 3) + K/2 (J - 1)^2 [J/m^3], l_i = J^(-1/3) lambda_i.
 
-    `Ogden(moduli, exponents, bulk_modulus)`: mu_k [Pa] and a_k [-], one for each term, each mu_k a_k > 0, and K [Pa].
+    `Ogden(moduli, exponents, bulk_modulus)`: mu_k [Pa] and a_k [-], one for each term, and K [Pa].
     Vectors are for all tetrahedra, or of shape (num_tetrahedra, terms). Small strains have the shear modulus
-    sum_k mu_k a_k / 2 and the bulk modulus K; (mu, 2) is neo-Hookean, (2 c10, 2) with (-2 c01, -2) Mooney's. Others write
-    mu_k a_k / 2 for the modulus of a term: theirs times 2 / a_k are these. J must stay above 0.
+    sum_k mu_k a_k / 2, which must be above 0, and the bulk modulus K; a term with mu_k a_k < 0 may make large strains
+    unstable. (mu, 2) is neo-Hookean, (2 c10, 2) with (-2 c01, -2) Mooney's. Others write mu_k a_k / 2 for the modulus of a
+    term: theirs times 2 / a_k are these. J must stay above 0.
     Ogden 1972, Large deformation isotropic elasticity, doi:10.1098/rspa.1972.0026.
     """
 
@@ -66,9 +67,10 @@ class Ogden(Material):
         check_range("bulk_modulus", values["bulk_modulus"], 0, np.inf, False, "a stiffness [Pa]")
         mu, a = values["moduli"], values["exponents"]
         if mu.shape == a.shape or 1 in (mu.ndim, a.ndim):  # else of sets, not on a mesh yet
-            for k in range(self.terms):
-                stiffness = mu[..., k] * a[..., k]
-                check_range(f"mu_{k + 1} a_{k + 1}", stiffness, 0, np.inf, False, "each term must stiffen the body")
+            shear = (mu * a).sum(-1) / 2
+            check_range(
+                "sum of moduli * exponents / 2", shear, 0, np.inf, False, "the shear modulus [Pa] of small strains"
+            )
 
     def lame(self, values):
         mu = (np.asarray(values["moduli"]) * values["exponents"]).sum(-1) / 2

@@ -21,7 +21,8 @@ TARGETS = dict(low=0.03, all=0.06)  # held-out errors that a law must keep, of t
 PENALTY = 1.1  # by which another number must lessen the held-out error
 POINTS, BLOCKS, HALVES = 200, 10, 8  # of a curve; that alternate in held-out fits; that intervals leave out half of
 QUANTILE = 2.776  # Student's, 95 %, of HALVES / 2 degrees of freedom
-EXPONENTS = (0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # where searches begin
+# of Ogden's terms, from which the best are refined
+EXPONENTS = (-8.0, -5.0, -3.0, -2.0, -1.0, -0.5, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 8.0, 10.0)
 
 
 def principal_stretches(stretch, kind: str) -> np.ndarray:
@@ -134,32 +135,48 @@ def fitted(law: str, count: int, curves: Sequence[Curve], top: float) -> np.ndar
         size = np.linalg.norm(matrix, axis=0)
         solve = nnls if law == "MooneyRivlin" else lambda a, b: np.linalg.lstsq(a, b, rcond=None)
         return solve(matrix / size, target)[0] / size
+    if law == "Ogden":
+        return _fitted_ogden(count // 2, curves, top, target, columns)
     largest = max(c.stress.max() / c.stretch.max() for c in curves)
-    if law == "Gent":
-        least = 1.01 * (2 * top**2 + top**-4.0 - 3)  # of equibiaxial tension
+    least = 1.01 * (2 * top**2 + top**-4.0 - 3)  # of equibiaxial tension
 
-        def spread(u):
-            return np.array([np.exp(u[0]), least + np.exp(u[1])])
-
-        starts, bounds = [[np.log(largest), np.log(f * least)] for f in (0.03, 0.3)], ([-30, -30], [40, 30])
-    else:
-        terms = count // 2
-        each = columns(*(("Ogden", np.array([1.0, a])) for a in EXPONENTS))
-        chosen = [list(k) for k in combinations(range(len(EXPONENTS)), terms)]
-        moduli, k = min(((nnls(each[:, k], target), k) for k in chosen), key=lambda found: found[0][1])
-        mu = np.log(np.maximum(moduli[0], 1e-4 * moduli[0].max() + 1e-9))
-        starts, bounds = [[*mu, *np.array(EXPONENTS)[k]]], (terms * [-30] + terms * [0.1], terms * [40] + terms * [12])
-
-        def spread(u):
-            return np.concatenate([np.exp(u[:terms]), u[terms:]])
+    def spread(u):
+        return np.array([np.exp(u[0]), least + np.exp(u[1])])
 
     runs = [
         least_squares(
-            lambda u: weighted_residuals(law, spread(u), curves), u, bounds=bounds, x_scale="jac", max_nfev=200
+            lambda u: weighted_residuals(law, spread(u), curves),
+            [np.log(largest), np.log(f * least)],
+            bounds=([-30, -30], [40, 30]),
+            x_scale="jac",
+            max_nfev=200,
         )
-        for u in starts
+        for f in (0.03, 0.3)
     ]
     return spread(min(runs, key=lambda run: run.cost).x)
+
+
+def _fitted_ogden(terms: int, curves: Sequence[Curve], top: float, target: np.ndarray, columns) -> np.ndarray:
+    """Moduli and exponents of the best stable law. Moduli may have any sign: a difference of terms is soft at first."""
+    from scipy.optimize import least_squares
+
+    each, guesses = columns(*(("Ogden", np.array([1.0, a])) for a in EXPONENTS)), []
+    size = np.linalg.norm(each, axis=0)
+    for k in map(list, combinations(range(len(EXPONENTS)), terms)):
+        moduli = np.linalg.lstsq(each[:, k] / size[k], target, rcond=1e-10)[0] / size[k]
+        guesses.append((((each[:, k] @ moduli - target) ** 2).sum(), [*moduli, *np.array(EXPONENTS)[k]]))
+    guesses = [np.array(p) for _, p in sorted(guesses)]
+    guess = next((p for p in guesses if is_stable("Ogden", p, top)), guesses[0])
+    unit = np.maximum(np.abs(guess), 1e-9 * np.abs(guess[:terms]).max())
+    most = np.array(terms * [np.inf] + terms * [12.0])
+    run = least_squares(
+        lambda u: weighted_residuals("Ogden", u * unit, curves),
+        guess / unit,
+        bounds=(-most / unit, most / unit),
+        x_scale="jac",
+        max_nfev=200,
+    )
+    return run.x * unit if is_stable("Ogden", run.x * unit, top) else guess
 
 
 def _judged(law: str, count: int, curves: Sequence[Curve], top: float) -> tuple[np.ndarray, dict]:
@@ -233,8 +250,8 @@ def fit_rubber(tests: TensileTest | Sequence[TensileTest]) -> dict:
     It is fitted by least squares that weigh stretches below 3 by the largest stress there. Of the laws that are stable to
     the largest stretch that the tests reach, and whose errors of what was not fitted keep 3 % up to stretch 3 and 6 % of
     all, the one of least error is taken, where each number more must lessen it by a tenth, and laws with a number whose
-    interval holds zero come last. Where none keeps these errors, the law is valid to less, in steps of a twentieth, but to
-    3 at least; `kept` says whether it keeps them there.
+    interval holds zero come last, above all where it is the shear modulus. Where none keeps these errors, the law is valid
+    to less, in steps of a twentieth, but to 3 at least; `kept` says whether it keeps them there.
     """
     tests = [tests] if isinstance(tests, TensileTest) else list(tests)
     end = max(test.stretch[-1] for test in tests)
@@ -245,18 +262,19 @@ def fit_rubber(tests: TensileTest | Sequence[TensileTest]) -> dict:
         found = []
         for law, count in LAWS:
             p, errors = _judged(law, count, curves, top)
-            if p[0] > 0 and is_stable(law, p, top):
+            if is_stable(law, p, top):
                 widths, score = interval_widths(law, p, curves), _score(p, errors)
-                unseen = bool(np.any(widths[:-1] >= np.abs(p)))
+                unseen = bool(widths[-1] >= shear_modulus(law, p)), bool(np.any(widths[:-1] >= np.abs(p)))
                 found.append((score > PENALTY ** len(p), unseen, score, law, p, widths, errors))
         missed, unseen, _, law, p, widths, errors = min(found, key=lambda x: x[:3])
         if not missed:
             break
     middle = np.array([*p, shear_modulus(law, p)])
     with np.errstate(over="ignore"):  # an interval of the logarithm, or, where zero is within, none
-        low, high = (
+        ends = [
             np.where(widths < np.abs(middle), middle * np.exp(s * widths / np.abs(middle)), np.nan) for s in (-1, 1)
-        )
+        ]
+    low, high = np.sort(ends, axis=0)
     numbers, lows, highs = (
         named(law, x) | {"shear_modulus": float(y)}
         for x, y in ((p, middle[-1]), (low[:-1], low[-1]), (high[:-1], high[-1]))

@@ -9,8 +9,9 @@ import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
 
-UNITS = {"mpa": 1e6, "n/mm2": 1e6, "kpa": 1e3, "pa": 1.0, "n/m2": 1.0, "psi": 6894.757, "bar": 1e5}
-UNIT = r"(?:mm/mm|m/m|n\s*/\s*mm\s*(?:\^?2|²)|n\s*/\s*m\s*(?:\^?2|²)|[mk]?pa|psi|bar|%|percent|kn|n|mm|cm|m|s|-|1)"
+UNITS = {"mpa": 1e6, "n/mm2": 1e6, "kpa": 1e3, "pa": 1.0, "n/m2": 1.0, "n/cm2": 1e4, "psi": 6894.757, "bar": 1e5}
+UNITS |= {"kgf/cm2": 98066.5, "kgf/mm2": 9.80665e6}
+UNIT = r"(?:mm/mm|m/m|(?:kgf|n)\s*/\s*[cm]?m\s*(?:\^?2|²)|[mk]?pa|psi|bar|%|percent|kn|n|mm|cm|m|s|-|1)"
 STRETCH, STRAIN, STRESS = (
     r"stretch|lambda|λ|extension ratio",
     r"strain|elongation|dehnung|d[ée]formation",
@@ -41,7 +42,8 @@ class TensileTest:
     def from_file(cls, path: str | Path, kind: str = "uniaxial") -> "TensileTest":
         """A table of numbers below a line of titles, which say what they are and their unit: a stretch, or an engineering or
         true strain (in % where the title says so), or a displacement; and an engineering or true stress, or a force. A
-        displacement needs the length, and a force the cross-section, in lines "Length (mm);33" and "Width (mm);6" above.
+        displacement needs the length, and a force the cross-section, in lines "Length (mm);33" and "Width (mm);6" above. The
+        stress of rows with the same stretch is their mean.
 
         Cells stand between semicolons, tabs, commas or blanks; decimals follow a point or a comma; any encoding. What goes
         back from a larger stretch, what follows the largest stress, and slack before the first one are left out, and said.
@@ -191,11 +193,15 @@ def _stress(columns: dict, header: dict, stretch: np.ndarray, path) -> np.ndarra
     if title is None or _unit(title) not in ("n", "kn"):
         raise ValueError(f"{path}: no column is a stress, or a force [N] ({', '.join(columns)}): {REMEDY}")
     sides = [of_header(header, word, "mm") for word in ("width", "thickness")]
-    if None in sides:
+    area = None if None in sides else 1e-6 * sides[0] * sides[1]
+    for unit, factor in (("mm", 1e-6), ("cm", 1e-4)):
+        given = of_header(header, "section", unit)
+        area = factor * given if area is None and given else area
+    if area is None:
         raise ValueError(
             f'{path}: {title!r} needs the cross-section: lines "Width (mm);6" and "Thickness (mm);3" above'
         )
-    return columns[title] * (1e3 if _unit(title) == "kn" else 1) / (sides[0] * sides[1] * 1e-6)
+    return columns[title] * (1e3 if _unit(title) == "kn" else 1) / area
 
 
 def _first_loading(stretch: np.ndarray, stress: np.ndarray, said: list[str], path) -> tuple[np.ndarray, np.ndarray]:
@@ -211,6 +217,8 @@ def _first_loading(stretch: np.ndarray, stress: np.ndarray, said: list[str], pat
         raise ValueError(
             f"{path}: {len(stretch)} rows have stretch and stress; {FEWEST} are the fewest that are fitted"
         )
+    first = np.flatnonzero(np.diff(stretch, prepend=np.nan) != 0)  # of rows that say the same stretch
+    stretch, stress = stretch[first], np.add.reduceat(stress, first) / np.diff(first, append=len(stress))
     largest = np.maximum.accumulate(np.concatenate([[1.0], stretch[:-1]]))
     rising = stretch > largest
     back = int((~rising & (largest > 1)).sum())

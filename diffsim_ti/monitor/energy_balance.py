@@ -30,9 +30,9 @@ class Window:
 class EnergyBalance:
     """Follows T + V less the work of what is outside, as it is at checks, every few hundred passes.
 
-    T is the kinetic energy of free vertices, V that of strains, weight, contacts, and of cables and muscles that pull
-    steadily. Both swap within an oscillation, by a quarter of (omega h)^2, which is no gain. So the velocity v- of half a
-    substep before u is taken together with u:
+    T is the kinetic energy of free vertices, V that of strains, with what plastic flow has dissipated, weight, contacts,
+    and of cables and muscles that pull steadily. Both swap within an oscillation, by a quarter of (omega h)^2, which is no
+    gain. So the velocity v- of half a substep before u is taken together with u:
 
         T(v-) + V(u) + h/2 v- . f(u)         or, with v of the same time as u,    T(v) + V(u) - h^2/8 f(u)^2 / m
 
@@ -40,8 +40,9 @@ class EnergyBalance:
     take. Passes note the work of loads, of prescribed motion and of moving obstacles, and what drag takes
     (solvers/explicit/kick_drift.py), but for drag that acts alone, which can hide a gain. So whatever rises beyond the
     lowest level is the steps' own.
-    Laws that read a rate or remember may take or do work of their own, and nothing notes that of forces without an energy
-    which act vertex by vertex, such as those of a rotating frame: runs with these are not watched.
+    Laws that read a rate, or remember other things than plastic flow, may take or do work of their own, and nothing notes
+    that of forces without an energy which act vertex by vertex, such as those of a rotating frame: runs with these are not
+    watched.
     Hairer, Lubich, Wanner 2003, Geometric numerical integration illustrated by the Stoermer-Verlet method,
     doi:10.1017/S0962492902000144, 4.1 and 5.
     """
@@ -59,8 +60,8 @@ class EnergyBalance:
 
     @staticmethod
     def knows(law) -> bool:
-        """Whether the forces of a law are those of its energy alone."""
-        return law.reads == ("H",) and not law.state_names
+        """Whether the forces of a law are those of its energy alone, of plastic ones with what they have dissipated."""
+        return law.reads == ("H",) and (law.plastic or not law.state_names)
 
     def clear(self) -> None:
         """Forget what was seen."""

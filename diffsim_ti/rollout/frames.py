@@ -6,7 +6,9 @@ import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import Public
+from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
+from diffsim_ti.outputs import Strain
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.scene import Scene
 from diffsim_ti.state.watch import ContactResolution
@@ -77,6 +79,22 @@ class Frames(metaclass=Public):
             known = ", ".join(("positions", "velocities", "displacements", *self.outputs))
             raise KeyError(f"no output named {name!r}; there are {known}: pass others to Rollout(..., outputs=[...])")
         return self.outputs[name]
+
+
+def warn_of_large_stretch(frames: Frames) -> bool:
+    """Warn where a frame stretches a material beyond what is known of it, and say whether one does."""
+    material = frames.scene.material
+    if not np.isfinite(material.valid_to):
+        return False
+    strains = Strain(principal=True).settled(frames.scene).value(frames)[..., -1]
+    frame, tetrahedron = np.unravel_index(np.argmax(strains), strains.shape)
+    stretch = np.sqrt(1 + 2 * strains[frame, tetrahedron])
+    if beyond := bool(stretch > material.valid_to):
+        warn(
+            f"{material!r} is valid to stretch {material.valid_to:.3g}, and tetrahedron {tetrahedron} has {stretch:.3g} at "
+            f"{frames.times[frame]:.3g} s: what the material does there was not measured, or is not stable"
+        )
+    return beyond
 
 
 def check_finite(name: str, adjoint: np.ndarray, save_every: int) -> None:

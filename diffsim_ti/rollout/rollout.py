@@ -14,13 +14,12 @@ from diffsim_ti.common.copies import made_again
 from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import positions_of
 from diffsim_ti.common.public import Public
-from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.outputs import Change, Displacements, Output, Positions, Strain, Velocities
+from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
-from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
+from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
 from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
@@ -246,8 +245,7 @@ class Rollout(metaclass=Public):
             if value.shape != shape:
                 raise ValueError(f"output {name!r}: its value has shape {value.shape}, but it says {shape}")
             frames.outputs[name] = value
-        if np.isfinite(self.scene.material.valid_to):
-            _warn_of_large_stretch(frames)
+        warn_of_large_stretch(frames)
         return frames
 
     def vjp(
@@ -394,16 +392,3 @@ class Rollout(metaclass=Public):
         Raises RuntimeError for a run that this tape already holds, ValueError for k outside 0 .. runs - 1.
         """
         self.tape_face.run(k)
-
-
-def _warn_of_large_stretch(frames: Frames) -> None:
-    """Where a frame stretches a material beyond what is known of it."""
-    material = frames.scene.material
-    strains = Strain(principal=True).settled(frames.scene).value(frames)[..., -1]
-    frame, tetrahedron = np.unravel_index(np.argmax(strains), strains.shape)
-    stretch = np.sqrt(1 + 2 * strains[frame, tetrahedron])
-    if stretch > material.valid_to:
-        warn(
-            f"{material!r} is valid to stretch {material.valid_to:.3g}, and tetrahedron {tetrahedron} has {stretch:.3g} at "
-            f"{frames.times[frame]:.3g} s: what the material does there was not measured, or is not stable"
-        )

@@ -19,7 +19,7 @@ from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
-from diffsim_ti.rollout.frames import Frames
+from diffsim_ti.rollout.frames import Frames, warn_of_large_stretch
 from diffsim_ti.solvers import SemiImplicitSolver
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.substeps import MOST, needed
@@ -127,6 +127,7 @@ class Simulator(metaclass=Public):
         self._set: dict[str, np.ndarray] = {}  # inputs that were given since, as a run of the last step has them
         self._stale = True  # whether the device may have rows of other steps than `arrays.rows`
         self._step_values = StepValues(self.scene.inputs, self.solver.dt)
+        self._beyond = False  # whether a step stretched the material beyond what is known of it
         self.workspace.load(self._start)
         self.workspace.report.clear()
         self._guard.restart_with_solver()
@@ -160,6 +161,8 @@ class Simulator(metaclass=Public):
             raise
         self.step_count += 1
         self.workspace.place_obstacles(int(self.solver.schedule.first(1)))
+        if np.isfinite(self.scene.material.valid_to) and not self._beyond:
+            self._beyond = warn_of_large_stretch(self._frames())
 
     @property
     def step_inputs(self) -> tuple[str, ...]:
@@ -350,15 +353,20 @@ class Simulator(metaclass=Public):
             raise ValueError(f"{output!r} is of a step: make the simulator with Simulator(solver, contact_forces=True)")
         if output.cumulative:
             raise ValueError(f"{output!r} counts from the start of a run: pass it to Rollout(..., outputs=[...])")
-        now = (x[None] for x in (self.positions, self.velocities, self.displacements))
-        frames = Frames(*now, np.array([self.time]), self.values_of_step)
-        frames.steps = np.array([self.step_count])
+        frames = self._frames()
         frames.law_state = self.law_state[None]
         if self._notes:
             frames.contact_forces = self.workspace.contact_forces(self.solver.dt)[1:]
         if output.reads_chamber_pressures and self.scene.holds_volumes:
             frames.chamber_pressures = self.workspace.last_chamber_pressures()[None]
         return self.settled(output).value(frames)[0]
+
+    def _frames(self) -> Frames:
+        """The present state."""
+        now = (x[None] for x in (self.positions, self.velocities, self.displacements))
+        frames = Frames(*now, np.array([self.time]), self.values_of_step, scene=self.scene)
+        frames.steps = np.array([self.step_count])
+        return frames
 
     def settled(self, output: Output) -> Output:
         """The output as it is for the scene, made once."""

@@ -8,9 +8,13 @@ the script
 
 1. finds each recording's frame from the base markers, and when the tip was let go;
 2. fits E, creep and one of three kinds of damping, and how the support went away, to the recordings without a weight;
-3. says which viscosity explains them (Akaike's criterion), and intervals that count how residuals hang together;
-4. predicts the recordings with a weight: rest, frequency and decay beside what was measured. Kinds of damping that one
-   frequency cannot tell apart share the prediction by Akaike's weights (Burnham, Anderson 2002, Model Selection, ch. 4).
+3. says which kind explains them (Akaike's criterion), and intervals that count how residuals hang together;
+4. predicts the recordings with a weight: rest, frequency and decay beside what was measured.
+
+Recordings without a weight have one frequency, at which a drag, a viscosity and a loss factor that does not depend on the
+frequency are the same; with a weight they part. Rubber has the last: its loss factor changes little within a decade of
+frequencies (Nashif, Jones, Henderson 1985, Vibration Damping, ch. 3), and causality then makes it stiffer with the frequency
+to the power 2 delta / pi. That is what is predicted, and the others are its interval.
 
     python examples/identify/measured_beam.py FOLDER [--mass KG] [--recordings PATTERN] [--output FOLDER]
 """
@@ -35,6 +39,7 @@ STEP = 0.01  # [s]; the recordings have 100 Hz
 EDGE = 3e-3  # [m] thickness of the cells that bear the weight
 LEAD, SPAN = 0.01, 1.2  # [s] from the start of the simulation to the release, and of what is fitted
 WINDOWS = ((1, 4), (4, 7))  # steps in which the support carries a share of the weight that is not known
+EVERY = 2  # samples to a picture of a film
 NOISE = 1e-4  # [m] of a marker's height
 SLOW = 1.0  # [s] of the branch by which the beam creeps after it has come to rest, in every kind
 SHARES = {"drag": 0.0, "Kelvin-Voigt": 2.0, "relaxation": 0.25}  # of a fast branch, where the search begins
@@ -44,6 +49,8 @@ FAST = {
     "relaxation": 0.01,
 }  # [s]; in a millisecond a branch is Kelvin-Voigt's viscosity
 KINDS = tuple(SHARES)
+DAMPS = ("drag_rate", "prony_shares[0]")  # what damps most
+LOSS = "loss factor"  # of Kelvin-Voigt's viscosity, whose time goes with the period
 
 
 # ---- recordings ---------------------------------------------------------------------------------------------------------
@@ -193,6 +200,13 @@ class Fit:
     effective: float  # residuals that count as independent
     unknowns: int
 
+    @property
+    def spread(self) -> np.ndarray:
+        """Of rest, frequency and decay, relative half widths by those of E and of what damps."""
+        ends = (self.intervals[name] for name in self.intervals if name in ("youngs_modulus", *DAMPS))
+        E, damping = ((high - low) / (high + low) for low, high in ends)
+        return np.array([E, E / 2, damping])
+
     def akaike(self, effective: float) -> float:
         """n log(misfit^2) + 2 unknowns; Akaike 1974, doi:10.1109/TAC.1974.1100705."""
         return effective * np.log((self.misfit / NOISE) ** 2) + 2 * self.unknowns
@@ -278,24 +292,45 @@ def finer(cells: int, better: ds.TetrahedralMesh) -> float:
 
 @dataclass
 class Prediction:
-    """Of the mean height of the tip's markers: rest [m], frequency [Hz], decay [1/s]; times [s] and heights [m]."""
+    """Of the mean height of the tip's markers: rest [m], frequency [Hz], decay [1/s]; times [s], heights [m], where the
+    markers' pins begin and the outline of the beam's side, x and z [m]."""
 
     rest: float
     frequency: float
     decay: float
     times: np.ndarray
     heights: np.ndarray
+    pins: np.ndarray
+    outline: np.ndarray
 
 
-def predict(found: Fit, cells: int, mass: float, seconds: float = 1.3) -> Prediction:
+def predict(found: Fit, cells: int, mass: float, flat: bool = False, seconds: float = 1.3) -> Prediction:
+    """flat: with the loss factor that the viscosity has without a weight."""
     body = mesh(cells, EDGE if mass else 0.0)
     numbers = dict(found.numbers, youngs_modulus=found.numbers["youngs_modulus"] * finer(cells, body))
     numbers["support"] = np.mean(found.supports, 0)
-    frames = swing(body, found.damping, numbers, seconds + LEAD, mass).forward()
-    heights = (frames["markers"] - frames["markers"][0])[:, :, 2]
-    hung = hang(body, numbers, mass).forward()["markers"]
-    times = np.asarray(frames.times) - LEAD
-    return Prediction(float((hung[-1] - hung[0])[:, 2].mean()), *oscillation(times, heights.mean(1)), times, heights)
+    hung, moving = hang(body, numbers, mass).forward()["markers"], dict(numbers)
+    if flat:
+        scenes = (scene(mesh(cells), None, found.numbers), scene(body, None, numbers, mass=mass))
+        alone, laden = (ds.modes(one, 1).frequencies[0] for one in scenes)
+        fast, slow = numbers["prony_shares"]
+        delta = np.arctan(2 * np.pi * alone * fast * FAST[found.damping])
+        moving["youngs_modulus"] = numbers["youngs_modulus"] * (laden / alone) ** (2 * delta / np.pi)
+        moving["prony_shares"] = np.array([fast * alone / laden, slow])
+    frames = swing(body, found.damping, moving, seconds + LEAD, mass).forward()
+    pins, times = frames["markers"], np.asarray(frames.times) - LEAD
+    heights = (pins - pins[0])[:, :, 2]
+    outline = frames.positions[:, side(body)][..., [0, 2]]
+    rest = float((hung[-1] - hung[0])[:, 2].mean())
+    return Prediction(rest, *oscillation(times, heights.mean(1)), times, heights, pins[..., [0, 2]], outline)
+
+
+def side(body: ds.TetrahedralMesh) -> np.ndarray:
+    """Vertices of the outline of the beam's side, in their order: below, at the tip, above."""
+    x, y, z = body.vertices.T
+    ways = ((z < 1e-9, x), (x > -1e-9, z), (z > SIDE - 1e-9, -x))
+    rows = [np.flatnonzero(on & (y > SIDE - 1e-9)) for on, _ in ways]
+    return np.concatenate([row[np.argsort(along[row])] for row, (_, along) in zip(rows, ways)])
 
 
 def misfit(prediction: Prediction, recording: Recording) -> float:
@@ -307,10 +342,9 @@ def misfit(prediction: Prediction, recording: Recording) -> float:
     return float(min(np.sqrt(np.mean((one - wanted) ** 2)) for one in simulated))
 
 
-def compare(predictions: dict, weights: dict, recordings: list[Recording], straight: np.ndarray) -> dict:
-    """Prints what was measured, and beside it what each kind of damping predicts and their mean by weights.
-
-    Returns relative errors of that mean."""
+def compare(predictions: dict, chosen: str, spread: np.ndarray, recordings: list[Recording], straight) -> dict:
+    """Prints what was measured, and beside it what each kind of damping predicts. spread: how far rest, frequency and decay
+    may be off, relatively, by the intervals of the fit. Returns relative errors of the chosen."""
     seen = []
     for one in recordings:
         rest, own = (1e3 * float((one.rest - of)[:, 2].mean()) for of in (straight, one.start))
@@ -320,22 +354,22 @@ def compare(predictions: dict, weights: dict, recordings: list[Recording], strai
             f"  {one.name}: rest {rest:.2f} +- {frame:.2f} mm ({own:.2f} from where its support held it), "
             f"{seen[-1][1]:.3f} Hz, decay {seen[-1][2]:.2f} 1/s"
         )
-    numbers = {kind: (1e3 * p.rest, p.frequency, p.decay) for kind, p in predictions.items()}
+    numbers = {kind: np.array([1e3 * p.rest, p.frequency, p.decay]) for kind, p in predictions.items()}
     for kind, (rest, frequency, decay) in numbers.items():
         off = np.mean([misfit(predictions[kind], one) for one in recordings])
         words = f"misfit of the motion {1e3 * off:.2f} mm"
         print(f"  by {kind}: rest {rest:.2f} mm, {frequency:.3f} Hz, decay {decay:.2f} 1/s; {words}")
-    mean = sum(weights[kind] * np.array(x) for kind, x in numbers.items())
-    errors = dict(zip(("rest", "frequency", "decay"), mean / np.mean(seen, 0) - 1))
-    print(
-        f"  their mean: rest {mean[0]:.2f} mm ({errors['rest']:+.1%}), {mean[1]:.3f} Hz ({errors['frequency']:+.1%}), "
-        f"decay {mean[2]:.2f} 1/s ({errors['decay']:+.1%})"
-    )
+    errors = dict(zip(("rest", "frequency", "decay"), numbers[chosen] / np.mean(seen, 0) - 1))
+    each = np.array([x * (1 + sign * spread) for x in numbers.values() for sign in (-1, 1)])
+    low, high = each.min(0), each.max(0)
+    spans = [f"{name} {x:+.1%} ({a:.3g} to {b:.3g})" for (name, x), a, b in zip(errors.items(), low, high)]
+    print(f"  {chosen} over what was measured (intervals of all kinds that explain the fitted): {', '.join(spans)}")
     return errors
 
 
-def draw(path: Path, pairs: list) -> None:
-    """Measured and simulated heights of the three markers, a row for each (recording, prediction, words)."""
+def draw(path: Path, pairs: list, straight: np.ndarray) -> None:
+    """Measured and simulated heights of the three markers above those of the straight beam, a row for each (recording,
+    prediction, words)."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -346,12 +380,46 @@ def draw(path: Path, pairs: list) -> None:
         len(pairs), 1, figsize=(9, 2.2 * len(pairs)), layout="constrained", sharex=True, squeeze=False
     )
     for axis, (recording, prediction, words) in zip(axes[:, 0], pairs):
+        measured = (recording.tip - straight)[:, :, 2]
         for k, colour in enumerate(("tab:blue", "tab:orange", "tab:green")):
-            axis.plot(recording.times, 1e3 * recording.heights[:, k], ".", ms=3, color=colour)
+            axis.plot(recording.times, 1e3 * measured[:, k], ".", ms=3, color=colour)
             axis.plot(prediction.times, 1e3 * prediction.heights[:, k], "-", lw=1, color=colour)
+        rest, frame = 1e3 * prediction.rest, 1.96e3 * LENGTH * recording.frame_error
+        axis.axhspan(rest - frame, rest + frame, color="0.9", zorder=0)
         axis.set(xlim=(-0.05, prediction.times[-1]), ylabel="height [mm]", title=f"{recording.name}: {words}")
-    axes[-1, 0].set_xlabel("time since the release [s]; dots: markers, lines: simulated")
+    words = "dots: measured, lines: simulated, grey: simulated rest and how far the camera's frame may be off"
+    axes[-1, 0].set_xlabel(f"time since the release [s]; {words}")
     figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def film(path: Path, recording: Recording, prediction: Prediction, words: str, straight: np.ndarray) -> None:
+    """The simulated beam from the side, its markers and the measured ones, four times as slow; straight: places of these
+    on the straight beam."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    stand_off = (TIP - np.clip(TIP, [-LENGTH, 0, 0], [0, SIDE, SIDE]))[:, [0, 2]]
+    chosen = (recording.times > -0.02) & (recording.times < prediction.times[-1])
+    times, measured = recording.times[chosen], (recording.tip[chosen] - straight + TIP)[..., [0, 2]]
+    shown = np.minimum(np.searchsorted(prediction.times, times), len(prediction.times) - 1)
+    figure, axis = plt.subplots(figsize=(6, 4), gridspec_kw=dict(left=0.12, bottom=0.14))
+    (beam,) = axis.fill(*(1e3 * prediction.outline[0]).T, color="tab:blue", alpha=0.3)
+    (simulated,) = axis.plot([], [], "o", mfc="none", color="tab:blue", label="simulated")
+    (seen,) = axis.plot([], [], ".", color="tab:red", label="measured")
+    axis.set(xlim=(-105, 15), ylim=(-30, 50), aspect="equal", xlabel="along the beam [mm]", ylabel="height [mm]")
+    axis.legend(loc="lower left")
+
+    def show(k: int):
+        beam.set_xy(1e3 * prediction.outline[shown[k]])
+        simulated.set_data(*(1e3 * (prediction.pins[shown[k]] + stand_off)).T)
+        seen.set_data(*(1e3 * measured[k]).T)
+        axis.set_title(f"{recording.name}: {words}; {times[k]:.2f} s", fontsize=9)
+
+    FuncAnimation(figure, show, range(0, len(times), EVERY)).save(path, PillowWriter(fps=25 / EVERY), dpi=80)
     plt.close(figure)
 
 
@@ -365,6 +433,8 @@ def main(
     span: float = SPAN,
 ) -> dict:
     """Returns each kind's `Fit`, the name of the best, and relative errors of each mass that was predicted.
+
+    Writes a picture, and films of what was predicted, to the folder `output`.
 
     mass [kg]: of the recordings with a weight; default: what the digits in a file's name say, in grams.
     """
@@ -400,11 +470,16 @@ def main(
     for weight, group in groups.items():
         words = f"with {1e3 * weight:g} g, predicted" if weight else "without a weight, fitted"
         print(f"{words}:")
-        predictions = {kind: predict(fits[kind], cells, weight) for kind in kinds}
-        errors[weight] = compare(predictions, weights, group, straight)
-        pairs += [(one, predictions[best], words) for one in group]
+        predictions, chosen = {kind: predict(fits[kind], cells, weight) for kind in kinds}, best
+        if weight and "Kelvin-Voigt" in kinds:
+            chosen = LOSS
+            predictions[LOSS] = predict(fits["Kelvin-Voigt"], cells, weight, flat=True)
+        errors[weight] = compare(predictions, chosen, fits[best].spread, group, straight)
+        pairs += [(one, predictions[chosen], words) for one in group]
     if output:
-        draw(Path(output) / "measured_beam.png", pairs)
+        draw(Path(output) / "measured_beam.png", pairs, straight)
+        for one, prediction, words in pairs[len(light) :]:
+            film(Path(output) / f"{one.name}.gif", one, prediction, words, straight)
     return dict(fits=fits, best=best, errors=errors)
 
 
@@ -413,6 +488,6 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("--mass", type=float, help="of the recordings with a weight [kg]; default: their names' grams")
     parser.add_argument("--recordings", default="beam_load*.csv", help="pattern of those with a weight")
-    parser.add_argument("--output", type=Path, help="folder for a picture")
+    parser.add_argument("--output", type=Path, help="folder for a picture and films")
     ds.init(precision="f64")
     main(**vars(parser.parse_args()))

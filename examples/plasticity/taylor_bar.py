@@ -1,10 +1,18 @@
 """Taylor's bar: a copper rod hits a smooth rigid wall at 227 m/s, and how short and how wide it has become after 80 us.
 
 A quarter of the rod, in explicit steps of linear tetrahedra with patches, or of ten-node ones; the wall holds z of its end,
-which stays in contact for that long. With the same numbers other codes are reported
-to end near lengths of 21.5 mm and radii of 7.0 to 7.2 mm; the problem stands, among others, in Zhu, Cescotto 1995,
-Unified and mixed formulation of the four-node quadrilateral elements, doi:10.1002/nme.1620380411; Camacho, Ortiz 1997,
-Adaptive Lagrangian modelling of ballistic penetration of metallic targets, doi:10.1016/S0045-7825(96)01134-6.
+which stays in contact for that long. Radius and length in the end [mm]:
+
+    7.17, 21.50  linear tetrahedra with patches, 6 x 36 cells
+    7.02, 21.55  ten-node tetrahedra with the mean dilatation of each (--order 2)
+    7.12         Simo 1992, doi:10.1016/0045-7825(92)90123-2
+    7.11         Zienkiewicz, Rojek, Taylor, Pastor 1998, Triangles and tetrahedra in explicit dynamic codes for solids
+    7.22         hexahedra, converged; Foulk and others 2021, doi:10.1002/nme.6686
+    7.23, 21.43  their composite tetrahedra in Sierra/SM; 7.23, 21.42: fifteen-node tetrahedra of Carina
+    6.9, 21.7    F-bar hexahedra in OpenSees, coarse
+
+The third to the sixth row stand in the benchmarks of Carina (github.com/Cthonios/Carina.jl, benchmark/tet15-p1/taylor), the
+last in the validation of a fork of OpenSees (LadrunoBrick).
 
     python examples/plasticity/taylor_bar.py [--quick]
 """

@@ -76,6 +76,21 @@ def plastic(kind, seed: int, law, mesh, E: float):
     return ds.J2Plasticity(E, 0.3, first, E * rng.uniform(0, 0.1), **more)
 
 
+def directed(kind, seed: int, law, mesh, E: float):
+    """Behind the structures of golden.py, in a tenth of those without patches Hooke's law with three planes of symmetry
+    instead of the law, and in a tenth a stress at rest on an elastic one."""
+    draw, rng = np.random.default_rng([44, kind.number]).random(), np.random.default_rng([45, seed])
+    elastic = law.law("f64").reads == ("H",) and not law.law("f64").state_names
+    if kind.number < 60 or draw > 0.2 or kind.volume == "patches" or not elastic:
+        return law
+    if draw > 0.1:
+        return ds.InitialStress(law, 0.01 * E * rng.standard_normal((mesh.num_tetrahedra, 6)))
+    stiff = dict(zip(("E1", "E2", "E3", "G12", "G23", "G13"), E * rng.uniform(0.5, 1.5, 6) / [1, 1, 1, 2, 2, 2]))
+    ratios = dict(zip(("nu12", "nu23", "nu13"), rng.uniform(0.1, 0.3, 3)))
+    directions = dict(zip(("direction_1", "direction_2"), rng.standard_normal((2, mesh.num_tetrahedra, 3))))
+    return ds.Orthotropic(**stiff, **ratios, **directions)
+
+
 def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list[ds.Muscle]:
     """In a fifth of the structures."""
     if np.random.default_rng([26, kind.number]).random() > 0.2:

@@ -114,7 +114,8 @@ def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configu
         bent = 0.08 if kind.self_contact else 0.03  # so that surfaces that meet are curved
         mesh, start = bodies.with_middles(mesh, start, np.random.default_rng([23, seed]), bent)
     law, E = material(kind, rng, mesh)
-    law = newer.grown(kind, seed, newer.plastic(kind, seed, law, mesh, E), mesh)
+    law = newer.directed(kind, seed, newer.plastic(kind, seed, law, mesh, E), mesh, E)
+    law = newer.grown(kind, seed, law, mesh)
     density = rng.uniform(600, 1200) * (1 + 0.3 * rng.random(mesh.num_tetrahedra) if rng.random() < 0.4 else 1.0)
     fixed = _fixed(kind, rng, mesh) if kind.fixed else None
     if kind.rollers:
