@@ -7,10 +7,23 @@ are flat). Pair p presses along its normal n_p with its weights w_p, B = w C, fr
     y_p = d_p + n_p . B z,    z = f + alpha (1 + c) / 2 delta,    delta = (h / m) sum_p P_p B_p^T n_p,
 
 P the push of secant.py: one convex problem for all pairs, so that there is one z. Then the velocity gains delta, and what
-friction takes (friction_kernels.py) with the normal forces P, and nodes drift by alpha (v + (1 + c) / 2 delta + friction).
+friction takes with the normal forces P, and nodes drift by alpha (v + (1 + c) / 2 delta + friction).
 Impulses of a pair sum up to zero, so that momentum is kept to round-off. Angular momentum is, too, with normals and weights
 taken where f has gone the share (1 - c) / 2, for X + that share of f is where delta acts; they are taken at the beginning
 where c = 1.
+
+A pair that presses with P slides with the velocity t = T B v across its normal, T = I - n n^T. Friction gives it the impulse
+
+    r = -h mu P f(s / eps) t / |t|,   s + c f(s / eps) = |t|,   c = h sum_i (|B_i| / m_i) S_i,   S_i = sum |B_i| mu P
+
+over nodes i, the last sum over all pairs; f is that of terms/obstacles/friction.py. c / (h mu P) is a bound W of the inverse
+mass that the pair meets while all others have friction, too: by Cauchy and Schwarz |sum_p r_p B_p|^2 / m is at most
+sum_p W_p |r_p|^2. With r_p = -(1 - s / |t|) t / W_p all frictions together change the kinetic energy by no more than
+
+    sum_p (r_p . t_p + W_p |r_p|^2 / 2) = -sum_p (|t|^2 - s^2) / 2 W_p <= 0
+
+for any h, P, mu and eps, and no node depends on the order of the pairs. Where a patch slides as a whole W is no bound but
+the value, and s the speed of sliding at the end: it creeps no faster than eps.
 
 Beneath WALL of its width a pair meets a second barrier of stiffness (mean mass) / h^2, whose push is of the end alone and
 stops what comes at a width in h: as stiff as the part can feel, and without effect on what is as far apart as contact should

@@ -22,15 +22,20 @@ from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSol
 from diffsim_ti.mechanics.surfaces.near_set import NearSet
 from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
 from diffsim_ti.mechanics.surfaces.part_kernels import TAKEN
-from diffsim_ti.mechanics.surfaces.stages import moment_of
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
-from diffsim_ti.runtime.slots import VertexRows
-from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
+from diffsim_ti.runtime.slots import VertexRows, copy_slot
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, Moment
 
 MOST_LISTS = 6  # made for one pass
 MOST_TRIES = 12  # at a pass with one list, each with the pairs that came near in the one before
 PASSES = 1.5, 15  # like this one, that a list made for it should hold for, at least and at most
 SHORTEST = 2.0**-14  # share of a pass
+
+
+def moment_of(at: Passes) -> Moment:
+    """Obstacles at the end of a pass, and where it begins."""
+    schedule = at.ws.solver.schedule
+    return Moment(schedule, at.j, schedule.end(at.j), schedule.begin(at.j))
 
 
 @dataclass
@@ -79,9 +84,10 @@ class PairContact(Stage):
         self.node_place = np.full(num_nodes, -1)
         self.node_place[self.nodes] = np.arange(len(self.nodes))
         self.kept: dict[int, ContactPass | None] = {}
+        self.work = 0.0  # done by what moves obstacles and held vertices, as they press [J]
         self.partly_fixed = bool(len(a.supports.partly_fixed))
         self.free = a.supports.freedom(num_nodes) if self.partly_fixed else None
-        self.numbers, self.rough = PairNumbers(self.inner), self.inner.friction is not None
+        self.numbers, self.rough = PairNumbers(self.inner), self.inner.has_friction
         runtime.fill(a.corner, 0)
         corners = self.inner.a.first_contact_corner + self.inner.list.num_surface
         self.scratch = runtime.array(self.inner.kernels.vec4, corners)  # for forces, which are not looked at
@@ -101,13 +107,14 @@ class PairContact(Stage):
         fine = self._fine(u, at.slot)
         inner.forces(*fine, self.scratch)
         corners = self.obstacles.displacements if self.obstacles else None
-        start = None if at.stride else self.rows.get(u, at.slot)  # which the drift replaces
+        if not at.stride:
+            copy_slot(u, at.slot, self.begin, 0)  # which the drift replaces
         yield
         self._follow(at, AT_STAGE)
         if at.stride:
             self.kept[at.end] = None
         try:
-            self._act(at, start, corners)
+            self._act(at, corners)
         except Tunnelling as error:
             raise at.ws.dated(error, at.j, at.num_passes) from None
 
@@ -124,18 +131,18 @@ class PairContact(Stage):
         it may be near."""
         inner = self.inner
         inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
-        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, **inner.sizes_of_sums)
-        inner.run(inner.motion.find, dict(u=u), slot=slot, lost=0.5 * inner.least_width, **bodies)
+        inner.look_at(inner.motion.find, u, slot)
         return tuple(bool(x) for x in whole(inner.flags))
 
-    def _act(self, at: Passes, start: np.ndarray | None, corners: np.ndarray | None) -> None:
-        """What contact does to a pass, anew with a longer list where one does not hold to the end. start, corners:
-        displacements where it begins, of the body where the record has none, and of obstacles."""
+    def _act(self, at: Passes, corners: np.ndarray | None) -> None:
+        """What contact does to a pass, anew with a longer list where one does not hold to the end. corners: displacements of
+        those of obstacles where it begins."""
         inner, history, own = self.inner, at.history, slice(self.num_own)
         stale, lost, any_near = self._look(*self._fine(history.u, at.end))
         now, acts = at.now if stale or any_near else None, False
         if now and now.alpha > 0:
-            start = self.rows.get(history.u, at.slot) if start is None else start
+            before = (history.u, at.slot) if at.stride else (self.begin, 0)
+            start = self.rows.get(*before)
             u, v = self.rows.get(history.u, at.end), self.rows.get(history.v, at.end)
             if self.obstacles:
                 start, u = np.concatenate([start, corners]), np.concatenate([u, self.obstacles.displacements])
@@ -147,9 +154,8 @@ class PairContact(Stage):
                 needed = np.maximum(needed, 1.1 * inner.travel(moved - runtime.fetch(inner.before)))
                 self.rows.put(history.u, at.end, u[own])
                 self.rows.put(history.v, at.end, v)
-                self.rows.put(self.begin, 0, start[own])
                 self._follow(at, AT_BEGIN)
-                begin = self._fine(self.begin, 0)
+                begin = self._fine(*before)
                 inner.build(*begin, wanted=self._passes(needed) * needed, needed=needed)
                 inner.forces(*begin, self.scratch)
                 self._follow(at, AT_STAGE)
@@ -160,6 +166,7 @@ class PairContact(Stage):
             if not lost:
                 break
         inner.age += 1
+        self.work += self.set.work if acts and any_near else 0.0
         if lost and acts:
             self._refuse(at, now)
         if at.stride:
@@ -328,7 +335,7 @@ class PairContact(Stage):
             f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep "
             f"of {h:.3g} s, {ways[i] / h:.3g} m/s at vertex {surface[i]}: take substeps of {0.25 * h:.3g} s"
         )
-        error.stable_dt, error.stiffness = 0.25 * h, None
+        error.stable_dt = 0.25 * h
         raise error
 
     @property

@@ -93,6 +93,7 @@ class NearSet:
     def begin(self, x: np.ndarray, anew: bool) -> None:
         """A pass begins with nodes at x; anew: and no pair is chosen."""
         self._write(self.arrays["nodes"].x, x)
+        runtime.fill(self.arrays["state"].numbers, 0)
         if anew:
             runtime.fill(self.arrays["pairs"].chosen, 0)
 
@@ -113,7 +114,7 @@ class NearSet:
     def take(self, **numbers) -> tuple[int, float]:
         """(what came of a part, its damping)"""
         self._take_part(**self.acting, **numbers)
-        return int(whole(self.arrays["state"].result)[0]), float(whole(self.arrays["state"].damping)[0])
+        return int(whole(self.arrays["state"].result)[0]), float(whole(self.arrays["state"].numbers)[0])
 
     @property
     def motion(self) -> np.ndarray:
@@ -123,6 +124,11 @@ class NearSet:
     def moved(self) -> tuple[np.ndarray, np.ndarray]:
         """What contact has added to displacements and velocities, (e, b)."""
         return self._get("e"), self._get("b")
+
+    @property
+    def work(self) -> float:
+        """Done by what moves obstacles and held vertices, in all parts [J]."""
+        return float(whole(self.arrays["state"].numbers)[1])
 
     @property
     def solution(self) -> np.ndarray:

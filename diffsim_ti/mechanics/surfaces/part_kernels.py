@@ -39,7 +39,7 @@ OF_POINTS = dict.fromkeys(("at_begin", "at_look", "moved", "at_end"), "vectors")
 OF_PAIRS = dict(filled="ints", open="ints", n="vectors")
 OF_PAIRS |= dict.fromkeys(("fading", "begin", "end", "change", "P", "K", "stiff", "q", "r", "z", "p", "Ap"), "scalars")
 OF_ROWS = dict(node="ints", share="scalars", row="vectors")
-RESULT = dict(result="ints", damping="scalars")
+RESULT = dict(result="ints", numbers="scalars")
 WORK = OF_NODES | OF_POINTS | OF_PAIRS | OF_ROWS | dict(gauss="scalars")
 
 
@@ -375,8 +375,9 @@ class PartKernels(Pair):
 
     @ti.func
     def act(self, c, pairs: A, nodes: A, state: A, work: A, plan: A):
-        """e and b after the part (PartSolver.take)."""
+        """e and b after the part (PartSolver.take); the work of what moves nodes of infinite mass against pushes [J]."""
         h, alpha, tiny = plan.share * plan.h, plan.share * plan.alpha, ti.cast(1e-200, self.fp)
+        done = ti.cast(0, self.fp)
         for i in range(plan.num_nodes):
             work.residual[i], work.sum[i], work.load[i] = self.vec4(0), self.vec4(0), 0.0
             work.step[i] = nodes.motion[i] / plan.alpha + state.b[i]
@@ -397,13 +398,17 @@ class PartKernels(Pair):
             for m in range(p * plan.room, p * plan.room + work.filled[p]):
                 work.sum[work.node[m]] += work.share[m] * impulse
         for i in range(plan.num_nodes):
-            delta = (h * nodes.inverse[i]) * self.freed(i, three(work.residual[i]), nodes)
-            friction = nodes.inverse[i] * self.freed(i, three(work.sum[i]), nodes)
+            pushed, rubbed = three(work.residual[i]), three(work.sum[i])
+            delta = (h * nodes.inverse[i]) * self.freed(i, pushed, nodes)
+            friction = nodes.inverse[i] * self.freed(i, rubbed, nodes)
+            if nodes.inverse[i] == 0:
+                done = done - (h * pushed + rubbed).dot(three(nodes.motion[i])) / plan.h
             way = three(state.b[i]) + 0.5 * (1 + c) * delta + friction
             state.e_next[i] = state.e[i] + alpha * self.four(way)
             state.b_next[i] = state.b[i] + self.four(delta + friction)
             work.sum[i] = nodes.x[i] + (plan.begin + plan.share) * nodes.motion[i] + state.e_next[i]
         self.spread(work.at_end, work.sum, nodes, plan)
+        return done
 
     @ti.func
     def farthest_place(self, pairs: A, work: A, plan: A):
@@ -419,7 +424,7 @@ class PartKernels(Pair):
     def take_all(self, pairs: A, nodes: A, state: A, work: A, plan: A):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            c, result, step, room = plan.damping, TOO_LONG, LOOK, ti.cast(0, self.fp)
+            c, result, step, room, done = plan.damping, TOO_LONG, LOOK, ti.cast(0, self.fp), ti.cast(0, self.fp)
             square = self.place(c, pairs, nodes, state, work, plan)
             if square > LONGEST**2:
                 step = DONE
@@ -445,10 +450,11 @@ class PartKernels(Pair):
                 elif step == LOOK:
                     result, step = UNSOLVED, DONE
                     if self.balance(c, plan.wall / (plan.share * plan.h) ** 2, pairs, state, work, plan):
-                        self.act(c, pairs, nodes, state, work, plan)
+                        done = self.act(c, pairs, nodes, state, work, plan)
                         room, step = plan.rounding * (1 + self.farthest_place(pairs, work, plan)), CHECK
                 elif left == 0:
                     result, step = TAKEN, DONE
+                    state.numbers[1] += done
                     for i in range(plan.num_nodes):
                         state.e[i], state.b[i] = state.e_next[i], state.b_next[i]
                 else:
@@ -457,10 +463,11 @@ class PartKernels(Pair):
                         work.at_look[i] = work.at_begin[i]
                         if step == CHECK_END:
                             work.at_look[i] = work.at_end[i]
-            state.result[0], state.damping[0] = result, c
+            state.result[0], state.numbers[0] = result, c
 
     @cached_property
     def take(self) -> Kernel:
-        """The part `begin` .. `begin + share` of a pass of length h; result: what came of it, damping: its own."""
+        """The part `begin` .. `begin + share` of a pass of length h; result: what came of it; numbers: its damping, and
+        the work of all parts since `NearSet.begin`."""
         numbers = dict.fromkeys(("begin", "share", "h", "alpha", "damping", "wall", "rounding"), "float")
         return self._kernel("take_part", self.take_all, rough="int", **numbers)
