@@ -313,6 +313,35 @@ def test_all_threads_do_what_one_does(kind):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_surfaces_push_an_affine_body(friction):
+    """Momenta are kept to round-off, angular momentum where nothing rubs; gradients know that four nodes share its mass."""
+    low = ds.TetrahedralMesh.create_box(2, size=0.1)
+    up = ds.TetrahedralMesh.create_box(2, size=0.08, origin=(0.01, 0.104, 0.02)).rotated([0, 1, 0], 0.1)
+    mesh = ds.TetrahedralMesh.joined([low, up])
+    E = np.repeat([5e4, 5e6], [low.num_tetrahedra, up.num_tetrahedra])
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(E, 0.3),
+        1000.0,
+        [ds.SelfContact(2e4, 5e-3, friction=friction, friction_speed=0.05)],
+        reduced={"body_1": "affine"},
+        precision="f64",
+        initial_velocities=np.repeat([[0, 0, 0], [0.1, -0.5, 0]], 8, axis=0),
+    )
+    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=10), 8, save_every=4, gradients="all")
+    frames = rollout.forward()
+    m = scene.inputs.derive(scene.inputs.values).mass[:, None]
+    P, L = (m * frames.velocities).sum(1), (m * np.cross(frames.positions, frames.velocities)).sum(1)
+    assert np.abs(P - P[0]).max() < 1e-13 and np.abs(L - L[0]).max() < (1e-4 if friction else 1e-13)
+    assert frames.velocities[-1, 8:, 1].max() > -0.4
+    q = frames.displacements[-1, 8:]
+    np.testing.assert_allclose(q, scene.reduced.of(frames.displacements[-1])[8:], rtol=0, atol=1e-15)
+    assert verify.dot_product_test(rollout) <= 1e-12
+    names = ["density", "rest_positions", "initial_positions"] + ["self_contact_friction"] * bool(friction)
+    assert ds.check_gradients(rollout, inputs=names, verbose=False).passed
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_starts_that_a_body_cannot_have_are_brought_near(kind):
     rng = np.random.default_rng(2)
@@ -365,7 +394,11 @@ def test_the_benchmark_of_a_stiff_part():
             {},
             'take obstacles as a force in explicit steps.*contact="force"',
         ),
-        ([ds.SelfContact(1e4, 1e-3)], {}, r"meet between vertices \(SelfContact\).*take an implicit solver"),
+        (
+            [ds.SelfContact(1e4, 1e-3)],
+            {},
+            r'meet between vertices \(SelfContact\).*pass "affine".*take an implicit solver',
+        ),
         (
             [ds.Sphere((0, -1, 0), 1e-3, stiffness=1e3, width=1e-3)],
             {},
