@@ -334,6 +334,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("batch/batch.py", "act at their nodes alone"): "test_curved_contact.py, from the start",
     ("terms/obstacles/obstacle.py", "from the triangles of their nodes"): "test_curved_contact.py",
     ("terms/obstacles/obstacle.py", "at their vertices alone"): "test_own_obstacle.py",
+    ("monitor/guard.py", "are squeezed: take substeps of"): "test_obstacle_pairs.py",
     ("monitor/guard.py", "take substeps of {} s ({}"): "test_step_limit.py",
     ("monitor/guard.py", "pass substeps={}, or reduce dt"): "test_step_limit.py",
     ("rollout/simulator.py", "for the same number from the start"): "test_step_limit.py",

@@ -270,7 +270,7 @@ class PartSolver:
         at.sizes.data = np.where(at.B.data.real < 0, -at.B.data, at.B.data)
         at.S = at.sizes.T @ at.load
         at.bound = at.h * (at.sizes @ near.lightened(of, at.S, sizes=True))
-        at.kappa, at.share_of_mu, at.ratio, at.slip = slip(at.s, at.bound, of.speed, TINY, ARRAYS)
+        at.kappa, at.share_of_mu, at.ratio, at.slip = slip(at.s, at.bound, of.speed, ARRAYS)
         at.impulse = (-at.h * at.load * at.kappa)[:, None] * at.t
         at.friction_sum = at.B.T @ at.impulse
         return near.lightened(of, near.freed(at.friction_sum))

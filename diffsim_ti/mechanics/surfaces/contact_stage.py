@@ -97,7 +97,6 @@ class PairContact(Stage):
         self.partly_fixed = bool(len(a.supports.partly_fixed))
         self.free = a.supports.freedom(num_nodes) if self.partly_fixed else None
         self.numbers, self.rough = PairNumbers(self.inner), self.inner.has_friction
-        runtime.fill(a.corner, 0)
         corners = self.inner.a.first_contact_corner + self.inner.list.num_surface
         self.scratch = runtime.array(self.inner.kernels.vec4, corners)  # for forces, which are not looked at
         self.begin = runtime.array(a.vector, 1, a.num_vertices)
@@ -157,7 +156,7 @@ class PairContact(Stage):
         """(the set, places of its vertices, which four of the nodes are its) of those that have nodes there."""
         for k, (x, at) in enumerate(zip(self.sets, self.members)):
             here = np.flatnonzero((places - self.first_set) // 4 == k)
-            if len(here) and places[here[0]] >= self.first_set:
+            if len(here):
                 yield x, at, here
 
     # ---- passes --------------------------------------------------------------------------------------------------------
@@ -400,11 +399,13 @@ class PairContact(Stage):
         return parts
 
     def _refuse(self, at: Passes, now) -> None:
+        """Raise Tunnelling, the state's displacements being those where the pass begins."""
         inner, surface = self.inner, self.inner.mesh.surface_vertices
         moved = runtime.fetch_row(*self._fine(at.history.u, at.end))[surface] - runtime.fetch(inner.before)
         ways = np.linalg.norm(moved - moved.mean(0), axis=1)
         i, h = int(ways.argmax()), now.h
         inner.fresh = False
+        copy_slot(*((at.history.u, at.slot) if at.stride else (self.begin, 0)), at.ws.state.u, 0)
         error = Tunnelling(
             f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep "
             f"of {h:.3g} s, {ways[i] / h:.3g} m/s at vertex {surface[i]}: take substeps of {0.25 * h:.3g} s"

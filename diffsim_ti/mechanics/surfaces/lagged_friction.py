@@ -112,7 +112,7 @@ class LaggedFriction:
         relative = np.einsum("pk,pkd->pd", self.w, v)
         t = self._across(relative)
         s = np.linalg.norm(t, axis=1)
-        kappa, _, _, slope = slip(s, 0, eps, TINY, ARRAYS)
+        kappa, _, _, slope = slip(s, 0, eps, ARRAYS)
         return v, relative, t, s, t / np.maximum(s, TINY)[:, None], kappa, slope
 
     def _across(self, x: np.ndarray) -> np.ndarray:

@@ -409,7 +409,7 @@ class PartKernels(Pair):
     @ti.func
     def act(self, c, pairs: A, nodes: A, state: A, work: A, plan: A):
         """e and b after the part (PartSolver.take); the work of what moves nodes of infinite mass against pushes [J]."""
-        h, alpha, tiny = plan.share * plan.h, plan.share * plan.alpha, ti.cast(1e-200, self.fp)
+        h, alpha = plan.share * plan.h, plan.share * plan.alpha
         done = ti.cast(0, self.fp)
         for i in range(plan.num_nodes):
             work.residual[i], work.sum[i], work.load[i] = self.vec4(0), self.vec4(0), 0.0
@@ -426,7 +426,7 @@ class PartKernels(Pair):
                 v += work.share[m] * work.step[i]
                 bound += h * ti.abs(work.share[m]) * self.lightened_sizes(i, work.load, nodes)
             t = v - work.n[p].dot(v) * work.n[p]
-            kappa, f, y, slip = slip_in_kernels(ti.sqrt(t.norm_sqr()), bound, pairs.speed[p], tiny, KERNELS)
+            kappa, f, y, slip = slip_in_kernels(ti.sqrt(t.norm_sqr()), bound, pairs.speed[p], KERNELS)
             impulse = (-1.0 * h * pairs.mu[p] * work.P[p] * kappa) * t
             for m in range(p * plan.room, p * plan.room + work.filled[p]):
                 work.sum[work.node[m]] += work.share[m] * impulse
