@@ -313,6 +313,28 @@ def test_all_threads_do_what_one_does(kind):
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_narrow_obstacle_pushes_an_affine_body():
+    """Whose vertices it meets by a force, and whose faces by pairs."""
+    mesh, there = ds.TetrahedralMesh.create_box(3, size=0.1), dict(stiffness=1e3, width=4e-3, friction=0.3)
+    ball = ds.Sphere((0.053, -0.013, 0.042), 0.01, path=lambda t: [0.2 * t, 0, 0], **there)
+    scene = ds.Scene(
+        mesh.with_vertex_set("body", range(mesh.num_vertices)),
+        ds.StableNeoHookean(1e6, 0.3),
+        1000.0,
+        [ball],
+        reduced={"body": "affine"},
+        initial_velocities=[0, -1.0, 0],
+        precision="f64",
+    )
+    assert scene.obstacles[0].by_pairs
+    rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=2e-4, contact="force"), 40, gradients="all")
+    frames = rollout.forward()
+    assert frames.velocities[-1, :, 1].mean() > 0.3
+    shift = frames.displacements[-1]
+    np.testing.assert_allclose(shift, scene.reduced.of(shift), rtol=0, atol=1e-15)
+    assert verify.dot_product_test(rollout) <= 1e-12
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_surfaces_push_an_affine_body(friction):
     """Momenta are kept to round-off, angular momentum where nothing rubs; gradients know that four nodes share its mass."""
@@ -401,7 +423,7 @@ def test_the_benchmark_of_a_stiff_part():
         ),
         (
             [ds.Sphere((0, -1, 0), 1e-3, stiffness=1e3, width=1e-3)],
-            {},
+            dict(contact="force"),
             r"meet between vertices \(Sphere\).*or give obstacles by_pairs=False",
         ),
     ],

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 def check_bodies(scene: "Scene", contact: str) -> None:
     """Raise ValueError for what these bodies do not have in explicit steps."""
     said = f"reduced sets ({scene.reduced.describe()})"
-    if contact == "stage" and any(term.acts_on_surface and term.primitives is None for term in scene.terms):
+    if contact == "stage" and any(term.acts_on_surface for term in scene.terms):
         raise ValueError(
             f"{said} take obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
             'contact="force"'
