@@ -194,8 +194,7 @@ class PairContact(Stage):
         it may be near."""
         inner = self.inner
         inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
-        inner.look_at(inner.motion.find, u, slot)
-        return tuple(bool(x) for x in whole(inner.flags))
+        return inner.look_at(inner.motion.find, u, slot)
 
     def _act(self, at: Passes, corners: np.ndarray | None) -> None:
         """What contact does to a pass, anew with a longer list where one does not hold to the end. corners: displacements of

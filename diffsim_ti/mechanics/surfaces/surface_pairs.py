@@ -221,14 +221,14 @@ class SurfacePairs:
 
     def holds(self, u, slot: int) -> bool:
         """Whether the list holds at u[slot]."""
-        if self.fresh:
-            self.look_at(self.motion.holds, u, slot)
-        return self.fresh and not whole(self.flags)[0]
+        return self.fresh and not self.look_at(self.motion.holds, u, slot)[0]
 
-    def look_at(self, kernel, u, slot: int) -> None:
-        """Launch a kernel that follows the motion to u[slot] since the list was made, for its `flags`."""
+    def look_at(self, kernel, u, slot: int) -> tuple[bool, bool, bool]:
+        """The `flags` of a kernel that follows the motion to u[slot] since the list was made."""
         bodies = dict(num_bodies=self.num_bodies, markers=self.markers, **self.sizes_of_sums)
         self.run(kernel, dict(u=u), slot=slot, lost=0.5 * self.least_width, **bodies)
+        flags = runtime.view(self.flags)
+        return tuple(bool(x) for x in (runtime.fetch(self.flags) if flags is None else flags))
 
     def ensure(self, u, slot: int) -> None:
         """Make the list anew if it does not hold at u[slot]."""
