@@ -9,6 +9,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
+from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.listed_pair import between
 from diffsim_ti.mechanics.surfaces.proximity import PARALLEL, Pair
 from diffsim_ti.runtime import Kernel, kernels_of
@@ -91,3 +92,32 @@ def evaluate_pairs(
     kernel.kernel.bind(at=at, out=out)(count=len(x), stiffness=float(stiffness), width=float(width))
     numbers = dict(zip(("distance", "energy", "by_stiffness", "by_width"), whole(out.numbers)[: len(x)].T.copy()))
     return SimpleNamespace(**numbers, **{name: runtime.fetch(getattr(out, name))[: len(x)] for name in OUT})
+
+
+def follow_parts(monkeypatch) -> list[tuple[bool, float]]:
+    """Of each part that explicit runs take from now on, whether it pressed and how much of the kinetic energy friction took;
+    it is what the formulas say that tangents and adjoints follow, it balances its pushes, and friction adds no energy."""
+    act, seen = PairContact._act, []
+
+    def spy(self, at, *given):
+        act(self, at, *given)
+        one = self.kept.get(at.end)
+        for k, part in enumerate(one.parts if one else ()):
+            of = self._numbers(one, at.now)
+            found = one.solver.look(part, of)
+            after = one.solver.take(part, of, found)
+            np.testing.assert_allclose(part.P, found.P, rtol=0, atol=1e-9 * found.P.max(initial=1e-300))
+            known = (one.parts[k + 1].e, one.parts[k + 1].b) if k + 1 < len(one.parts) else (None, one.b)
+            for x, y in zip(after, known):
+                assert y is None or np.abs(x - y).max() <= 1e-11 * max(np.abs(y).max(), 1e-300)
+            lost = 0.0
+            if of.rough:
+                inverse = one.solver.near.lightened(of, np.eye(len(of.inverse)))
+                mass = np.linalg.pinv(inverse)
+                before, then = (float((mass @ v * v).sum()) for v in (found.V, found.V + found.friction))
+                assert then <= before * (1 + 1e-14)
+                lost = 1 - then / before
+            seen.append((bool(found.P.max() > 0), lost))
+
+    monkeypatch.setattr(PairContact, "_act", spy)
+    return seen

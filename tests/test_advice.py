@@ -209,6 +209,13 @@ FOLLOWED = {
         lambda: verlet(**RIGID),
         lambda: verlet(**RIGID, contact="force"),
     ),
+    ("mechanics/reduced/body_checks.py", "meet between vertices"): (
+        lambda: verlet(**RIGID | dict(terms=[ds.SelfContact()])),
+        lambda: [
+            ds.ImplicitEulerSolver(scene(**RIGID | dict(terms=[ds.SelfContact()])), dt=1e-3),
+            ds.Simulator(verlet(**RIGID | dict(terms=[ds.SelfContact()], reduced={"body_0": "affine"}))).step(),
+        ],
+    ),
     ("solvers/explicit/solver.py", "are of obstacles that act as a stage"): (
         lambda: ds.Rollout(verlet(terms=[GROUND], contact="force"), 1, outputs=[ds.ContactForce(GROUND)]),
         lambda: ds.Rollout(verlet(terms=[GROUND], contact="stage"), 1, outputs=[ds.ContactForce(GROUND)]),
@@ -325,10 +332,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("batch/taped.py", "its field is already"): "test_batch_tape.py",
     ("common/checked.py", "is a tensor with a graph"): "test_calls.py",
     ("mechanics/surfaces/surface_pairs.py", "take a width below"): "test_self_contact.py",
-    ("solvers/explicit/solver.py", "leave stage out"): "test_self_contact.py",
-    ("mechanics/surfaces/surface_pairs.py", "take substeps of {} s"): "test_self_contact.py, battery_of_throws.py",
-    ("mechanics/surfaces/contact_stage.py", "take substeps of {} s"): "battery_of_throws.py",
-    ("mechanics/surfaces/surface_pairs.py", "no step stops them"): "test_self_contact.py, battery_of_throws.py",
+    ("mechanics/surfaces/contact_stage.py", "take substeps of {} s"): "test_self_contact.py, battery_of_throws.py",
     ("diff_simulator.py", "a two-step method"): "test_torch_solvers.py",
     ("identification/descent.py", "take smaller steps"): "names neither an argument nor a number",
     ("inputs/inputs.py", "none of its inputs says that it is a place"): "test_far_from_origin.py",
@@ -344,6 +348,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("batch/batch.py", "act at their nodes alone"): "test_curved_contact.py, from the start",
     ("terms/obstacles/obstacle.py", "from the triangles of their nodes"): "test_curved_contact.py",
     ("terms/obstacles/obstacle.py", "at their vertices alone"): "test_own_obstacle.py",
+    ("monitor/guard.py", "are squeezed: take substeps of"): "test_obstacle_pairs.py",
     ("monitor/guard.py", "take substeps of {} s ({}"): "test_step_limit.py",
     ("monitor/guard.py", "pass substeps={}, or reduce dt"): "test_step_limit.py",
     ("rollout/simulator.py", "for the same number from the start"): "test_step_limit.py",

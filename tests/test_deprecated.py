@@ -44,6 +44,12 @@ def test_a_backend_was_an_arch():
     assert caught[0].filename == __file__
 
 
+def test_pairs_need_not_be_asked_to_be_a_stage():
+    for stage in (True, False):
+        with pytest.warns(DeprecationWarning, match="leave `stage` out, which goes with the next version"):
+            ds.SelfContact(stage=stage)
+
+
 def test_an_obstacle_of_users_may_say_its_kernels_by_the_old_name():
     with pytest.warns(DeprecationWarning, match="Ball.twin is called counterpart;") as caught:
 

@@ -72,6 +72,13 @@ LOADS = np.zeros(MESH.vertices.shape)
 LOADS[-1] = 0, 0.3, 0.2
 SHAKEN = dict(fixed="xmin", motion=lambda t: [0.01 * np.sin(40 * t), 0.01 * np.sin(55 * t), 0])
 PLATE = lambda t: [0.3 * np.sin(20 * t), 0.01 * np.sin(60 * t), 0]  # noqa: E731
+
+
+def ball(by_pairs: bool) -> ds.Sphere:
+    place, path = [0.05, -0.04, 0.05], lambda t: [0, 0.05 * np.sin(30 * t), 0]
+    return ds.Sphere(place, 0.05, stiffness=400.0, width=0.02, path=path, by_pairs=by_pairs)
+
+
 WORK = {
     "loads": lambda: body([ds.ExternalForce(LOADS)], fixed="xmin"),
     "loads of steps": lambda: body(
@@ -84,19 +91,8 @@ WORK = {
     "a muscle of steps": lambda: body(
         [ds.Muscle([0, 1, 0], 3e4, 0.5 + 0.5 * np.sin(0.3 * np.arange(80)))], fixed="xmin"
     ),
-    "a ball": lambda: body(
-        [
-            ds.Sphere(
-                [0.05, -0.04, 0.05],
-                0.05,
-                stiffness=400.0,
-                width=0.02,
-                path=lambda t: [0, 0.05 * np.sin(30 * t), 0],
-                by_pairs=False,  # whose work is not counted
-            )
-        ],
-        ABOVE,
-    ),
+    "a ball": lambda: body([ball(False)], ABOVE),
+    "a ball by pairs": lambda: body([ball(True)], ABOVE),
     "a belt": lambda: body([ds.Gravity(), ds.Ground(0.0, 2e3, width=0.01, friction=0.5, path=PLATE)], ABOVE),
 }
 

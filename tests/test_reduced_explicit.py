@@ -313,8 +313,31 @@ def test_all_threads_do_what_one_does(kind):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_self_contact_pushes_a_body(kind):
+def test_a_narrow_obstacle_pushes_an_affine_body():
+    """Whose vertices it meets by a force, and whose faces by pairs."""
+    mesh, there = ds.TetrahedralMesh.create_box(3, size=0.1), dict(stiffness=1e3, width=4e-3, friction=0.3)
+    ball = ds.Sphere((0.053, -0.013, 0.042), 0.01, path=lambda t: [0.2 * t, 0, 0], **there)
+    scene = ds.Scene(
+        mesh.with_vertex_set("body", range(mesh.num_vertices)),
+        ds.StableNeoHookean(1e6, 0.3),
+        1000.0,
+        [ball],
+        reduced={"body": "affine"},
+        initial_velocities=[0, -1.0, 0],
+        precision="f64",
+    )
+    assert scene.obstacles[0].by_pairs
+    rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=2e-4, contact="force"), 40, gradients="all")
+    frames = rollout.forward()
+    assert frames.velocities[-1, :, 1].mean() > 0.3
+    shift = frames.displacements[-1]
+    np.testing.assert_allclose(shift, scene.reduced.of(shift), rtol=0, atol=1e-15)
+    assert verify.dot_product_test(rollout) <= 1e-12
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_surfaces_push_an_affine_body(friction):
+    """Momenta are kept to round-off, angular momentum where nothing rubs; gradients know that four nodes share its mass."""
     low = ds.TetrahedralMesh.create_box(2, size=0.1)
     up = ds.TetrahedralMesh.create_box(2, size=0.08, origin=(0.01, 0.104, 0.02)).rotated([0, 1, 0], 0.1)
     mesh = ds.TetrahedralMesh.joined([low, up])
@@ -323,8 +346,8 @@ def test_self_contact_pushes_a_body(kind):
         mesh,
         ds.StableNeoHookean(E, 0.3),
         1000.0,
-        [ds.SelfContact(2e4, 5e-3)],
-        reduced={"body_1": kind},
+        [ds.SelfContact(2e4, 5e-3, friction=friction, friction_speed=0.05)],
+        reduced={"body_1": "affine"},
         precision="f64",
         initial_velocities=np.repeat([[0, 0, 0], [0.1, -0.5, 0]], 8, axis=0),
     )
@@ -332,10 +355,13 @@ def test_self_contact_pushes_a_body(kind):
     frames = rollout.forward()
     m = scene.inputs.derive(scene.inputs.values).mass[:, None]
     P, L = (m * frames.velocities).sum(1), (m * np.cross(frames.positions, frames.velocities)).sum(1)
-    assert (
-        np.abs(P - P[0]).max() < 1e-13 and np.abs(L - L[0]).max() < 1e-13 and frames.velocities[-1, 8:, 1].max() > -0.4
-    )
+    assert np.abs(P - P[0]).max() < 1e-13 and np.abs(L - L[0]).max() < (1e-4 if friction else 1e-13)
+    assert frames.velocities[-1, 8:, 1].max() > -0.4
+    q = frames.displacements[-1, 8:]
+    np.testing.assert_allclose(q, scene.reduced.of(frames.displacements[-1])[8:], rtol=0, atol=1e-15)
     assert verify.dot_product_test(rollout) <= 1e-12
+    names = ["density", "rest_positions", "initial_positions"] + ["self_contact_friction"] * bool(friction)
+    assert ds.check_gradients(rollout, inputs=names, verbose=False).passed
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -390,7 +416,16 @@ def test_the_benchmark_of_a_stiff_part():
             {},
             'take obstacles as a force in explicit steps.*contact="force"',
         ),
-        ([ds.SelfContact(1e4, 1e-3, friction=0.3)], {}, "no friction in SelfContact in explicit steps"),
+        (
+            [ds.SelfContact(1e4, 1e-3)],
+            {},
+            r'meet between vertices \(SelfContact\).*pass "affine".*take an implicit solver',
+        ),
+        (
+            [ds.Sphere((0, -1, 0), 1e-3, stiffness=1e3, width=1e-3)],
+            dict(contact="force"),
+            r"meet between vertices \(Sphere\).*or give obstacles by_pairs=False",
+        ),
     ],
 )
 def test_refused(terms, options, words):

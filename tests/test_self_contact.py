@@ -1,18 +1,17 @@
 """Contact of bodies with each other and with themselves in runs: motion, gradients, conservation, determinism, refusals."""
 
-import re
 from functools import lru_cache
 
 import numpy as np
 import pytest
 from exact_predicates import ExactJudge
+from pairs_alone import follow_parts
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
 import diffsim_ti as ds
-from diffsim_ti import verify
+from diffsim_ti import runtime, verify
 from diffsim_ti.mechanics.surfaces import contact_stage
-from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs
 
 MATERIAL = ds.StableNeoHookean(5e4, 0.3)
@@ -24,7 +23,7 @@ def tetrahedron(size=0.1):
 
 
 @lru_cache
-def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, stage=False, **options):
+def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, **options):
     """Two tetrahedra that meet edge across edge, a little askew."""
     corners = np.array([[-0.05, 0, 0], [0.05, 0, 0], [0, -0.08, -0.05], [0, -0.08, 0.05]])
     lower = ds.TetrahedralMesh(corners, [[0, 1, 2, 3]], fix_orientation=True)
@@ -36,7 +35,7 @@ def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, stag
         mesh,
         MATERIAL,
         density=1000.0,
-        terms=[ds.SelfContact(STIFFNESS, WIDTH, stage=stage)],
+        terms=[ds.SelfContact(STIFFNESS, WIDTH)],
         initial_velocities=velocity,
         precision=precision,
     )
@@ -44,7 +43,7 @@ def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, stag
 
 
 @lru_cache
-def two_blocks(precision="f64", stage=False, **options):
+def two_blocks(precision="f64", **options):
     """A turned block that falls on another; many pairs of all kinds."""
     block = ds.TetrahedralMesh.create_box(3, 0.1)
     upper = block.rotated([1, 2, 0.5], 0.7, center=(0.05, 0.05, 0.05)).translated([0.02, 0.125, 0.01])
@@ -55,7 +54,7 @@ def two_blocks(precision="f64", stage=False, **options):
         mesh,
         MATERIAL,
         density=1000.0,
-        terms=[ds.SelfContact(STIFFNESS, WIDTH, stage=stage)],
+        terms=[ds.SelfContact(STIFFNESS, WIDTH)],
         initial_velocities=velocity,
         precision=precision,
     )
@@ -88,10 +87,9 @@ def test_energy_and_momenta_through_a_collision():
     simulator.check_surfaces()
 
 
-@pytest.mark.parametrize("kind", ["edges", "edges as a stage", "blocks"])
+@pytest.mark.parametrize("kind", ["edges", "blocks"])
 def test_gradients_through_a_collision(kind):
-    edges = crossed_edges(stage="stage" in kind)
-    rollout = collision() if kind == "blocks" else ds.Rollout(edges, 60, gradients="all")
+    rollout = collision() if kind == "blocks" else ds.Rollout(crossed_edges(), 60, gradients="all")
     frames = rollout.forward()
     free = (frames.displacements[-1] - frames.displacements[0]) - rollout.values["initial_velocities"] * frames.times[
         -1
@@ -118,10 +116,9 @@ def test_gradients_through_a_collision(kind):
         assert min(abs(c - slope) for c in central) <= 2e-5 * abs(slope) + 1e-9, name
 
 
-@pytest.mark.parametrize("stage", [False, True], ids=["force", "stage"])
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
-def test_tangent_and_adjoint_agree(solver, stage):
-    rollout = ds.Rollout(crossed_edges(solver=solver, stage=stage), 60, save_every=20, gradients="all")
+def test_tangent_and_adjoint_agree(solver):
+    rollout = ds.Rollout(crossed_edges(solver=solver), 60, save_every=20, gradients="all")
     assert verify.dot_product_test(rollout) <= 1e-11
 
 
@@ -273,6 +270,8 @@ def test_no_contact_costs_no_bit():
 
 @pytest.mark.backends
 def test_collision_in_single_precision():
+    if runtime.arch_name() == "vulkan":
+        pytest.skip("kernels of the stage take more arrays than it lends")
     simulator = ds.Simulator(crossed_edges("f32"))
     gaps = []
     for _ in range(8):
@@ -313,67 +312,29 @@ def test_a_width_beyond_many_elements_is_refused():
     assert 0.1 < width < 0.5
 
 
-def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
-    solver = crossed_edges(speed=400.0, substeps=1)
-    simulator = ds.Simulator(solver)
-    with pytest.raises(ds.Tunnelling, match=r"substep of 0\.0001 s.*take substeps of"):
+def test_what_the_stage_cannot_resolve_is_an_error_that_keeps_the_state(monkeypatch):
+    """Where parts of a substep may not become as short as they would have to."""
+    monkeypatch.setattr(contact_stage, "SHORTEST", 0.3)
+    simulator = ds.Simulator(crossed_edges(speed=100.0, substeps=1))
+    with pytest.raises(ds.Tunnelling, match=r"^step \d+, t = .*substep of 0\.0001 s.*take substeps of") as error:
         simulator.run(20)
+    assert error.value.step == simulator.step_count and f"t = {simulator.time:.6g} s" in str(error.value)
     simulator.check_surfaces()
-    scene = crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)])
-    weak = ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT, substeps=1))
-    with pytest.raises(
-        ds.Tunnelling, match=r"^step \d+, t = .*(edges|vertex).*may have gone through each other: their gap was .* m/s"
-    ) as error:
-        weak.run(100)
-    assert error.value.step == weak.step_count > 0 and f"t = {weak.time:.6g} s" in str(error.value)
-    weak.check_surfaces()
-
-
-def test_contact_too_stiff_for_its_step_says_so_and_its_advice_works():
-    scene = crossed_edges().scene
-    scene = scene.replace(terms=[ds.SelfContact(1e9, WIDTH)])
-    stiff = ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT, substeps=1))
-    with pytest.raises(ds.Tunnelling, match=r"at .* rad/s is too stiff for it: take substeps of") as error:
-        stiff.run(200)
-    step = error.value.stable_dt
-    shorter = ds.SemiImplicitSolver(stiff.solver.scene, dt=step)
-    simulator = ds.Simulator(shorter)
-    simulator.run(round(3e-3 / step))
-    simulator.check_surfaces()
-
-
-@pytest.mark.parametrize("stiffness, dt", [(1.0, 1e-4), (1e-2, 4e-4), (1e7, 4e-4)])
-def test_a_throw_goes_well_when_the_advice_is_taken(stiffness, dt):
-    """Too weak a contact, steps that are too long, and both: one error, whose numbers are right."""
-    scene, of = two_blocks().scene, dict(substep=dt, stiffness=stiffness)
-
-    def throw():
-        now = scene.replace(terms=[ds.SelfContact(of["stiffness"], WIDTH)])
-        simulator = ds.Simulator(ds.SemiImplicitSolver(now, dt=of["substep"], substeps=1))
-        simulator.run(int(0.016 / of["substep"]))
-        simulator.check_surfaces()
-        return simulator
-
-    with pytest.raises(ds.Tunnelling, match="take substeps of") as error:
-        throw()
-    said = re.search(r"stiffness to (\S+) N/m", str(error.value))
-    assert (said is None) == (error.value.stiffness is None) == (stiffness > 1e3)
-    of["substep"] = float(re.search(r"substeps of (\S+) s", str(error.value))[1])
-    of["stiffness"] = float(said[1]) if said else stiffness
-    assert of["substep"] == pytest.approx(error.value.stable_dt, rel=0.01)
-    assert throw().smallest_gap() > 0
+    monkeypatch.undo()
+    step = error.value.enough
+    assert f"take substeps of {step:.3g} s" in str(error.value)
+    shorter = ds.Simulator(ds.SemiImplicitSolver(simulator.solver.scene, dt=step, substeps=1))
+    shorter.run(round(2e-3 / step))
+    shorter.check_surfaces()
 
 
 @pytest.mark.parametrize("stiffness, dt", [(1e-2, 4e-4), (1e7, 4e-4)])
 def test_the_stage_keeps_surfaces_apart_whatever_the_stiffness(stiffness, dt):
-    """Where a force is too weak or too stiff for its step by far, and says so: no intersection, momenta to round-off, no
+    """Much too weak, and much too stiff for a force in such steps: no intersection, momenta to round-off, no
     energy from nowhere but for the second order of turning surfaces."""
     mesh, scene = two_blocks().scene.mesh, two_blocks().scene
-    force = ds.SemiImplicitSolver(scene.replace(terms=[ds.SelfContact(stiffness, WIDTH)]), dt=dt, substeps=1)
-    with pytest.raises(ds.Tunnelling, match=r"or pass SelfContact\(stage=True\)"):
-        ds.Simulator(force).run(40)
-    staged = scene.replace(terms=[ds.SelfContact(stiffness, WIDTH, stage=True)])
-    simulator = ds.Simulator(ds.SemiImplicitSolver(staged, dt=dt))
+    scene = scene.replace(terms=[ds.SelfContact(stiffness, WIDTH)])
+    simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=dt))
     judge = ExactJudge(mesh.vertices, mesh.surface_triangles, (), mesh.elements, np.arange(mesh.num_vertices))
     energy, (p, L, size) = simulator.compute_energy(), momenta(simulator)
     for _ in range(8):
@@ -386,25 +347,11 @@ def test_the_stage_keeps_surfaces_apart_whatever_the_stiffness(stiffness, dt):
     assert simulator.compute_energy() <= 1.02 * energy
 
 
-def test_parts_of_the_stage_are_those_of_its_formulas(monkeypatch):
-    """What kernels find balances the pushes, and leads where the formulas lead that tangents and adjoints follow; the list
-    and its length leave no trace."""
-    act, seen, scene = PairContact._act, [], two_blocks().scene
-    scene = scene.replace(terms=[ds.SelfContact(STIFFNESS, WIDTH, friction=0.4, stage=True)])
-
-    def spy(self, at, *given):
-        act(self, at, *given)
-        one = self.kept.get(at.end)
-        for k, part in enumerate(one.parts if one else ()):
-            of = self._numbers(one, at.now)
-            found = one.solver.look(part, of)
-            after = one.solver.take(part, of, found)
-            pushed = one.solver.jacobian(part, found).T @ found.P
-            np.testing.assert_allclose(part.xi, pushed, rtol=0, atol=1e-12 * np.abs(pushed).max(initial=1e-300))
-            known = (one.parts[k + 1].e, one.parts[k + 1].b) if k + 1 < len(one.parts) else (None, one.b)
-            for x, y in zip(after, known):
-                assert y is None or np.abs(x - y).max() <= 1e-11 * max(np.abs(y).max(), 1e-300)
-            seen.append(np.abs(part.xi).max() > 0)
+@pytest.mark.parametrize("mu, speed", [(0.4, 1e-3), (1e-2, 1e-5), (1e3, 1.0)])
+def test_parts_of_the_stage_are_those_of_its_formulas(mu, speed, monkeypatch):
+    """The list and its length leave no trace."""
+    seen, scene = follow_parts(monkeypatch), two_blocks().scene
+    scene = scene.replace(terms=[ds.SelfContact(STIFFNESS, WIDTH, friction=mu, friction_speed=speed)])
 
     def frames():
         rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=4e-4, substeps=1), 24, gradients="all")
@@ -412,22 +359,11 @@ def test_parts_of_the_stage_are_those_of_its_formulas(monkeypatch):
         rollout.vjp(out, np.ones_like(out.positions))  # for which passes are recorded
         return out.positions
 
-    monkeypatch.setattr(PairContact, "_act", spy)
     first = frames()
-    assert sum(seen) > 10
-    monkeypatch.setattr(contact_stage, "PASSES", (1.0, 1.0))
-    np.testing.assert_array_equal(first, frames())
-
-
-def test_a_stage_where_there_is_none_is_refused():
-    scene = two_blocks(stage=True).scene
-    for solver in (
-        lambda: ds.SemiImplicitSolver(scene, dt=DT, contact="force"),
-        lambda: ds.VelocityVerletSolver(scene.replace(reduced={"body_0": "affine"}), dt=DT),
-    ):
-        with pytest.raises(ValueError, match="leave stage out, or take an implicit solver"):
-            solver()
-    ds.ImplicitEulerSolver(scene, dt=DT)
+    assert sum(pressed for pressed, _ in seen) > 10 and max(lost for _, lost in seen) > 1e-6
+    if mu == 0.4:
+        monkeypatch.setattr(contact_stage, "PASSES", (1.0, 1.0))
+        np.testing.assert_array_equal(first, frames())
 
 
 def test_one_per_scene_and_gap_needs_it():

@@ -230,12 +230,14 @@ def test_motion_since_the_last_forces_is_that_of_all_vertices():
     mesh = ds.TetrahedralMesh.joined([box, *(small.translated([0.3 * k, 2.0, 0]) for k in range(29))])
     precision = "f32" if runtime.arch_name() == "vulkan" else "f64"
     scene = ds.Scene(mesh, ds.Corotated(1e5, 0.3), 1000.0, [ds.SelfContact(1e3, 1e-2)], precision=precision)
-    solver = ds.SemiImplicitSolver(scene, dt=1e-5)
+    solver = ds.ImplicitEulerSolver(scene, dt=1e-5)
     workspace = solver.workspace(solver.start_values())
     pairs, surface = workspace.pairs, mesh.surface_vertices
     move = np.random.default_rng(0).normal(size=mesh.vertices.shape) * 1e-4
     runtime.fill(workspace.state.u, move[None])
     pairs.ensure(workspace.state.u, 0)
+    pairs.near = pairs.list.buffers.take("near", ti.i32, pairs.list.count)
+    pairs.look_at(pairs.motion.find, workspace.state.u, 0)
     assert pairs.builds == 2  # the list still holds: no new one was made after those of the rest shape and the start
     marked = move[surface][runtime.fetch(pairs.marked)].reshape(30, -1, 3)
     found, latest = runtime.fetch(pairs.frame), marked[:, 0].mean(0)

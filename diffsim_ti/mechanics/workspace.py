@@ -41,7 +41,6 @@ class Workspace:
     potential = None  # of implicit steps
     chambers = None  # of explicit steps
     volumes = None  # of chambers, that are held
-    stages_pairs = False  # whether pairs of surfaces act as a stage of passes, not as a force
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
     last_multipliers = None  # of constrained volumes, in implicit steps

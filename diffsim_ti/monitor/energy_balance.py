@@ -103,7 +103,7 @@ class EnergyBalance:
     def _begin(self, first: int, num_passes: int, level: float | None) -> None:
         if self.ws.arrays.features().driven:
             runtime.fill(self.ws.contact.work, 0)
-        for stage in self._constraints:
+        for stage in self._working:
             stage.work = 0.0
         self.window = Window(first, num_passes, self.ws.changes, self.ws.substep, level)
         if level is None and self.ws.arrays.features().moving:
@@ -123,7 +123,7 @@ class EnergyBalance:
     def _check(self, now: int, num_passes: int) -> None:
         window, features = self.window, self.ws.arrays.features()
         work = self._noted_work() if features.driven else 0.0
-        work += sum(stage.work for stage in self._constraints)
+        work += sum(stage.work for stage in self._working)
         if window.level is None:
             window.level = self._level_at_start(window)
         level = self._level(now, num_passes)
@@ -134,9 +134,9 @@ class EnergyBalance:
         self._begin(now, num_passes, level)
 
     @property
-    def _constraints(self) -> list:
-        """Stages that count the work of what they do to velocities."""
-        return [stage for stage in (self.ws.volumes, self.ws.projected) if stage]
+    def _working(self) -> list:
+        """Stages that count the work which they let others do."""
+        return [stage for stage in self.ws.stages if hasattr(stage, "work")]
 
     def _noted_work(self) -> float:
         """By passes, of loads, walls and what holds the body [J]."""

@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.common.copies import CarriesMore
 from diffsim_ti.common.progress import Steady
 from diffsim_ti.common.warn import warn
+from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.chatter import Chatter
@@ -130,7 +131,10 @@ class Guard:
             if balance:
                 balance.before(first, num_passes)
             self.mark(first)
-            self._pass(first, stop, num_passes, save_every, recording)
+            try:
+                self._pass(first, stop, num_passes, save_every, recording)
+            except Tunnelling as error:
+                raise self._with_stable_step(error) from None
             if self.ws.bending and self.ws.solver.explicit:
                 self.ws.bending.check(stop, runtime.fetch_row(self.ws.state.u, 0))
             if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
@@ -334,6 +338,18 @@ class Guard:
         )
         error.enough = enough
         raise error
+
+    def _with_stable_step(self, error: Tunnelling) -> Tunnelling:
+        """The same error, which advises a stable substep where the present one has outgrown the state that it was raised
+        in."""
+        stable = self._stable_step()[0] if self.ws.solver.explicit else np.inf
+        if not self.ws.substep <= stable:
+            said, error.stable_dt = str(error).rpartition(": take substeps of")[0], self._calm_substep(stable)
+            error.args = (
+                f"{said}; the substep has outgrown the stable step {stable:.3g} s of this state, whose elements are "
+                f"squeezed: take substeps of {error.stable_dt:.3g} s",
+            )
+        return error
 
     def _stable_step(self) -> tuple[float, str]:
         """The stable step of the last good state or, where that one is too far gone, of the start."""

@@ -1,6 +1,6 @@
 """What steps add to the energy of a run by themselves, apart from all that is done to it: the drift of a scheme.
 
-Kinetic energy T changes by the work W of the body's own forces, strains, weight, springs and self-contact, and by that of
+Kinetic energy T changes by the work W of the body's own forces, strains, weight and springs, and by that of
 all else: loads, supports, friction, drag, contact stages. The own forces have an energy V, and dV + W, which vanishes as
 steps become short, is the scheme's own. What is left of a change of the whole energy was done from outside, or taken.
 """
@@ -49,4 +49,4 @@ class OwnWork:
             mass = a.values.mass * (runtime.fetch(a.inverse_mass) > 0)
             u = runtime.fetch_row(ws.state.u, 0).astype(np.float64)
             out -= float((mass[:, None] * a.values.parameters[at:][:3] * (a.values.rest + u)).sum())
-        return out + (ws.pairs.look(ws.state.u)[0] if ws.pairs else 0.0)
+        return out

@@ -185,9 +185,6 @@ class Stiffness:
         w = root * self.possible(x, root)
         scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the masses
         runtime.fill(self.w, (w / scale)[None])
-        if self.ws.pairs and not self.ws.stages_pairs:
-            self.ws.pairs.ensure(self.ws.state.u, 0)
-            self.ws.pairs.product(self.ws.state.u, 0, self.w, self.ws.arrays.corner)
         a = self.ws.arrays
         a.clear_corners_of_loads()
         self._multiply(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)

@@ -102,7 +102,7 @@ class SceneArrays:
         self.parameters_of_self_contact = slice(0, 0)
         if self.self_contact:
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
-        if self.self_contact or any(term.primitives is not None for term in self.contacts):
+        if not presses and (self.self_contact or any(term.primitives is not None for term in self.contacts)):
             # each surface vertex gathers one corner more, after those of its tetrahedra
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)

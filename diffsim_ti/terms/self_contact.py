@@ -29,9 +29,9 @@ class SelfContact(Term):
     sets of vertices or tetrahedra, {("palm", "ball"): 0.6}, and other pairs have no friction; a pair whose corners are
     in several sets belongs to those of its vertex, or of each edge's first one, and of the triangle's first one.
     friction_speed [m/s]: the speed of sliding below which friction is smoothed, and with which what is held may creep:
-    mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each substep that
-    adds no energy, whatever the step (friction_kernels.py), with N as the stage of contact finds it or, where contact
-    is a force, from where the substep begins; in implicit ones a force, with N and the normal from where the step begins.
+    mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a part of the stage that adds
+    no energy, whatever the step (surfaces/contact_parts.py), with N as the stage finds it; in implicit ones a force, with
+    N and the normal from where the step begins.
     Its forces F act at the two ends of the gap d: a couple d x F, which changes angular momentum by less than the
     width times the impulse of friction. Edges that pass each other are bumps, which take energy: a slab on a slope
     went as with 0.0005 more friction at a width of 4 mm, and as with 0.0001 at 1 mm, whatever friction_speed and step.
@@ -49,17 +49,17 @@ class SelfContact(Term):
 
     Inputs with gradient: "self_contact_stiffness", "self_contact_width", with friction "self_contact_friction_speed" and
     "self_contact_friction", of a dict shape (pairs,); or "<name>.stiffness" and so on.
-    One per scene. In explicit steps it is a force, whose stiffness shortens stable steps; or with stage=True a stage that no
-    step is too large for (`contact_damping` of their solvers), as it always is beside obstacles that act by pairs: what the
-    stiffness cannot hold is lost as in an inelastic impact. A substep with near pairs then takes
-    1.5 to 6 times as long, of small bodies the most.
+    One per scene. In explicit steps it is a stage that no step is too large for (`contact_damping` of their solvers): what
+    the stiffness cannot hold is lost as in an inelastic impact. A substep with near pairs then takes several times as long
+    as one without, of small bodies the most. Of reduced sets affine ones go with it there.
+    stage: has no effect, and goes with the next version.
     Implicit solvers keep surfaces apart during the whole motion of every step; ImplicitMidpointSolver raises Tunnelling
     where the end of a step lies beyond a contact.
 
     Raises ValueError for stiffness, width or friction_speed <= 0, friction < 0, names that are no sets, sets of a dict that
     share a vertex, and, when a run starts, for a width beyond four mean edges of the surface, for primitives that touch at
-    rest, and for surfaces that touch or pass through each other. A substep in which two primitives may have passed through
-    each other raises Tunnelling.
+    rest, and for surfaces that touch or pass through each other. An explicit substep whose parts cannot be short enough to
+    keep surfaces apart raises Tunnelling.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
 
@@ -72,9 +72,14 @@ class SelfContact(Term):
         name: str | None = None,
         friction: float | Mapping[tuple[str, str], float] = 0.0,
         friction_speed: float = 1e-3,
-        stage: bool = False,
+        stage: bool | None = None,
     ):
-        self.stage = bool(stage)
+        if stage is not None:
+            warn(
+                "SelfContact: pairs are always a stage of explicit steps; leave `stage` out, which goes with the next "
+                "version",
+                DeprecationWarning,
+            )
         self.friction_pairs = tuple(friction) if isinstance(friction, Mapping) else None
         numbers("friction_speed", 0.0 if hasattr(friction_speed, "detach") else friction_speed)
         speed = positive("friction_speed", friction_speed, "m/s", "self_contact_friction_speed")

@@ -18,13 +18,21 @@ def check_bodies(scene: "Scene", contact: str) -> None:
         )
     if scene.holds_volumes:
         raise ValueError(f"{said} and FilledChamber do not go together in explicit steps: take an implicit solver")
-    self_contact = scene.term(SelfContact)
-    rough = [term for term in scene.terms if term.primitives is not None and term.has_friction]
-    rough = [self_contact] if self_contact and self_contact.has_friction else rough
-    if scene.reduced.by_basis:
-        rough += [term for term in scene.terms if term.acts_on_surface and term.has_friction]
-    if rough:
+    between = meets_between_vertices(scene)
+    if between and (scene.reduced.by_basis or any(body.rigid for body in scene.reduced.by_few)):
+        names = ", ".join(sorted({type(x).__name__ for x in between}))
+        raise ValueError(
+            f"{said} and surfaces that meet between vertices ({names}) do not go together in explicit steps, but for affine "
+            'sets: pass "affine" in place of "rigid", or take an implicit solver, or give obstacles by_pairs=False'
+        )
+    rough = [term for term in scene.terms if term.acts_on_surface and term.has_friction]
+    if rough and scene.reduced.by_basis:
         raise ValueError(
             f"{said} have no friction in {type(rough[0]).__name__} in explicit steps, which slows every vertex by itself: "
             "leave it out, or take an implicit solver"
         )
+
+
+def meets_between_vertices(scene: "Scene") -> list:
+    """Terms of a scene whose surfaces act by pairs."""
+    return [term for term in scene.terms if isinstance(term, SelfContact) or term.primitives is not None]

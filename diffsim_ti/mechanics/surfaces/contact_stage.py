@@ -22,15 +22,20 @@ from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSol
 from diffsim_ti.mechanics.surfaces.near_set import NearSet
 from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
 from diffsim_ti.mechanics.surfaces.part_kernels import TAKEN
-from diffsim_ti.mechanics.surfaces.stages import moment_of
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
-from diffsim_ti.runtime.slots import VertexRows
-from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
+from diffsim_ti.runtime.slots import VertexRows, copy_slot
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, Moment
 
 MOST_LISTS = 6  # made for one pass
 MOST_TRIES = 12  # at a pass with one list, each with the pairs that came near in the one before
 PASSES = 1.5, 15  # like this one, that a list made for it should hold for, at least and at most
 SHORTEST = 2.0**-14  # share of a pass
+
+
+def moment_of(at: Passes) -> Moment:
+    """Obstacles at the end of a pass, and where it begins."""
+    schedule = at.ws.solver.schedule
+    return Moment(schedule, at.j, schedule.end(at.j), schedule.begin(at.j))
 
 
 @dataclass
@@ -40,6 +45,7 @@ class ContactPass:
     near: NearPairs
     numbers: np.ndarray  # of the pairs in the list
     nodes: np.ndarray
+    points: np.ndarray
     pairs: np.ndarray
     rest: tuple  # of pairs: plane and weights at rest, which coefficient of friction
     start: np.ndarray
@@ -58,37 +64,100 @@ class ContactPass:
         plane, weights, own = self.rest
         own = SimpleNamespace(**{name: x[chosen] for name, x in vars(own).items()})
         rest = plane[chosen], weights[chosen], own
-        return ContactPass(near, self.numbers[chosen], self.nodes, self.pairs[chosen], rest, start[self.nodes], u, v)
+        given = near, self.numbers[chosen], self.nodes, self.points, self.pairs[chosen], rest
+        return ContactPass(*given, start[self.nodes], u, v)
 
 
 class PairContact(Stage):
-    """The stage, of the pairs of a workspace (surface_pairs.py, curved_pairs.py)."""
+    """The stage, of the pairs of a workspace (surface_pairs.py, curved_pairs.py).
+
+    Nodes are vertices of surfaces and of affine sets, corners of obstacles, and then four of each affine set: its vertices
+    move by u = B q (terms/reduced.py), and rows of C say points by q in their place.
+    """
 
     def __init__(self, pairs, damping: float):
         self.damping = damping
         self.pairs, self.inner, self.a = pairs, getattr(pairs, "inner", pairs), pairs.a
         a, mesh = self.a, self.a.mesh
         self.matrix, self.obstacles = getattr(pairs, "matrix", None), pairs.obstacles
-        self.rows, num_nodes = VertexRows(a, mesh.surface_vertices), mesh.num_vertices
-        self.num_own = len(mesh.surface_vertices)
-        self.nodes = mesh.surface_vertices  # of bodies; corners of obstacles, of infinite mass, follow all vertices
+        self.sets = a.bodies.bodies if a.bodies else ()
+        own = np.unique(np.concatenate([mesh.surface_vertices, *(x.vertices for x in self.sets)]))
+        self.rows, self.num_own = VertexRows(a, own), len(own)
+        num_corners = 0
         if self.obstacles:
-            num_nodes += self.obstacles.corners.count
-            self.matrix = self.pairs.finer.mesh.with_corners
-            self.nodes = np.append(self.nodes, np.arange(mesh.num_vertices, num_nodes))
+            num_corners, self.matrix = self.obstacles.corners.count, self.pairs.finer.mesh.with_corners
+        self.first_set, num_nodes = self.num_own + num_corners, mesh.num_vertices + num_corners + 4 * len(self.sets)
+        self.nodes = np.append(own, np.arange(mesh.num_vertices, num_nodes))  # numbers of the others follow vertices
         self.node_place = np.full(num_nodes, -1)
         self.node_place[self.nodes] = np.arange(len(self.nodes))
+        self.members = [self.node_place[x.vertices] for x in self.sets]
+        self.moves = self._moves(mesh.num_vertices + num_corners) if self.sets else self.matrix
         self.kept: dict[int, ContactPass | None] = {}
+        self.work = 0.0  # done by what moves obstacles and held vertices, as they press [J]
         self.partly_fixed = bool(len(a.supports.partly_fixed))
         self.free = a.supports.freedom(num_nodes) if self.partly_fixed else None
-        self.numbers, self.rough = PairNumbers(self.inner), self.inner.friction is not None
-        runtime.fill(a.corner, 0)
+        self.numbers, self.rough = PairNumbers(self.inner), self.inner.has_friction
         corners = self.inner.a.first_contact_corner + self.inner.list.num_surface
         self.scratch = runtime.array(self.inner.kernels.vec4, corners)  # for forces, which are not looked at
         self.begin = runtime.array(a.vector, 1, a.num_vertices)
         self.set, self.whole = NearSet(self.inner), None  # pairs that have been near, and what there is to know of them
         runtime.fill(self.begin, 0)
         self.clear()
+
+    # ---- nodes ---------------------------------------------------------------------------------------------------------
+
+    def _moves(self, count: int):
+        """C of points, (points, nodes by number), with all four entries of each set that a point belongs to."""
+        from scipy.sparse import coo_matrix, identity
+
+        whole = (identity(count, format="csr") if self.matrix is None else self.matrix).tocoo()
+        kept = ~np.isin(whole.col, np.concatenate([x.vertices for x in self.sets]))
+        rows, columns, data = ([x[kept]] for x in (whole.row, whole.col, whole.data))
+        for k, x in enumerate(self.sets):
+            B = whole.tocsr()[:, x.vertices] @ x.basis
+            points = np.flatnonzero(abs(whole.tocsr()[:, x.vertices]).sum(1))
+            rows.append(np.repeat(points, 4))
+            columns.append(np.tile(count + 4 * k + np.arange(4), len(points)))
+            data.append(B[points].ravel())
+        shape = whole.shape[0], count + 4 * len(self.sets)
+        out = coo_matrix((np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))), shape).tocsr()
+        out.sort_indices()
+        return out
+
+    def _all(self, own: np.ndarray, corners: np.ndarray | None) -> np.ndarray:
+        """Of all nodes, from displacements of vertices and of corners of obstacles."""
+        more = [corners] if self.obstacles else []
+        more += [x.basis.T @ own[at] for x, at in zip(self.sets, self.members)]
+        return np.concatenate([own, *more]) if more else own
+
+    def _all_vjp(self, places: np.ndarray, by: np.ndarray, out: np.ndarray) -> None:
+        """Add the adjoint of vertices for that of some nodes."""
+        own = places < self.num_own
+        out[places[own]] += by[own]
+        for x, at, here in self._of_sets(places):
+            out[at] += x.basis @ by[here]
+
+    def _add(self, x: np.ndarray, places: np.ndarray, change: np.ndarray) -> None:
+        """Add to vertices what some nodes changed by."""
+        own = places < self.num_own
+        x[places[own]] += change[own]
+        for body, at, here in self._of_sets(places):
+            x[at] += body.basis @ change[here]
+
+    def _add_vjp(self, places: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """The adjoint of such changes."""
+        out, own = np.zeros((len(places), 3)), places < self.num_own
+        out[own] = by[places[own]]
+        for x, at, here in self._of_sets(places):
+            out[here] = x.basis.T @ by[at]
+        return out
+
+    def _of_sets(self, places: np.ndarray):
+        """(the set, places of its vertices, which four of the nodes are its) of those that have nodes there."""
+        for k, (x, at) in enumerate(zip(self.sets, self.members)):
+            here = np.flatnonzero((places - self.first_set) // 4 == k)
+            if len(here):
+                yield x, at, here
 
     # ---- passes --------------------------------------------------------------------------------------------------------
 
@@ -101,13 +170,14 @@ class PairContact(Stage):
         fine = self._fine(u, at.slot)
         inner.forces(*fine, self.scratch)
         corners = self.obstacles.displacements if self.obstacles else None
-        start = None if at.stride else self.rows.get(u, at.slot)  # which the drift replaces
+        if not at.stride:
+            copy_slot(u, at.slot, self.begin, 0)  # which the drift replaces
         yield
         self._follow(at, AT_STAGE)
         if at.stride:
             self.kept[at.end] = None
         try:
-            self._act(at, start, corners)
+            self._act(at, corners)
         except Tunnelling as error:
             raise at.ws.dated(error, at.j, at.num_passes) from None
 
@@ -117,28 +187,26 @@ class PairContact(Stage):
             self.pairs.follow(self.a.poses.value(self.a.rows["path"], moment_of(at)), m)
 
     def _fine(self, u, slot: int) -> tuple:
-        return (u, slot) if self.matrix is None else (self.pairs.fine(u, slot), 0)
+        return (u, slot) if self.pairs is self.inner else (self.pairs.fine(u, slot), 0)
 
     def _look(self, u, slot: int) -> tuple[bool, bool, bool]:
         """Whether the list does not hold where the pass led, whether pairs beyond it may have crossed, and whether pairs of
         it may be near."""
         inner = self.inner
         inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
-        bodies = dict(num_bodies=inner.num_bodies, markers=inner.markers, **inner.sizes_of_sums)
-        inner.run(inner.motion.find, dict(u=u), slot=slot, lost=0.5 * inner.least_width, **bodies)
-        return tuple(bool(x) for x in whole(inner.flags))
+        return inner.look_at(inner.motion.find, u, slot)
 
-    def _act(self, at: Passes, start: np.ndarray | None, corners: np.ndarray | None) -> None:
-        """What contact does to a pass, anew with a longer list where one does not hold to the end. start, corners:
-        displacements where it begins, of the body where the record has none, and of obstacles."""
+    def _act(self, at: Passes, corners: np.ndarray | None) -> None:
+        """What contact does to a pass, anew with a longer list where one does not hold to the end. corners: displacements of
+        those of obstacles where it begins."""
         inner, history, own = self.inner, at.history, slice(self.num_own)
         stale, lost, any_near = self._look(*self._fine(history.u, at.end))
         now, acts = at.now if stale or any_near else None, False
         if now and now.alpha > 0:
-            start = self.rows.get(history.u, at.slot) if start is None else start
+            before = (history.u, at.slot) if at.stride else (self.begin, 0)
+            start = self._all(self.rows.get(*before), corners)
             u, v = self.rows.get(history.u, at.end), self.rows.get(history.v, at.end)
-            if self.obstacles:
-                start, u = np.concatenate([start, corners]), np.concatenate([u, self.obstacles.displacements])
+            u = self._all(u, self.obstacles.displacements if self.obstacles else None)
             acts = bool(np.isfinite(u).all())  # else the guard of the run will say so
         one, needed = None, 0.0
         for _ in range(MOST_LISTS if acts else 0):
@@ -147,9 +215,8 @@ class PairContact(Stage):
                 needed = np.maximum(needed, 1.1 * inner.travel(moved - runtime.fetch(inner.before)))
                 self.rows.put(history.u, at.end, u[own])
                 self.rows.put(history.v, at.end, v)
-                self.rows.put(self.begin, 0, start[own])
                 self._follow(at, AT_BEGIN)
-                begin = self._fine(self.begin, 0)
+                begin = self._fine(*before)
                 inner.build(*begin, wanted=self._passes(needed) * needed, needed=needed)
                 inner.forces(*begin, self.scratch)
                 self._follow(at, AT_STAGE)
@@ -160,6 +227,7 @@ class PairContact(Stage):
             if not lost:
                 break
         inner.age += 1
+        self.work += self.set.work if acts and any_near else 0.0
         if lost and acts:
             self._refuse(at, now)
         if at.stride:
@@ -183,16 +251,18 @@ class PairContact(Stage):
             if not near.holds(flagged):
                 self._extend(flagged, now)
             place = self.whole.nodes
-            motion, own = u[place] - start[place], place < self.num_own
-            near.begin(self.rest + start[place], anew=tries == 0)
+            motion = u[place] - start[place]
+            near.begin(start[place], anew=tries == 0)
             if not near.choose(led_to[place] - start[place]):
                 break
             near.start(motion)
             parts = self._go(at, now, recording)
             e, b = near.moved
             led_to, v_next = u.copy(), v.copy()
-            led_to[place[own]] += e[own]
-            v_next[place[own]] += now.decay * b[own]
+            self._add(led_to, place, e)
+            if self.sets:
+                led_to = self._all(led_to[: self.num_own], led_to[self.num_own : self.first_set])
+            self._add(v_next, place, now.decay * b)
             self.rows.put(at.history.u, at.end, led_to[: self.num_own])
             self.rows.put(at.history.v, at.end, v_next)
             _, lost, _ = self._look(*self._fine(at.history.u, at.end))
@@ -211,11 +281,7 @@ class PairContact(Stage):
         if self.set.builds == inner.builds:
             close[self.set.numbers] = True
         numbers = np.flatnonzero(close)
-        self.whole, a = self._pass(numbers), self.a
-        rest = a.values.rest - a.origin
-        if self.obstacles:
-            rest = np.concatenate([rest, self.obstacles.corners.made(a.values.parameters.astype(float))])
-        self.rest = rest[self.nodes[self.whole.nodes]]
+        self.whole = self._pass(numbers)
         self.whole.u = np.zeros((len(self.nodes), 3))
         self.whole.start = self.whole.u[self.whole.nodes]
         self.set.fill(self.whole, self._numbers(self.whole, now))
@@ -256,16 +322,19 @@ class PairContact(Stage):
         scale = np.zeros(len(numbers))
         scale[edges] = whole(inner.list.scale)[numbers[edges] - inner.list.num_vt]
         points, local = np.unique(corners, return_inverse=True)
-        C, nodes = None, points
-        if self.matrix is not None:
-            C = self.matrix[points]
+        C, nodes, sets = None, points, np.zeros((0, 4), int)
+        if self.moves is not None:
+            C = self.moves[points]
             nodes = np.unique(C.indices)
             C = C[:, nodes].tocsr()
+            C.sort_indices()
+        if self.sets:
+            sets = np.flatnonzero(nodes >= len(self.node_place) - 4 * len(self.sets)).reshape(-1, 4)
         free = None if self.free is None else self.free[nodes]
-        near = NearPairs(local.reshape(-1, 4), edges, scale, len(points), C, free)
+        near = NearPairs(local.reshape(-1, 4), edges, scale, len(points), C, free, sets)
         rest = whole(inner.rest_plane)[numbers].astype(float), whole(inner.rest_weights)[numbers].astype(float)
         place = self.node_place[nodes]
-        return ContactPass(near, numbers, place, corners, (*rest, self.numbers.of(numbers, corners)), None)
+        return ContactPass(near, numbers, place, points, corners, (*rest, self.numbers.of(numbers, corners)), None)
 
     def _numbers(self, one: ContactPass, now, changes=None) -> SimpleNamespace:
         """What parts read; changes: of it, as imaginary parts of the size `TINY`."""
@@ -275,8 +344,10 @@ class PairContact(Stage):
         if self.obstacles:
             corners = self.obstacles.corners
             rest, radius = np.concatenate([rest, corners.made(numbers)]), np.append(0.0, corners.radii(numbers))
-            mass, inverse_mass = (np.append(x, np.zeros(corners.count)) for x in (mass, inverse_mass))
+            mass = np.append(mass, np.zeros(corners.count))
             radius = radius[own.contact]
+        mass = np.append(mass, np.zeros(4 * len(self.sets)))
+        inverse_mass = np.append(inverse_mass, np.zeros(len(mass) - len(inverse_mass)))
         start, end, h_alpha, D = one.start, one.u[one.nodes], now.alpha, one.rest[0][:, 3]
         if changes is not None:
             numbers, rest, mass = numbers + changes.parameters, rest + changes.rest, mass + changes.mass
@@ -290,11 +361,19 @@ class PairContact(Stage):
         mu, with_friction = np.zeros(len(one.pairs), numbers.dtype), own.mu >= 0
         mu[with_friction] = numbers[own.mu[with_friction]]
         speed = np.where(with_friction, numbers[own.speed], 1.0)
+        rest = rest[one.points] if self.matrix is None else self.matrix[one.points] @ rest
+        coupled, wall = self._coupled(one.nodes, mass), mass[self.a.mesh.surface_vertices].mean()
         return SimpleNamespace(
-            x=rest[nodes] + start, motion=end - start, inverse=inverse, h=now.h, alpha=h_alpha, stiffness=k / share,
-            width=share * W, mu=mu, speed=speed, wall=mass[self.a.mesh.surface_vertices].mean(), rough=self.rough,
+            x=start, rest=rest, motion=end - start, inverse=inverse, coupled=coupled, h=now.h, alpha=h_alpha, wall=wall,
+            stiffness=k / share, rough=self.rough,
+            width=share * W, mu=mu, speed=speed,
             share=share, k=k, W=W, D=D, radius=radius, seeds=(),
         )  # fmt: skip
+
+    def _coupled(self, places: np.ndarray, mass: np.ndarray) -> np.ndarray:
+        """Inverse masses of affine sets, (B^T M B)^-1, shape (sets, 4, 4)."""
+        every = [x.basis.T @ (mass[x.vertices][:, None] * x.basis) for x, _, _ in self._of_sets(places)]
+        return np.linalg.inv(np.array(every)) if every else np.zeros((0, 4, 4))
 
     @property
     def inverse(self) -> np.ndarray:
@@ -314,21 +393,23 @@ class PairContact(Stage):
                     self._refuse(at, now)
                 continue
             if recording:
-                parts.append(Part(begin, share, damping, *before, self.set.solution))
+                parts.append(Part(begin, share, damping, *before, self.set.pushes))
             begin, share, shortened = begin + share, share if shortened else 2 * share, False
         return parts
 
     def _refuse(self, at: Passes, now) -> None:
+        """Raise Tunnelling, the state's displacements being those where the pass begins."""
         inner, surface = self.inner, self.inner.mesh.surface_vertices
         moved = runtime.fetch_row(*self._fine(at.history.u, at.end))[surface] - runtime.fetch(inner.before)
         ways = np.linalg.norm(moved - moved.mean(0), axis=1)
         i, h = int(ways.argmax()), now.h
         inner.fresh = False
+        copy_slot(*((at.history.u, at.slot) if at.stride else (self.begin, 0)), at.ws.state.u, 0)
         error = Tunnelling(
             f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep "
             f"of {h:.3g} s, {ways[i] / h:.3g} m/s at vertex {surface[i]}: take substeps of {0.25 * h:.3g} s"
         )
-        error.stable_dt, error.stiffness = 0.25 * h, None
+        error.stable_dt = 0.25 * h
         raise error
 
     @property
@@ -354,13 +435,14 @@ class PairContact(Stage):
         after, change = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         rest = runtime.fetch(run.numbers.rest).astype(float) if t.rest is None else np.asarray(t.rest, float)
         parameters = np.asarray(t.parameters, float)[: len(self.a.values.parameters)]
-        rate, first, last, mass, radius = run.rate_dot, before, after, t.mass, np.zeros(1)
+        rate, at_begin, at_end, mass, radius = run.rate_dot, None, None, t.mass, np.zeros(1)
         if self.obstacles:
             poses = self.a.poses.jvp(self.a.rows["path"], t.path, moment_of(at))
             at_end, at_begin, _ = self.obstacles.changes(parameters, poses)
-            first, last = np.concatenate([before, at_begin]), np.concatenate([after, at_end])
             rest, mass = (np.concatenate([x, np.zeros((len(at_end), *x.shape[1:]))]) for x in (rest, mass))
             radius = np.append(0.0, self.obstacles.corners.radii_jvp(self.a.values.parameters, parameters))
+        first, last = self._all(before, at_begin), self._all(after, at_end)
+        mass = np.append(mass, np.zeros(4 * len(self.sets)))
         dots = SimpleNamespace(
             parameters=tiny * parameters, rest=tiny * rest, mass=tiny * mass, radius=tiny * radius,
             start=tiny * first[one.nodes], end=tiny * last[one.nodes], alpha=tiny * rate * now.alpha_by_rate,
@@ -370,15 +452,14 @@ class PairContact(Stage):
         e = b = np.zeros_like(of.motion)
         looks = []
         for part in one.parts:
-            own = Part(part.begin, part.share, part.c, e, b, part.xi)
+            own = Part(part.begin, part.share, part.c, e, b, part.P)
             looks.append((own, one.solver.look(own, of)))
             e, b = one.solver.take(own, of, looks[-1][1])
         if run.impulses:
             self._note(run.impulses, at, one, of, looks, changes=True)
         decay = now.decay + tiny * rate * now.decay_by_rate
-        own = one.nodes < self.num_own
-        after[one.nodes[own]] += e[own].imag / 1e-30
-        change[one.nodes[own]] += (decay * b[own]).imag / 1e-30
+        self._add(after, one.nodes, e.imag / 1e-30)
+        self._add(change, one.nodes, (decay * b).imag / 1e-30)
         self.rows.put(run.u, 0, after)
         self.rows.put(run.v, 0, change)
 
@@ -395,36 +476,36 @@ class PairContact(Stage):
         p, q = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         of = self._numbers(one, now)
         of.seeds = self._seeds(run.impulses, at, one)
-        own, count = one.nodes < self.num_own, len(one.nodes)
-        nodes = one.nodes[own]
+        count = len(one.nodes)
         adj = SimpleNamespace(
             x=np.zeros_like(of.motion), motion=np.zeros_like(of.motion), inverse=np.zeros(count), alpha=0.0,
+            rest=np.zeros_like(of.rest), coupled=np.zeros_like(of.coupled),
             stiffness=np.zeros(len(one.pairs)), width=np.zeros(len(one.pairs)), mu=np.zeros(len(one.pairs)),
             speed=np.zeros(len(one.pairs)), radius=np.zeros(len(one.pairs)), wall=0.0,
         )  # fmt: skip
-        e_adj, b_adj = np.zeros((2, count, 3))
-        e_adj[own], b_adj[own] = p[nodes], now.decay * q[nodes]
-        by_decay = fsum((q[nodes] * one.b[own]).ravel())  # whatever other nodes the set has, which add zeros
+        e_adj, b_adj = self._add_vjp(one.nodes, p), self._add_vjp(one.nodes, q)
+        by_decay = fsum((b_adj * one.b).ravel())  # whatever other nodes the set has, which add zeros
+        b_adj = now.decay * b_adj
         for part in one.parts[::-1]:
             e_adj, b_adj = one.solver.back(part, of, e_adj, b_adj, adj)
         self.by_rate += now.alpha_by_rate * adj.alpha + now.decay_by_rate * by_decay
-        by_start = (adj.x - adj.motion)[own]
-        p[nodes] += adj.motion[own]
+        self._all_vjp(one.nodes, adj.motion, p)
         self.rows.put(run.u, 0, p)
-        self._add(one, of, adj, own)
+        self._add_numbers(one, of, adj)
         if self.obstacles:
-            self._add_obstacles(at, one, adj, own)
+            self._add_obstacles(at, one, adj)
         with self._alone(at, one):
             yield
         p = self.rows.get(run.u, 0)
-        p[nodes] += by_start
+        self._all_vjp(one.nodes, adj.x - adj.motion, p)
         self.rows.put(run.u, 0, p)
 
-    def _add_obstacles(self, at: Passes, one: ContactPass, adj, own: np.ndarray) -> None:
+    def _add_obstacles(self, at: Passes, one: ContactPass, adj) -> None:
         """Adjoints of where corners of obstacles were, and of radii."""
-        obstacles, place = self.obstacles, one.nodes[~own] - self.num_own
+        theirs = (one.nodes >= self.num_own) & (one.nodes < self.first_set)
+        obstacles, place = self.obstacles, one.nodes[theirs] - self.num_own
         by_begin, by_end = np.zeros((2, obstacles.corners.count, 3))
-        by_begin[place], by_end[place] = (adj.x - adj.motion)[~own], adj.motion[~own]
+        by_begin[place], by_end[place] = (adj.x - adj.motion)[theirs], adj.motion[theirs]
         obstacles.add_places(by_begin, AT_BEGIN)
         obstacles.add_places(by_end, AT_STAGE)
         by_radii = np.zeros(1 + len(obstacles.corners.parts))
@@ -434,13 +515,15 @@ class PairContact(Stage):
         if self.by_path is not None:
             self.a.poses.vjp(self.a.rows["path"], by_rows, moment_of(at), self.by_path)
 
-    def _add(self, one: ContactPass, of, adj, own: np.ndarray) -> None:
+    def _add_numbers(self, one: ContactPass, of, adj) -> None:
         """Adjoints of the numbers, of masses and of the rest shape."""
-        surface = self.a.mesh.surface_vertices
+        surface, own = self.a.mesh.surface_vertices, one.nodes < self.num_own
         nodes, numbers = self.nodes[one.nodes[own]], one.rest[2]
         self.by_mass[nodes] -= (of.inverse**2 * adj.inverse)[own]
+        for W, by_W, (x, _, _) in zip(of.coupled, adj.coupled, self._of_sets(one.nodes)):
+            self.by_mass[x.vertices] -= np.einsum("na,ab,nb->n", x.basis, W @ by_W @ W, x.basis)
         self.by_mass[surface] += adj.wall / len(surface)
-        self.by_rest[nodes] += adj.x[own]
+        self.by_fine_rest[one.points] += adj.rest
         # stiffness k / share, width share W, share = min(1, D / (2 W))
         by_share = np.where(of.share < 1, of.W * adj.width - of.k / of.share**2 * adj.stiffness, 0)
         np.add.at(self.by_numbers, numbers.stiffness, numbers.area * adj.stiffness / of.share)
@@ -458,7 +541,7 @@ class PairContact(Stage):
     def clear(self) -> None:
         a, path = self.a, self.a.rows.get("path")
         self.by_numbers, self.by_mass, self.by_rate = np.zeros(len(a.values.parameters)), np.zeros(a.num_vertices), 0.0
-        self.by_rest, self.by_fine_rest = np.zeros((a.num_vertices, 3)), np.zeros((self.inner.mesh.num_vertices, 3))
+        self.by_fine_rest = np.zeros((self.inner.mesh.num_vertices, 3))
         self.by_path = np.zeros(path.shape) if self.obstacles and path is not None else None
         if self.obstacles:
             self.obstacles.clear()
@@ -472,7 +555,7 @@ class PairContact(Stage):
             out.parameters += self.obstacles.by_parameters
         if self.by_path is not None:
             out.path += self.by_path
-        out.rest = self.by_rest + by_fine + out.rest
+        out.rest = by_fine + out.rest
         out.mass = out.mass + self.by_mass
         drag = self.a.features().drag
         if drag >= 0:

@@ -11,7 +11,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import Launches
-from diffsim_ti.mechanics.surfaces.curved_friction import friction_of
+from diffsim_ti.mechanics.surfaces.curved_friction import CurvedLaggedFriction
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleCorners, ObstacleMotion, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
@@ -154,7 +154,7 @@ class CurvedPairs:
         self._row, self._rest_dot = runtime.array(vector, 1, n), runtime.array(vector, surface.num_vertices)
         self.step, self.next = runtime.array(vector, 1, n), runtime.array(vector, 1, n)
         self._launch = Launches()
-        self.friction = friction_of(self)
+        self.friction = CurvedLaggedFriction(self) if self.inner.friction else None
 
     # ---- between nodes and points ------------------------------------------------------------------------------------
 
@@ -234,9 +234,6 @@ class CurvedPairs:
 
     def ensure(self, u, slot: int) -> None:
         self.inner.ensure(self.fine(u, slot), 0)
-
-    def check_pass(self, u, slot: int, h: float) -> None:
-        self.inner.check_pass(self.fine(u, slot), 0, h)
 
     def look(self, u) -> tuple[float, float]:
         return self.inner.look(self.fine(u, 0))

@@ -126,7 +126,7 @@ class ImplicitPairs(SurfacePairs):
     def _holds(self, u: np.ndarray) -> bool:
         """Whether the list holds at u, to where `next` goes."""
         runtime.fill(self.next, u[None])
-        return self.fresh and not self.check(self.next, 0, 0, 0)[0]
+        return self.holds(self.next, 0)
 
     def _shares(self, most: float) -> np.ndarray:
         """Of the step from `next` on, of each pair, where `forces` were exact."""

@@ -1,19 +1,23 @@
 """Friction between surfaces in implicit passes: a force with a potential, from what presses where the pass begins."""
 
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
+import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import whole
+from diffsim_ti.mechanics.surfaces.friction_kernels import FrictionKernels
 from diffsim_ti.mechanics.surfaces.friction_product import FrictionProduct
-from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
+from diffsim_ti.runtime import kernels_of
 from diffsim_ti.terms.obstacles.friction import ARRAYS, dissipated, slip
+from diffsim_ti.terms.self_contact import SelfContact
 
 TINY = 1e-300
 
 
-class LaggedFriction(PairFriction):
+class LaggedFriction:
     """Of the pairs that press with N at the first displacement of a pass, with the weights w and the normal n there.
 
     A pair slides with t = (I - n n^T) sum_i w_i v_i, v = (u - x) / gamma, and its corners feel
@@ -22,13 +26,33 @@ class LaggedFriction(PairFriction):
     """
 
     def __init__(self, pairs):
-        super().__init__(pairs)
+        self.pairs, a = pairs, pairs.a
+        self.a, self.num_surface = a, len(a.mesh.surface_vertices)
+        labels, rows = np.zeros(self.num_surface, int), np.full((1, 1), -1)
+        if pairs.term and pairs.term.has_friction:
+            labels, rows = pairs.term.labels(a.mesh)
+        self.num_rows, row_of = int(rows.max()) + 1, rows.ravel()
+        if pairs.contacts:
+            self.num_rows, row_of = len(pairs.contacts.mu), np.concatenate([row_of, pairs.contacts.row_of])
+        self.kernels = kernels_of(FrictionKernels, a.precision, pairs.first, pairs.parallel, len(rows))
+        self.own = SimpleNamespace(label=runtime.upload(labels, ti.i32), row_of=runtime.upload(row_of, ti.i32))
+        self.adjoints = None
         self.corners, self.w, self.n = np.zeros((0, 4), int), np.zeros((0, 4)), np.zeros((0, 3))
         self.L, self.x, self.per_gamma = np.zeros(0), np.zeros((self.a.num_vertices, 3)), 1.0
         self.by_speed, self.u_begin = np.zeros(len(self.speeds_at)), None
         self.contact = np.zeros(0, int)  # its number of each pair
         self._product, self._is_put = FrictionProduct(pairs), False
         self._bounded = False  # of each pair whether its stiffness is that of `bounded`
+
+    def make_room(self) -> None:
+        """Arrays of a new list."""
+        self.take("weights", "pressing")
+
+    def take(self, *names: str, scalar: bool = False) -> None:
+        """Arrays of all pairs of the list, by name."""
+        for name in names:
+            dtype = self.a.fp if scalar else self.pairs.kernels.vec4
+            setattr(self.own, name, self.pairs.list.buffers.take(f"{name} of friction", dtype, self.pairs.list.count))
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
         """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above."""
@@ -72,8 +96,10 @@ class LaggedFriction(PairFriction):
         self.L, self._is_put = pressing, False
 
     def _measure_here(self) -> None:
-        self.pairs.forces(self.pairs.next, 0, self.a.corner)
-        self.measure(self.pairs.next, 0)
+        pairs = self.pairs
+        pairs.forces(pairs.next, 0, self.a.corner)
+        if pairs.list.count:
+            pairs.run(self.kernels.measure, dict(u=pairs.next), self.own, slot=0)
 
     @property
     def speed(self) -> np.ndarray:
@@ -86,7 +112,7 @@ class LaggedFriction(PairFriction):
         relative = np.einsum("pk,pkd->pd", self.w, v)
         t = self._across(relative)
         s = np.linalg.norm(t, axis=1)
-        kappa, _, _, slope = slip(s, 0, eps, TINY, ARRAYS)
+        kappa, _, _, slope = slip(s, 0, eps, ARRAYS)
         return v, relative, t, s, t / np.maximum(s, TINY)[:, None], kappa, slope
 
     def _across(self, x: np.ndarray) -> np.ndarray:
@@ -142,13 +168,23 @@ class LaggedFriction(PairFriction):
         self.pairs.begin(self.u_begin)
         self._measure_here()
 
+    def _change_here(self, numbers) -> None:
+        """Changes of what presses, for those of where the pass begins, pairs.step, and `numbers`."""
+        self.take("weights_dot", "pressing_dot")
+        at = dict(u=self.pairs.next, w=self.pairs.step, rest_dot=numbers.rest, parameters_dot=numbers.parameters)
+        if self.pairs.contacts:
+            parameters = runtime.fetch(numbers.parameters)[: len(self.a.values.parameters)].astype(np.float64)
+            self.pairs.contacts.load_change(self.a.values.parameters, parameters)
+            at |= dict(numbers_dot=self.pairs.contacts.numbers_dot)
+        self.pairs.run(self.kernels.measure_jvp, at, self.own, slot=0)
+
     def jvp(
         self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers, only=None
     ) -> np.ndarray:
         """Change of the forces for those of u, of x, of where the pass begins, and of `numbers`, a Tangent."""
         self._back_to_begin()
         runtime.fill(self.pairs.step, du_begin[None])
-        self.changes(self.pairs.next, 0, self.pairs.step, numbers)
+        self._change_here(numbers)
         d_pressing = whole(self.own.pressing_dot)[self.felt].astype(np.float64)
         dw, dn, dL = whole(self.own.weights_dot)[self.felt].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
         d_speed = runtime.fetch(numbers.parameters)[self.speeds_at][self.contact]
@@ -178,15 +214,42 @@ class LaggedFriction(PairFriction):
         self._back_to_begin()
         pressing_adj = np.concatenate([n_adj, -kappa[:, None] * _dot(t, r_adj)], 1)
         by_begin = np.zeros_like(by_u)
-        by_begin[self.a.mesh.surface_vertices] = self._pull_back(self.pairs.next, 0, self.felt, w_adj, pressing_adj)
+        by_begin[self.a.mesh.surface_vertices] = self._pull_back(w_adj, pressing_adj)
         return by_u, -by_u, by_begin
 
+    def _pull_back(self, w_adj: np.ndarray, pressing_adj: np.ndarray) -> np.ndarray:
+        """Adjoint of where the pass begins at surface vertices for those of the weights and of (n, mu N) of the pairs that
+        press; adds those of the numbers and of the rest shape."""
+        self.take("weights_adj", "pressing_adj")
+        self.take("mu_adj", scalar=True)
+        for array, data in ((self.own.weights_adj, w_adj), (self.own.pressing_adj, pressing_adj)):
+            every = np.zeros((array.shape[0], 4))
+            every[self.felt] = data
+            runtime.fill(array, every)
+        at = dict(place=self.pairs.next, **self.adjoints)
+        self.pairs.run(self.kernels.measure_vjp, at, self.own, slot=0, begin=0, num_rows=self.num_rows)
+        return runtime.fetch(self.adjoints["by_place"])
+
     def clear_sums(self) -> None:
-        super().clear_sums()
+        """Begin a reverse sweep."""
+        if self.adjoints is None:
+            n, a = self.num_surface, self.a
+            self.adjoints = dict(by_mu=runtime.array(a.fp, n * self.num_rows), by_place=runtime.array(a.vector, n))
+        runtime.fill(self.adjoints["by_mu"], 0)
         self.by_speed[:] = 0
 
+    @property
+    def speeds_at(self) -> np.ndarray:
+        """Where the friction speed of each contact stands among the parameters."""
+        if self.pairs.contacts:
+            return self.pairs.contacts.rows[:, 2]
+        return np.array([self.pairs.first + SelfContact.index.friction_speed])
+
     def collect(self, out: np.ndarray) -> None:
-        super().collect(out)
+        """Adds the adjoints of friction speeds and coefficients to those of all parameters, float64."""
+        by_mu = whole(self.adjoints["by_mu"]).astype(np.float64)[: self.num_surface * self.num_rows]
+        contacts, first = self.pairs.contacts, self.pairs.first + SelfContact.index.friction
+        out[contacts.mu if contacts else slice(first, first + self.num_rows)] += by_mu.reshape(-1, self.num_rows).sum(0)
         np.add.at(out, self.speeds_at, self.by_speed)
 
 

@@ -10,16 +10,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.surfaces.listed_pair import (
-    MARGIN,
-    OPPOSITE,
-    SAFE,
-    ListedPair,
-    behind,
-    between,
-    first_of,
-    three,
-)
+from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, behind, between, first_of, three
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
 
@@ -106,37 +97,30 @@ class MotionKernels(ListedPair):
         return most
 
     @ti.func
-    def check_all(self, scene: A, at: A, plan: A):
+    def clear_flags(self, scene: A):
         for k in ti.static(range(3)):
             scene.flags[k] = 0
+
+    @ti.func
+    def hold_all(self, scene: A, at: A, plan: A):
+        self.clear_flags(scene)
         self.follow_frames(scene, at, plan)
         self.compare_slacks(scene, at, plan)
-        self.find_farthest(scene, at, plan)
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                room = ti.cast(SAFE, self.fp) * scene.plane[p][3]
-                if not scene.farthest[0] <= room:
-                    if not self.closing(kind, p, scene, at, plan) <= room:
-                        scene.flags[2] = 1
 
     @cached_property
-    def check(self) -> Kernel:
-        """flags: a vertex has used up its slack (0), or that and `lost` (1); a pair may have crossed (2)."""
-        own = dict(body="ints", marked="ints", flags="ints", slack="vectors", frame="vectors", farthest="scalars")
+    def holds(self) -> Kernel:
+        """flags: a vertex has used up its slack (0), or that and `lost` (1)."""
+        return self._kernel("holds", self.hold_all)
+
+    def _kernel(self, name: str, body, **own: str) -> Kernel:
+        own |= dict(body="ints", marked="ints", flags="ints", slack="vectors", frame="vectors", farthest="scalars")
         own |= dict(before="vectors", built="vectors")
-        numbers = dict.fromkeys(
-            ("num_bodies", "markers", "body_block", "body_blocks", "blocks", "size", "number"), "int"
-        )
-        numbers |= dict(lost="float")
-        return self.kernel("check", self.check_all, dict(u="vectors2"), own, **numbers)
+        sizes = "num_bodies", "markers", "body_block", "body_blocks", "blocks", "size", "number"
+        return self.kernel(name, body, dict(u="vectors2"), own, lost="float", **dict.fromkeys(sizes, "int"))
 
     @ti.func
     def find_all(self, scene: A, at: A, plan: A):
-        for k in ti.static(range(3)):
-            scene.flags[k] = 0
-        self.follow_frames(scene, at, plan)
-        self.compare_slacks(scene, at, plan)
+        self.hold_all(scene, at, plan)
         self.find_farthest(scene, at, plan)
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
@@ -152,13 +136,7 @@ class MotionKernels(ListedPair):
     def find(self) -> Kernel:
         """`near`: which pairs may be nearer than their width, where `forces` left planes or here; flags: a vertex
         has used up its slack (0), there is such a pair (2)."""
-        own = dict(body="ints", marked="ints", flags="ints", frame="vectors", farthest="scalars", near="ints")
-        own |= dict(before="vectors", built="vectors", slack="vectors")
-        numbers = dict.fromkeys(
-            ("num_bodies", "markers", "body_block", "body_blocks", "blocks", "size", "number"), "int"
-        )
-        numbers |= dict(lost="float")
-        return self.kernel("find", self.find_all, dict(u="vectors2"), own, **numbers)
+        return self._kernel("find", self.find_all, near="ints")
 
     @ti.func
     def measure(self, kind: A, p, scene: A):

@@ -59,7 +59,13 @@ class NearSet:
         own = dict(stiffness=of.stiffness, width=of.width, radius=radius, mu=of.mu, speed=of.speed, scale=near.scale)
         self._put("pairs", kernels.PAIRS, corners=near.corners.ravel(), number=numbers, chosen=chosen, **own)
         free = np.broadcast_to(np.eye(3), (n, 3, 3)) if near.free is None else near.free
-        rows = dict(start=start, index=index, weight=weight, inverse=of.inverse, free=free.reshape(-1, 3))
+        rows = dict(start=start, index=index, weight=weight, rest=of.rest, free=free.reshape(-1, 3))
+        inverse, group, blocks = of.inverse.copy(), np.full(n, -1), np.zeros((2, n, 4))
+        if len(near.sets):
+            inverse[near.sets], group[near.sets] = 1, near.sets[:, :1]
+            blocks[0, near.sets] = of.coupled
+            blocks[1, near.sets] = np.swapaxes(np.linalg.cholesky(of.coupled), 1, 2)
+        rows |= dict(inverse=inverse, group=group, coupled=blocks[0].ravel(), mixed=blocks[1].ravel())
         self._put("nodes", kernels.NODES, **rows)
         self._put("work", kernels.WORK, gauss=np.stack([NODES, SHARES], 1).ravel())
         self._take("pairs", dict(acting="ints"), count)
@@ -81,6 +87,7 @@ class NearSet:
     def begin(self, x: np.ndarray, anew: bool) -> None:
         """A pass begins with nodes at x; anew: and no pair is chosen."""
         put(self.arrays["nodes"].x, x)
+        runtime.fill(self.arrays["state"].numbers, 0)
         if anew:
             runtime.fill(self.arrays["pairs"].chosen, 0)
 
@@ -101,7 +108,7 @@ class NearSet:
     def take(self, **numbers) -> tuple[int, float]:
         """(what came of a part, its damping)"""
         self._take_part(**self.acting, **numbers)
-        return int(whole(self.arrays["state"].result)[0]), float(whole(self.arrays["state"].damping)[0])
+        return int(whole(self.arrays["state"].result)[0]), float(whole(self.arrays["state"].numbers)[0])
 
     @property
     def motion(self) -> np.ndarray:
@@ -113,6 +120,11 @@ class NearSet:
         return self._get("e"), self._get("b")
 
     @property
-    def solution(self) -> np.ndarray:
-        """xi of the part that was taken."""
-        return self._get("xi").ravel()
+    def work(self) -> float:
+        """Done by what moves obstacles and held vertices, in all parts [J]."""
+        return float(whole(self.arrays["state"].numbers)[1])
+
+    @property
+    def pushes(self) -> np.ndarray:
+        """With what the chosen pairs press in the part that was taken."""
+        return whole(self.arrays["work"].P)[: self.sizes["num_pairs"]][self.chosen > 0].copy()

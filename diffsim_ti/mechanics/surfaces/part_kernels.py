@@ -30,23 +30,24 @@ LOOK, CHECK, CHECK_BEGIN, CHECK_END, DONE = range(5)  # steps of a part: normals
 
 PAIRS = dict.fromkeys(("corners", "number", "chosen", "acting"), "ints")
 PAIRS |= dict.fromkeys(("scale", "stiffness", "width", "radius", "mu", "speed"), "scalars")
-NODES = dict(
-    start="ints", index="ints", weight="scalars", x="vectors", motion="vectors", inverse="scalars", free="vectors"
-)
+NODES = dict(start="ints", index="ints", weight="scalars", rest="vectors", x="vectors", motion="vectors")
+NODES |= dict(inverse="scalars", free="vectors", group="ints", coupled="scalars", mixed="scalars")
 STATE = dict.fromkeys(("e", "b", "e_next", "b_next", "xi"), "vectors")
 OF_NODES = dict.fromkeys(("f", "residual", "step", "sum"), "vectors") | dict.fromkeys(("root", "load"), "scalars")
 OF_POINTS = dict.fromkeys(("at_begin", "at_look", "moved", "at_end"), "vectors")
 OF_PAIRS = dict(filled="ints", open="ints", n="vectors")
 OF_PAIRS |= dict.fromkeys(("fading", "begin", "end", "change", "P", "K", "stiff", "q", "r", "z", "p", "Ap"), "scalars")
 OF_ROWS = dict(node="ints", share="scalars", row="vectors")
-RESULT = dict(result="ints", damping="scalars")
+RESULT = dict(result="ints", numbers="scalars")
 WORK = OF_NODES | OF_POINTS | OF_PAIRS | OF_ROWS | dict(gauss="scalars")
 
 
 @dataclass(frozen=True)
 class PartKernels(Pair):
     """pairs: of a set, those of vertex and triangle first; `acting` are those of them that a part moves, and its kernel is
-    given their numbers for num_vt and num_pairs. nodes: C (points, nodes) by rows."""
+    given their numbers for num_vt and num_pairs. nodes: C (points, nodes) by rows; those of an affine set are four in a row,
+    `group` the first of them or -1, `coupled` W and `mixed` L^T by rows, W = L L^T their inverse masses in place of
+    `inverse`, which is 1."""
 
     # ---- the barrier (host_geometry.py) --------------------------------------------------------------------------------
 
@@ -169,6 +170,34 @@ class PartKernels(Pair):
             y[d] = three(nodes.free[3 * i + d]).dot(x)
         return y
 
+    @ti.func
+    def lightened(self, i, x: A, nodes: A):
+        """What impulses x on the nodes change of the velocity of node i."""
+        first = nodes.group[i]
+        out = nodes.inverse[i] * self.freed(i, three(x[i]), nodes)
+        if first >= 0:
+            out = self.vec3(0)
+            for b in range(4):
+                out += nodes.coupled[4 * i + b] * three(x[first + b])
+        return out
+
+    @ti.func
+    def lightened_sizes(self, i, x: A, nodes: A):
+        """The same of numbers, by the sizes of inverse masses."""
+        first, out = nodes.group[i], nodes.inverse[i] * x[i]
+        if first >= 0:
+            out = ti.cast(0, self.fp)
+            for b in range(4):
+                out += ti.abs(nodes.coupled[4 * i + b]) * x[first + b]
+        return out
+
+    @ti.func
+    def place_points(self, target: A, source: A, nodes: A, plan: A):
+        """target = rest + C source"""
+        self.spread(target, source, nodes, plan)
+        for i in range(plan.num_points):
+            target[i] += nodes.rest[i]
+
     # ---- which pairs come near -----------------------------------------------------------------------------------------
 
     @ti.func
@@ -190,7 +219,7 @@ class PartKernels(Pair):
     def choose_all(self, list: A, pairs: A, nodes: A, state: A, work: A, plan: A):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            self.spread(work.at_begin, nodes.x, nodes, plan)
+            self.place_points(work.at_begin, nodes.x, nodes, plan)
             self.spread(work.moved, nodes.motion, nodes, plan)
             more, count = 0, 0
             for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
@@ -226,7 +255,7 @@ class PartKernels(Pair):
             work.f[i] = plan.share * nodes.motion[i] + alpha * state.b[i]
             work.sum[i] = nodes.x[i] + plan.begin * nodes.motion[i] + state.e[i]
             work.root[i] = ti.sqrt(alpha * 0.5 * (1 + c) * plan.share * plan.h * nodes.inverse[i])
-        self.spread(work.at_begin, work.sum, nodes, plan)
+        self.place_points(work.at_begin, work.sum, nodes, plan)
         self.spread(work.moved, work.f, nodes, plan)
         for i in range(plan.num_points):
             work.at_look[i] = work.at_begin[i] + theta * work.moved[i]
@@ -257,8 +286,12 @@ class PartKernels(Pair):
             work.begin[p], work.end[p] = d - theta * along, d + (1 - theta) * along
             self.set_row(p, w, pairs, nodes, work, plan)
             for k in range(p * plan.room, p * plan.room + work.filled[p]):
-                i = work.node[k]
-                work.row[k] = work.share[k] * work.root[i] * self.four(self.freed(i, n, nodes))
+                i, share = work.node[k], work.share[k]
+                if nodes.group[i] >= 0:
+                    share = 0.0
+                    for b in range(4):
+                        share += nodes.mixed[4 * i + b] * work.share[k + nodes.group[i] - i + b]
+                work.row[k] = share * work.root[i] * self.four(self.freed(i, n, nodes))
             fine = before > 0 and d > HALF * before
         else:
             fine = ti.min(before, self.parted(kind, p, n, work.at_end, pairs) - pairs.radius[p]) > room
@@ -375,8 +408,9 @@ class PartKernels(Pair):
 
     @ti.func
     def act(self, c, pairs: A, nodes: A, state: A, work: A, plan: A):
-        """e and b after the part (PartSolver.take)."""
-        h, alpha, tiny = plan.share * plan.h, plan.share * plan.alpha, ti.cast(1e-200, self.fp)
+        """e and b after the part (PartSolver.take); the work of what moves nodes of infinite mass against pushes [J]."""
+        h, alpha = plan.share * plan.h, plan.share * plan.alpha
+        done = ti.cast(0, self.fp)
         for i in range(plan.num_nodes):
             work.residual[i], work.sum[i], work.load[i] = self.vec4(0), self.vec4(0), 0.0
             work.step[i] = nodes.motion[i] / plan.alpha + state.b[i]
@@ -390,20 +424,25 @@ class PartKernels(Pair):
             for m in range(p * plan.room, p * plan.room + work.filled[p]):
                 i = work.node[m]
                 v += work.share[m] * work.step[i]
-                bound += h * ti.abs(work.share[m]) * nodes.inverse[i] * work.load[i]
+                bound += h * ti.abs(work.share[m]) * self.lightened_sizes(i, work.load, nodes)
             t = v - work.n[p].dot(v) * work.n[p]
-            kappa, f, y, slip = slip_in_kernels(ti.sqrt(t.norm_sqr()), bound, pairs.speed[p], tiny, KERNELS)
+            kappa, f, y, slip = slip_in_kernels(ti.sqrt(t.norm_sqr()), bound, pairs.speed[p], KERNELS)
             impulse = (-1.0 * h * pairs.mu[p] * work.P[p] * kappa) * t
             for m in range(p * plan.room, p * plan.room + work.filled[p]):
                 work.sum[work.node[m]] += work.share[m] * impulse
         for i in range(plan.num_nodes):
-            delta = (h * nodes.inverse[i]) * self.freed(i, three(work.residual[i]), nodes)
-            friction = nodes.inverse[i] * self.freed(i, three(work.sum[i]), nodes)
+            delta = h * self.lightened(i, work.residual, nodes)
+            friction = self.lightened(i, work.sum, nodes)
+            if nodes.inverse[i] == 0:
+                given = h * three(work.residual[i]) + three(work.sum[i])
+                done = done - given.dot(three(nodes.motion[i])) / plan.h
             way = three(state.b[i]) + 0.5 * (1 + c) * delta + friction
             state.e_next[i] = state.e[i] + alpha * self.four(way)
             state.b_next[i] = state.b[i] + self.four(delta + friction)
+        for i in range(plan.num_nodes):
             work.sum[i] = nodes.x[i] + (plan.begin + plan.share) * nodes.motion[i] + state.e_next[i]
-        self.spread(work.at_end, work.sum, nodes, plan)
+        self.place_points(work.at_end, work.sum, nodes, plan)
+        return done
 
     @ti.func
     def farthest_place(self, pairs: A, work: A, plan: A):
@@ -419,7 +458,7 @@ class PartKernels(Pair):
     def take_all(self, pairs: A, nodes: A, state: A, work: A, plan: A):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            c, result, step, room = plan.damping, TOO_LONG, LOOK, ti.cast(0, self.fp)
+            c, result, step, room, done = plan.damping, TOO_LONG, LOOK, ti.cast(0, self.fp), ti.cast(0, self.fp)
             square = self.place(c, pairs, nodes, state, work, plan)
             if square > LONGEST**2:
                 step = DONE
@@ -445,10 +484,11 @@ class PartKernels(Pair):
                 elif step == LOOK:
                     result, step = UNSOLVED, DONE
                     if self.balance(c, plan.wall / (plan.share * plan.h) ** 2, pairs, state, work, plan):
-                        self.act(c, pairs, nodes, state, work, plan)
+                        done = self.act(c, pairs, nodes, state, work, plan)
                         room, step = plan.rounding * (1 + self.farthest_place(pairs, work, plan)), CHECK
                 elif left == 0:
                     result, step = TAKEN, DONE
+                    state.numbers[1] += done
                     for i in range(plan.num_nodes):
                         state.e[i], state.b[i] = state.e_next[i], state.b_next[i]
                 else:
@@ -457,10 +497,11 @@ class PartKernels(Pair):
                         work.at_look[i] = work.at_begin[i]
                         if step == CHECK_END:
                             work.at_look[i] = work.at_end[i]
-            state.result[0], state.damping[0] = result, c
+            state.result[0], state.numbers[0] = result, c
 
     @cached_property
     def take(self) -> Kernel:
-        """The part `begin` .. `begin + share` of a pass of length h; result: what came of it, damping: its own."""
+        """The part `begin` .. `begin + share` of a pass of length h; result: what came of it; numbers: its damping, and
+        the work of all parts since `NearSet.begin`."""
         numbers = dict.fromkeys(("begin", "share", "h", "alpha", "damping", "wall", "rounding"), "float")
         return self._kernel("take_part", self.take_all, rough="int", **numbers)

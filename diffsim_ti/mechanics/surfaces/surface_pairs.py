@@ -9,31 +9,26 @@ from diffsim_ti import runtime
 from diffsim_ti.common.public import Public
 from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
 from diffsim_ti.mechanics.surfaces.buffers import branches, whole
-from diffsim_ti.mechanics.surfaces.listed_pair import MANY, OPPOSITE
+from diffsim_ti.mechanics.surfaces.listed_pair import MANY
 from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ContactNumbers, SurfaceWithObstacles
-from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
-from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
-from diffsim_ti.terms.obstacles.barrier import beta, curvature_at
 from diffsim_ti.terms.self_contact import SelfContact
-
-HELD = 4  # vertices that a pair is to stop, with what is behind it
 
 
 class Tunnelling(FloatingPointError, metaclass=Public):
-    """Surfaces moved so far in one substep that they may have crossed. Of explicit steps it carries stable_dt
-    [s], a substep that resolves the barrier, and stiffness [N/m], one that stops them, or None where theirs would do."""
+    """Surfaces moved so far in one substep that they may have crossed. Of explicit steps it carries stable_dt [s], a substep
+    that is short enough."""
 
     stable_dt: float | None = None
-    stiffness: float | None = None
+    stiffness: None = None  # no error asks for another one; goes with the next version
 
     @property
     def enough(self) -> float | None:
         """A substep [s] that is short enough, None where no substep is."""
-        return self.stable_dt if self.stiffness is None else None
+        return self.stable_dt
 
 
 class Overlap(ValueError):
@@ -51,7 +46,7 @@ class SurfacePairs:
     Forces go to the last corners of an array of corners, one for each surface vertex (state/arrays.py).
     """
 
-    friction_kind = PairFriction
+    friction_kind: type | None = None  # of implicit passes; explicit ones have it in their stage (contact_stage.py)
     typical_slack = 0.5  # share of the width that half of the vertices get at most, so that lists stay short
     fewest_passes, most_passes = 3, 30  # that a list should last, by its slacks, but
     least_slack = 0.1  # they are at least this share of the width, and
@@ -89,8 +84,8 @@ class SurfacePairs:
         self.touched = runtime.array(ti.i32, n)
         self.fresh, self.age, self.builds = False, 0, 0
         self._checked_rest = self._scratch = None
-        has_friction = len(self.contacts.mu) > 0 if self.kinematic else term.has_friction
-        self.friction = self.friction_kind(self) if has_friction else None
+        self.has_friction = len(self.contacts.mu) > 0 if self.kinematic else term.has_friction
+        self.friction = self.friction_kind(self) if self.friction_kind and self.has_friction else None
 
     def _number(self, place: int) -> float:
         return float(self.a.values.parameters[self.a.parameters_of_self_contact.start + place])
@@ -105,11 +100,6 @@ class SurfacePairs:
         if not self.kinematic:
             return self.width
         return float(self.contacts.widths[0 if self.term else 1 :].min())
-
-    def _stiffness_and_width(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of pairs of the list, without their shares."""
-        own, values = PairNumbers(self).of(np.arange(len(pairs)), pairs), self.a.values.parameters
-        return own.area * values[own.stiffness], values[own.width]
 
     def load(self, u) -> None:
         """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""
@@ -229,111 +219,22 @@ class SurfacePairs:
         """Let go of the arrays that forces were computed from."""
         self._launch.clear()
 
-    def check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
-        """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
-        bodies = dict(
-            num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.least_width, **self.sizes_of_sums
-        )
-        self.run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_pairs=num_pairs, **bodies)
+    def holds(self, u, slot: int) -> bool:
+        """Whether the list holds at u[slot]."""
+        return self.fresh and not self.look_at(self.motion.holds, u, slot)[0]
+
+    def look_at(self, kernel, u, slot: int) -> tuple[bool, bool, bool]:
+        """The `flags` of a kernel that follows the motion to u[slot] since the list was made."""
+        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, **self.sizes_of_sums)
+        self.run(kernel, dict(u=u), slot=slot, lost=0.5 * self.least_width, **bodies)
         flags = runtime.view(self.flags)
-        stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
-        return bool(stale), bool(lost), bool(crossed)
+        return tuple(bool(x) for x in (runtime.fetch(self.flags) if flags is None else flags))
 
     def ensure(self, u, slot: int) -> None:
         """Make the list anew if it does not hold at u[slot]."""
-        if not self.fresh or self.check(u, slot, 0, 0)[0]:
+        if not self.holds(u, slot):
             self.age = 0  # a jump says nothing of the pace
             self.build(u, slot)
-
-    def check_pass(self, u, slot: int, h: float) -> None:
-        """After a pass of length h [s] to u[slot]: raise Tunnelling if a pair may have crossed."""
-        self.age += 1
-        stale, lost, crossed = self.check(u, slot, self.list.num_vt, self.list.count)
-        if (lost or crossed) and np.all(np.isfinite(runtime.fetch(u, slot))):
-            self._refuse(runtime.fetch_row(u, slot), h, crossed)
-        if stale:
-            self.build(u, slot)
-
-    def _refuse(self, u: np.ndarray, h: float, crossed: bool) -> None:
-        surface = self.mesh.surface_vertices
-        moved = np.zeros((self.mesh.num_vertices, 3))
-        moved[surface] = u[surface] - runtime.fetch(self.before)
-        self.fresh = False
-        pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
-        plane = whole(self.plane)[: self.list.count].astype(np.float64)
-        closing = np.full(len(pairs), -np.inf)
-        for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
-            for a, b in OPPOSITE[kind]:
-                change = ((moved[pairs[part, b]] - moved[pairs[part, a]]) * plane[part, :3]).sum(1)
-                closing[part] = np.maximum(closing[part], change)
-        fastest = self._fastest(plane[:, 3], pairs)
-        worst = int((closing - plane[:, 3]).argmax()) if len(pairs) else None
-        stiffness, enough = self._resolved(moved[surface] / h, h, fastest, worst, pairs)
-        remedy = f"take substeps of {enough:.3g} s"
-        if stiffness is not None:
-            remedy = f"no step stops them: raise {self._stiffer(stiffness, worst, pairs)} and {remedy}"
-        elif fastest * h > 1:
-            remedy = f"contact at {fastest:.3g} rad/s is too stiff for it: {remedy}"
-        if not crossed:
-            i = surface[np.linalg.norm(moved[surface], axis=1).argmax()]
-            speed = np.linalg.norm(moved[i]) / h
-            error = Tunnelling(
-                f"vertex {i} moves at {speed:.3g} m/s, {np.linalg.norm(moved[i]):.3g} m in one substep of {h:.3g} s: "
-                f"too far for a contact of width {self.width:.3g} m to detect what it passes through; {remedy}"
-            )
-            error.stable_dt, error.stiffness = enough, stiffness
-            raise error
-        error = Tunnelling(
-            f"{self._name(worst, pairs)} may have gone through each other: their gap was {plane[worst, 3]:.3g} m, and they "
-            f"closed by {closing[worst]:.3g} m ({closing[worst] / h:.3g} m/s) in one substep of {h:.3g} s; {remedy}"
-        )
-        error.stable_dt, error.stiffness = enough, stiffness
-        raise error
-
-    def _resolved(self, v: np.ndarray, h: float, fastest: float, worst, pairs) -> tuple[float | None, float]:
-        """(stiffness [N/m] that stops surface vertices of velocities v [m/s], None if the present one does; a substep [s]).
-
-        The barrier k w^2 beta(s) of a pair takes HELD times m V^2 / 2, m the heaviest vertex, V how fast they meet: of all
-        vertices, or where contact is too stiff for the substep h, and speeds are of its own making, of bodies and of the
-        start. With the present k that is at s; where s < 1 / 50, at s = 1 / 10 with a new one. omega h is 1/2 there at most,
-        of the lightest vertex, and V h a tenth of the width.
-        """
-        light = runtime.fetch(self.a.inverse_mass).astype(np.float64)[self.mesh.surface_vertices]
-        mass, light = 1 / light[light > 0].min(initial=np.inf), light.max(initial=0)
-        frames = np.stack([v[self.body[self.mesh.surface_vertices] == b].mean(0) for b in range(self.num_bodies)])
-        start = self.a.values.velocity
-        start = float(np.linalg.norm(start - start.mean(0), axis=1).max(initial=0))
-        own = frames if fastest * h > 1 and len(frames) > 1 else v
-        speed = max(2 * start, 2 * float(np.linalg.norm(own - own.mean(0), axis=1).max(initial=0)), 1e-300)
-        k, w = self._stiffness_and_width(pairs)
-        k, w = (float(x[worst]) for x in (k, w)) if worst is not None else (1.0, self.width)
-        energy = 0.5 * HELD * mass * speed**2
-        shares = np.geomspace(0.02, 1, 400)
-        s, stiffness = float(np.interp(-energy / (k * w * w), -beta(shares), shares)), None
-        if energy > k * w * w * beta(0.02):
-            s, stiffness = 0.1, energy / float(w * w * beta(0.1))
-        omega = np.sqrt((stiffness or k) * light * curvature_at(s))
-        return stiffness, float(min(0.5 / max(omega, 1e-300), 0.1 * w / speed, 0.5 * h))
-
-    def _stiffer(self, stiffness: float, worst, pairs: np.ndarray) -> str:
-        """In words, the number that gives the worst pair a stiffness [N/m]."""
-        number = int(self.kinematic.numbers[pairs[worst][[0, 2]]].max()) if self.kinematic and worst is not None else 0
-        if not number:
-            return f"the contact's stiffness to {stiffness:.3g} N/m"
-        part = self.kinematic.corners.parts[number - 1]
-        if not part.force.per_area:
-            return f"the stiffness of {part.term!r} to {stiffness:.3g} N/m"
-        area = float(whole(self.list.area)[worst])
-        return f"the stiffness_per_area of {part.term!r} to {stiffness / area:.3g} N/m^3"
-
-    def _fastest(self, gaps: np.ndarray, pairs: np.ndarray) -> float:
-        """A frequency [rad/s] of pairs that press, of the lightest vertex against the stiffest pair."""
-        at_rest = whole(self.rest_plane)[: self.list.count, 3].astype(np.float64)
-        k, width = self._stiffness_and_width(pairs)
-        share = np.minimum(1, at_rest / (2 * width))  # listed_pair.py
-        stiffness = k / share * curvature_at(gaps / (share * width))
-        lightness = runtime.fetch(self.a.inverse_mass).astype(np.float64)[pairs].max(1)
-        return float(np.sqrt((stiffness * lightness).max(initial=0)))
 
     def _name(self, pair: int, pairs: np.ndarray) -> str:
         c = pairs[pair]

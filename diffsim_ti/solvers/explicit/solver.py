@@ -18,7 +18,7 @@ from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
-from diffsim_ti.mechanics.reduced.body_checks import check_bodies
+from diffsim_ti.mechanics.reduced.body_checks import check_bodies, meets_between_vertices
 from diffsim_ti.mechanics.reduced.projected_sets import ProjectedSets
 from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import Workspace
@@ -31,7 +31,7 @@ from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.pass_table import PassTable
-from diffsim_ti.terms import GasChamber, Growth, SelfContact
+from diffsim_ti.terms import GasChamber, Growth
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -67,9 +67,9 @@ class ExplicitSolver(Solver):
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
         are `reduced` take obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
-        SelfContact(stage=True) acts likewise, in parts of each substep (surfaces/contact_stage.py): it keeps surfaces apart
-        whatever its stiffness, with friction in it; it needs "stage", and no reduced sets.
-        Obstacles that act by pairs do so likewise with their points and edges; with "force" by one more force.
+        SelfContact, and obstacles that act by pairs, are always a stage, in parts of each substep
+        (surfaces/contact_stage.py), which keeps surfaces apart whatever the stiffness, with friction in it; of sets that
+        are `reduced` affine ones go with them.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.
@@ -97,23 +97,17 @@ class ExplicitSolver(Solver):
         self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
         if getattr(scene, "reduced", False):
             self.check_bodies(scene, contact)
-        term = scene.term(SelfContact) if hasattr(scene, "term") else None
-        if term and term.stage and (contact == "force" or scene.reduced):
-            raise ValueError(
-                f'SelfContact(stage=True) needs contact="stage" and a scene without reduced sets, got contact={contact!r}'
-                f"{' and reduced sets' if scene.reduced else ''}; leave stage out, or take an implicit solver"
-            )
         super().__init__(scene, dt, substeps, parallel, allow_unstable, check_start)
-        by_pairs = (term and term.stage) or any(getattr(x, "primitives", None) is not None for x in scene.terms)
-        if by_pairs and contact == "stage" and not scene.reduced and runtime.arch_name() == "vulkan":
+        if meets_between_vertices(scene) and runtime.arch_name() == "vulkan":
             raise ValueError(
                 "surfaces that meet between vertices act as a stage of explicit steps, for which Vulkan lends a kernel too "
-                'few arrays: pass contact="force" (without SelfContact(stage=True)), give obstacles by_pairs=False, or take '
-                "an implicit solver or another backend"
+                "few arrays: leave SelfContact out, give obstacles by_pairs=False, or take an implicit solver or another "
+                "backend"
             )
 
     def check_contact_forces(self) -> None:
-        if self.contact == "force" and any(term.acts_on_surface for term in self.scene.terms):
+        between = self.scene.reduced and meets_between_vertices(self.scene)
+        if between or self.contact == "force" and any(term.acts_on_surface for term in self.scene.terms):
             raise ValueError(
                 f"ContactForce and ContactTraction are of obstacles that act as a stage, and this {type(self).__name__} "
                 'takes them as forces: pass it contact="stage", or take an implicit solver, as reduced sets need'
@@ -126,10 +120,7 @@ class ExplicitSolver(Solver):
     def passes_per_launch(self) -> int:
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
         alone = (
-            self.scene.term(SelfContact)
-            or any(term.primitives is not None for term in self.scene.terms)
-            or any(x.apart for x in self.scene.interactions)
-            or self.scene.reduced
+            meets_between_vertices(self.scene) or any(x.apart for x in self.scene.interactions) or self.scene.reduced
         )  # which act between passes
         return 1 if alone or runtime.runs_on_cpu() or not runtime.can_repeat() else MOST_PASSES
 
@@ -187,21 +178,8 @@ class ExplicitWorkspace(Workspace):
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not unwatched else None
 
     @property
-    def stages_pairs(self) -> bool:
-        term = self.scene.term(SelfContact)
-        asked = bool(self.pairs) and (term is None or term.stage or bool(self.pairs.obstacles))  # which always are
-        return asked and self.solver.stages_contact and not self.scene.reduced
-
-    @property
     def has_unnoted_work(self) -> bool:
-        """Whether forces without an energy act vertex by vertex, or obstacles that move by pairs, whose work passes do not
-        note."""
-        if (
-            self.pairs
-            and self.pairs.obstacles
-            and any(x.term.path is not None for x in self.pairs.obstacles.corners.parts)
-        ):
-            return True
+        """Whether forces without an energy act vertex by vertex, whose work passes do not note."""
         on_host = (x for x in self.scene.interactions if x.on_host)
         return any(x.in_kernels and not len(x.vertices) and not f.has_energy for x, f in zip(on_host, self.hosts))
 

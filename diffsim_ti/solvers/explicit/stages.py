@@ -7,7 +7,6 @@ from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
 from diffsim_ti.mechanics.reduced.projected_sets import ProjectedAdjoint, ProjectedSets, ProjectedTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
-from diffsim_ti.mechanics.surfaces.stages import SurfaceForces, SurfaceFriction
 
 # stages whose tangents and adjoints have buffers: what makes these of them for a run
 BUFFERED = dict(
@@ -46,12 +45,8 @@ class KickDrift(Stage):
 
 def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
-    forces = friction = None
-    if ws.stages_pairs:
-        forces = PairContact(ws.pairs, ws.solver.contact_damping)
-    elif ws.pairs:
-        forces, friction = SurfaceForces(ws.pairs), SurfaceFriction(ws.pairs) if ws.pairs.friction else None
-    every = forces, ws.volumes, friction, ws.chambers, ws.projected, KickDrift()
+    pairs = PairContact(ws.pairs, ws.solver.contact_damping) if ws.pairs else None
+    every = pairs, ws.volumes, ws.chambers, ws.projected, KickDrift()
     return [stage for stage in every if stage]
 
 

@@ -18,50 +18,42 @@ import taichi as ti
 
 from diffsim_ti.runtime import traced
 
-ARRAYS = SimpleNamespace(sqrt=np.sqrt, minimum=np.minimum, maximum=np.maximum, select=np.where)
+# what a law of numbers is written in: NumPy's arrays, or numbers of kernels; a graph has the same names
+ARRAYS = SimpleNamespace(
+    sqrt=lambda x: np.sqrt(np.maximum(x, 0)), minimum=np.minimum, maximum=np.maximum, select=np.where
+)
+KERNELS = SimpleNamespace(
+    sqrt=traced(lambda x: ti.sqrt(ti.max(x, 0))), minimum=ti.min, maximum=ti.max, select=ti.select
+)
 
 
 @traced
-def _both_and_square(speed, c, eps):
-    """(a, b) with s / s* = 2 eps / (a + sqrt b) where a vertex sticks, s* = speed < eps + c."""
+def _roots(g, speed, c, eps):
+    """(a, b, c + eps - s*) with s / s* = 2 eps / (a + b) where a vertex sticks, s* = speed < eps + c."""
+    inside = g.minimum(speed, eps + c)  # where the root is real
     both = eps + c * 2
-    return both, both * both - c * speed * 4
+    return both, g.sqrt(both * both - c * inside * 4), c + eps - inside
 
 
-def keeps(g, speed, c, eps):
-    """s / s*, the share of the speed s* that is left; C1 in everything."""
-    sticks = speed.value < eps.value + c.value
-    both, square = _both_and_square(g.minimum(speed, eps + c), c, eps)  # where the root is real
-    stuck = eps * 2 / (both + g.sqrt(square))
-    outside = g.maximum(speed, eps + c)
-    sliding = g.number(1) - c / outside
-    return g.select(sticks, stuck, sliding)
-
-
+@traced
 def lost_per(g, speed, c, eps):
-    """(1 - keeps) / c, with all its digits where c is small; tends to f(s / eps) / s."""
-    sticks = speed.value < eps.value + c.value
-    inside = g.minimum(speed, eps + c)
-    both, square = _both_and_square(inside, c, eps)
-    root = g.sqrt(square)
-    stuck = (2 + 4 * (c + eps - inside) / (root + eps)) / (both + root)
-    return g.select(sticks, stuck, 1 / g.maximum(speed, eps + c))
+    """(1 - s / s*) / c = f(s / eps) / s*, with all its digits where c is small or 0; C1 in everything. g: a graph, ARRAYS or
+    KERNELS."""
+    both, root, left = _roots(g, speed, c, eps)
+    stuck = (2 + 4 * left / (root + eps)) / (both + root)
+    return g.select(speed < eps + c, stuck, 1 / g.maximum(speed, eps + c))
 
 
-def slip(speed, c, eps, tiny, m: ti.template()):
+def slip(speed, c, eps, g: ti.template()):
     """(f / s*, f, y, B) at y = s / eps for the speed s*; df = B (ds* - f dc - y d eps). c = 0: where s* is s.
 
-    For NumPy's arrays, and as `slip_in_kernels` for numbers of kernels; m: ARRAYS, KERNELS.
+    For NumPy's arrays, and as `slip_in_kernels` for numbers of kernels; g: ARRAYS, KERNELS.
     """
-    sticks = speed < eps + c
-    both, square = _both_and_square(m.minimum(speed, eps + c), c, eps)
-    keep = eps * 2 / (both + m.sqrt(m.maximum(square, 0)))
-    y = m.select(sticks, keep * speed / eps, 1)
-    kappa = m.select(sticks, keep / eps * (2 - y), 1 / m.maximum(speed, tiny))
-    return kappa, y * (2 - y), y, 2 * (1 - y) / (eps + 2 * c * (1 - y))
+    both, root, _ = _roots(g, speed, c, eps)
+    y = g.select(speed < eps + c, speed * 2 / (both + root), 1)
+    return lost_per(g, speed, c, eps), y * (2 - y), y, 2 * (1 - y) / (eps + 2 * c * (1 - y))
 
 
-KERNELS = SimpleNamespace(sqrt=ti.sqrt, minimum=ti.min, maximum=ti.max, select=ti.select)
 slip_in_kernels = ti.func(slip)
 
 
@@ -85,7 +77,8 @@ def slide(g, n, push, v, v_obstacle, h_over_m, mu, eps):
     """
     n, push = normal_force(g, n, push)
     t, speed = tangential(g, n, v, v_obstacle)
-    lost = g.number(1) - keeps(g, speed, h_over_m * mu * push, eps)
+    c = h_over_m * mu * push
+    lost = c * lost_per(g, speed, c, eps)
     return [a - lost * x for a, x in zip(v, t)]
 
 
@@ -104,9 +97,7 @@ def tangential(g, n, v, v_obstacle):
 def friction_force(g, n, push, v, v_obstacle, mu, eps):
     """The force of friction on a vertex."""
     t, speed = tangential(g, n, v, v_obstacle)
-    slow = (eps * 2 - g.minimum(speed, eps)) / (eps * eps)
-    share = g.select(speed.value < eps.value, slow, g.number(1) / g.maximum(speed, eps))
-    factor = g.number(0) - mu * push * share
+    factor = g.number(0) - mu * push * lost_per(g, speed, g.number(0), eps)
     return [factor * x for x in t]
 
 

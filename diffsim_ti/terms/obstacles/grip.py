@@ -3,7 +3,7 @@
 Many vertices slow the same body. With velocities v before friction and 1 / w_i a bound of the mass that vertex i feels, each
 takes the impulse of backward Euler (friction.py) as if it had the share of its load in the body,
 
-    p_i = -h mu N_i g(|t_i|) t_i,    g = (1 - keeps(|t_i|, C, eps)) / C,    C = sum_j h mu N_j w_j,
+    p_i = -h mu N_i g(|t_i|) t_i,    g = lost_per(|t_i|, C, eps),    C = sum_j h mu N_j w_j,
 
 so that C is the most by which all friction of a pass may slow the body. The matrix of what impulses do to velocities is at
 most the diagonal one of w_i C / (h mu N_i w_i), for C is the sum of these weights: no pass gains energy by friction.
