@@ -223,6 +223,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         if self.strains:
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
+        if stage.static and (held != u).any():
+            starts = self._led(u, held, problem)
         try:
             u_star = self._solve(j, u, held, starts, problem, stage)
         except NotConverged as error:
@@ -246,6 +248,15 @@ class ImplicitWorkspace(PrescribedInPasses):
             added = 0.0 if keeps else self._kinetic_added(u, v, u_next, v_star, undamped, stage)
             self.energy_watch.note(u, u_star, u_next, v_next, places, added)
         return u_next, np.zeros_like(v) if stage.static else v_next
+
+    def _led(self, u, held, problem: tuple) -> list:
+        """Where the equilibrium at u leads, linearised there, for motions of fixed vertices; nowhere if it is not stable."""
+        self.potential.place(u)
+        self.newton.residual_of(problem)
+        R = self.newton.residual_of(problem)
+        self.newton.preconditioner, self.newton.stiffness = self.preconditioner(problem[0])
+        way = self.newton.follows(u, R, held - u)
+        return [] if way is None else [u + way]
 
     def problem(self, j: int, stage: Stage, x: np.ndarray, y: np.ndarray) -> tuple:
         """Mass, inertial and loads of `Newton.solve` in pass j, inertia starting from (x, y)."""
