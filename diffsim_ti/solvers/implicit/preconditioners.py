@@ -21,6 +21,9 @@ class Preconditioner:
     def begin(self) -> None:
         self.spent, self.given_up, self.unfit = 0, False, False
 
+    def learn(self, residual: float, iterations: int) -> None:
+        """What a linear solve took to its relative residual."""
+
     @property
     def effort(self) -> Effort:
         """Of the factorisation that takes its place."""

@@ -23,6 +23,7 @@ from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.implicit.closing import Closing
 from diffsim_ti.solvers.implicit.load_stepping import LoadStepping
+from diffsim_ti.solvers.implicit.multigrid import Following
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
@@ -121,6 +122,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.check_apart()
 
     def _restart(self) -> None:
+        self.state.beside[0] = None
         if self.solver.multistep:
             self.state.fresh[0] = True
 
@@ -161,6 +163,7 @@ class ImplicitWorkspace(PrescribedInPasses):
                 self.save_frame(frame)
             u, v, before = self.read(self.state, 0)
             self.potential.hold(self.state, 0)
+            self.preconditioner.following = self.state.beside[0] or Following()
             begin, self.newton.reports = time.perf_counter(), []
             try:
                 u_next, v_next = self._pass(j, u, v, before)
@@ -178,6 +181,7 @@ class ImplicitWorkspace(PrescribedInPasses):
             runtime.fill(self.state.v, v_next[None])
             if self.state.z is not None:
                 self.launch_law_state("forward", self.arrays.features(), j, 0, 0, at=self.state)
+            self.state.beside[0] = self.preconditioner.following
             if base is not None:
                 self.state.copy(0, self.record, j + 1 - base)
                 if self.solver.multistep:
