@@ -256,10 +256,9 @@ class ImplicitWorkspace(PrescribedInPasses):
     def _led(self, u, held, problem: tuple) -> list:
         """Where the equilibrium at u leads, linearised there, for motions of fixed vertices; nowhere if it is not stable."""
         self.potential.place(u)
-        self.newton.residual_of(problem)
         R = self.newton.residual_of(problem)
         self.newton.preconditioner, self.newton.stiffness = self.preconditioner(problem[0])
-        way = self.newton.follows(u, R, held - u)
+        way = self.newton.follows(u, R, held - u, self.newton.inexact)
         return [] if way is None else [u + way]
 
     def problem(self, j: int, stage: Stage, x: np.ndarray, y: np.ndarray) -> tuple:
