@@ -20,11 +20,7 @@ def element_matrices(potential) -> np.ndarray:
     if a.points == 1:
         out = np.empty((count, k, k, 3, 3))
         for part, C in potential.tangent_chunks(CHUNK):
-            own, scaled = N[part], np.swapaxes(N[part] * V[part, None, None], 1, 2)
-            right = np.matmul(C.reshape(-1, 27, 3), scaled).reshape(-1, 3, 3, 3 * k)  # i, j, (k, b)
-            right = np.ascontiguousarray(np.swapaxes(right, 1, 2)).reshape(-1, 3, 9 * k)
-            both = np.matmul(own, right).reshape(-1, k, 3, 3, k)  # a, i, k, b
-            out[part] = np.moveaxis(both, 4, 2)
+            out[part] = between_nodes(C, N[part], V[part])
         return out
     C = potential.tangents().reshape(count, 27, 3)
     right = np.matmul(C * V[:, None, None], np.swapaxes(N, 1, 2)).reshape(count, 3, 3, 3, k)
@@ -33,6 +29,24 @@ def element_matrices(potential) -> np.ndarray:
     left = np.moveaxis(N, 2, 1).reshape(m, k, 3 * q)
     right = np.moveaxis(right, 3, 2).reshape(m, 3 * q, 9 * k)  # j beside the points
     return np.moveaxis((left @ right).reshape(m, k, 3, 3, k), 4, 2)
+
+
+def between_nodes(C: np.ndarray, N: np.ndarray, V: np.ndarray | None = None) -> np.ndarray:
+    """V N_a . C . N_b of each element for gradients N of its nodes, shape (m, k, 3), as (m, k, k, 3, 3)."""
+    k, scaled = N.shape[1], np.swapaxes(N if V is None else N * V[:, None, None], 1, 2)
+    right = np.matmul(C.reshape(-1, 27, 3), scaled).reshape(-1, 3, 3, 3 * k)  # i, j, (k, b)
+    right = np.ascontiguousarray(np.swapaxes(right, 1, 2)).reshape(-1, 3, 9 * k)
+    return np.moveaxis(np.matmul(N, right).reshape(-1, k, 3, 3, k), 4, 2)  # of a, i, k, b
+
+
+def summed(places: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(places, each once and in order, the sums of the 3x3 blocks there)."""
+    from scipy.sparse import csc_matrix
+
+    places, inverse = np.unique(places, return_inverse=True)
+    m = len(inverse)
+    gather = csc_matrix((np.ones(m), inverse, np.arange(m + 1)), shape=(len(places), m))
+    return places, (gather @ blocks.reshape(-1, 9)).reshape(-1, 3, 3)
 
 
 def assemble(potential, mass: Mass, free: Free, more=()):
@@ -56,13 +70,7 @@ def assemble(potential, mass: Mass, free: Free, more=()):
         places = np.concatenate([places, np.repeat(np.arange(n), np.diff(own.indptr)) * n + own.indices])
         parts.append(own.data.reshape(-1, 9))
     each = np.arange(n, dtype=np.int64) * (n + 1)  # also of vertices in no tetrahedron
-    places, inverse = np.unique(np.concatenate([places, each]), return_inverse=True)
-    data, first = np.zeros((len(places), 9)), 0
-    for entries in parts:
-        own, first = inverse[first : first + len(entries)], first + len(entries)
-        for k in range(9):
-            data[:, k] += np.bincount(own, entries[:, k], len(places))
-    data = data.reshape(-1, 3, 3)
+    places, data = summed(np.concatenate([places, each]), np.concatenate([*parts, np.zeros((n, 9))]))
     rows, columns = places // n, places % n
     is_free, P = mask_of(free)[:, 0] > 0, projectors_of(free)
     data[~(is_free[rows] & is_free[columns])] = 0

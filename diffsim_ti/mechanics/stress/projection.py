@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.mechanics.energy.assembled import between_nodes, summed
+
 
 class Projection:
     """w -> sum over points of V B^T (C+ - C) B w, with C = d2psi/dF2 and C+ the same without negative eigenvalues.
@@ -29,16 +31,13 @@ class Projection:
 
     def matrix(self):
         """The same as a SciPy matrix [N/m]."""
-        from scipy.sparse import coo_matrix
+        from scipy.sparse import bsr_matrix
 
-        C = self.C.reshape(-1, 3, 3, 3, 3)
-        blocks = np.einsum("eai,ecidj,ebj->eacbd", self.N, C, self.N, optimize=True)
-        at, size = (
-            (3 * self.nodes[:, :, None] + np.arange(3)).reshape(len(C), 3 * self.nodes.shape[1]),
-            3 * self.num_vertices,
-        )
-        rows, columns = (x.ravel() for x in np.broadcast_arrays(at[:, :, None], at[:, None]))
-        return coo_matrix((blocks.ravel(), (rows, columns)), shape=(size, size)).tocsr()
+        n = self.num_vertices
+        places = (self.nodes[:, :, None].astype(np.int64) * n + self.nodes[:, None, :]).ravel()
+        places, blocks = summed(places, between_nodes(self.C, self.N))
+        start = np.searchsorted(places, n * np.arange(n + 1))
+        return bsr_matrix((blocks, places % n, start), shape=(3 * n, 3 * n))
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         dH = np.einsum("eac,eaj->ecj", w[self.nodes], self.N)
