@@ -151,6 +151,7 @@ class Cycle:
     def __init__(self, matrices: list, ways: list, frames, parallel: bool):
         self.frames = frames
         self.levels = [Level(M, self._wide(M, parallel)) for M in matrices]
+        self._entries = [len(M.data) for M in (*matrices, *ways)]
         self._down, self._up = [], []  # (kernel, records, numbers)
         for level, below, P in zip(self.levels, self.levels[1:], ways):
             kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel))
@@ -169,14 +170,17 @@ class Cycle:
     def _wide(self, M, parallel: bool) -> bool:
         return parallel and nodes_of(M) > self.wide or not runtime.runs_on_cpu()
 
-    def put(self, matrices: list, ways: list) -> None:
-        """Set the numbers of other matrices and ways with the same places."""
+    def put(self, matrices: list, ways: list) -> bool:
+        """Set the numbers of other matrices and ways; False where their entries are not in the same places."""
+        if [len(M.data) for M in (*matrices, *ways)] != self._entries:
+            return False
         for level, M in zip(self.levels, matrices):
             level.put_numbers(M)
         for (_, between, _), P in zip(self._down, ways):
             runtime.fill(between["down"].values, rows_of(P.T.tobsr(P.blocksize[::-1]).data))
             runtime.fill(between["up"].values, rows_of(P.data))
         runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
+        return True
 
     def put_diagonal(self, blocks: np.ndarray, nodes=slice(None)) -> None:
         """Set the diagonal blocks of some nodes of the finest level."""

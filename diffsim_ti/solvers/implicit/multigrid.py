@@ -22,7 +22,7 @@ from diffsim_ti.solvers.implicit.factorised import eliminated
 from diffsim_ti.solvers.implicit.preconditioners import Preconditioner
 from diffsim_ti.solvers.implicit.rotations import Frames
 
-STRONG = 0.08  # share of the diagonals' mean from which on a connection is within aggregates
+STRONG = 0.07  # share of the mean of two diagonals from which on aggregates join; measured
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,21 @@ class Following:
     place: np.ndarray | None = None
     usual: float | None = None
     excess: float = 0.0
+
+    def numbers(self) -> np.ndarray:
+        """For a file."""
+        place = () if self.place is None else self.place.ravel()
+        return np.array([self.excess, self.usual or 0.0, *place])
+
+    @classmethod
+    def of(cls, numbers: np.ndarray, shape: tuple) -> "Following":
+        """Of `numbers`, for displacements of a shape. Raises ValueError."""
+        if numbers.shape not in ((2,), (2 + np.prod(shape),)) or not np.all(np.isfinite(numbers)):
+            raise ValueError(
+                f"resume: preconditioner: expected 2 finite numbers, or {2 + np.prod(shape)}, as `state` has them, got an "
+                f"array of shape {numbers.shape}"
+            )
+        return cls(numbers[2:].reshape(shape) if len(numbers) > 2 else None, float(numbers[1]), float(numbers[0]))
 
 
 class Multigrid(Preconditioner):
@@ -101,7 +116,7 @@ class Multigrid(Preconditioner):
             matrices, ways = self._levels([correction.matrix()] if len(correction.C) else [])
             if is_definite(matrices[-1]):
                 break
-        self.cycle.put(matrices, ways)
+        self._follows = self.cycle.put(matrices, ways)
         self.potential.place(u)
 
     def _levels(self, more=()) -> tuple[list, list]:
@@ -207,9 +222,10 @@ def smoothed(matrix, motions: np.ndarray, aggregates: list | None = None) -> tup
                 break
         tentative, motions = fit_candidates(own, motions)
         blocks = diagonal_blocks(A)
-        size, k = largest_eigenvalue(A, blocks), nodes_of(A)
-        scale = bsr_matrix((inverses(blocks) * (4 / (3 * size)), np.arange(k), np.arange(k + 1)), shape=A.shape)
-        P = tentative - scale @ (A @ tentative)
+        rows = np.repeat(np.arange(nodes_of(A)), np.diff(A.indptr))
+        data = inverses(blocks)[rows] @ A.data * (-4 / (3 * largest_eigenvalue(A, blocks)))
+        data[rows == A.indices] += np.eye(A.blocksize[0])
+        P = bsr_matrix((data, A.indices, A.indptr), shape=A.shape) @ tentative  # by a product, which keeps zeros
         ways.append(P)
         matrices.append((P.T @ (A @ P)).tobsr((6, 6)))
         found.append(own)
