@@ -97,7 +97,9 @@ def main() -> None:
     options = parser.parse_args()
     sizes, repeats = ([9, 13], 1) if options.quick else (options.vertices, options.repeats)
     rows = []
-    print("| unknowns | forward [s] | gradient [s] | products | force [N] | torch-fem: i7, Threadripper, RTX 5090 [s] |")
+    print(
+        "| unknowns | forward [s] | gradient [s] | products | force [N] | torch-fem: i7, Threadripper, RTX 5090 [s] |"
+    )
     print("| ---: | ---: | ---: | ---: | ---: | --- |")
     for n in sizes:
         forward, gradient, products, force, _ = measured(n, repeats)
