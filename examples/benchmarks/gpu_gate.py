@@ -6,9 +6,9 @@
 Each part runs in a process of its own with a time limit, prints one JSON line, and is a row of the table at the end: the
 device; copies and launches; correctness against the CPU, in float64 and float32; time per substep by size beside what
 copying the same bytes takes; implicit steps and their gradients by size, and what bytes their iterations of conjugate
-gradients move; many scenes at once, explicit and implicit; the same work by peers that are installed (compare_peers.py), on the same
-device. What does not fit the time or the memory is left out, and said so. With --record the rows go to a file, too, and
-parts that are done there are not done again; --half takes the first or the second part of the list.
+gradients move; many scenes at once, explicit and implicit; the same work by peers that are installed (compare_peers.py),
+on the same device. What does not fit the time or the memory is left out, and said so. With --record the rows go
+to a file, too, and parts that are done there are not done again; --half takes the first or the second part of the list.
 """
 
 import argparse

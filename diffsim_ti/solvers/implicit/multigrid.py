@@ -68,14 +68,10 @@ class Multigrid(Preconditioner):
     """
 
     direct = 200  # nodes of which the inverse itself takes less time than levels below them
-    price = (
-        60,
-        20_000,
-    )  # iterations that new numbers cost, of a large body and times the number of vertices of a small one
-    good, strained = (
-        3.0,
-        0.1,
-    )  # iterations per decade that are no reason for others; change of C = F^T F that may be one
+    # measured: iterations that new numbers cost, of a large body, and more, times the vertices, of a small one
+    price = 40, 50_000
+    # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
+    usual, strained = (1.5, 3.0), 0.1
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
         """run: what has the `following` of a run."""
@@ -153,8 +149,10 @@ class Multigrid(Preconditioner):
         if not (0 < residual < 0.5 and iterations > 1):
             return
         now, known = self.run.following, iterations / -np.log10(residual)
-        usual = now.usual or (min(known, self.good) if now.place is None else known)
-        excess = max(iterations * (1 - max(usual, self.good) / known), 0.0)
+        usual = now.usual or max(known, self.usual[0])
+        if now.place is None:  # a solve that was the first one, but not at rest, says too much
+            usual = min(usual, self.usual[1])
+        excess = max(iterations * (1 - usual / known), 0.0)
         self.run.following = Following(now.place, usual, now.excess + excess)
 
     def _is_poor(self, u: np.ndarray) -> bool:

@@ -4,10 +4,10 @@
 
 4 x (N-1) x (N-1) cubic cells, 4/(N-1) x 1 x 1 m, psi = mu/2 (I_C - 3) - mu ln J + lambda/2 ln^2 J, E = 1000 Pa, nu = 0.3.
 Both ends are fixed along x, the two middle planes by symmetry; in ten increments, geometric in stretch, the body gets ten
-times as long, in float64. The force is exactly 3839.48 N. Forward: the ten equilibria, with all that a solve sets up, without
-compiling; gradient: the force's by Young's modulus and Poisson's ratio, after that. Cells are cut into five tetrahedra,
-where torch-fem has hexahedra. A table in Markdown, with torch-fem's published seconds; the exponent with which time grows
-with unknowns; with --peers, an interpreter that has them, the same stretch by torch-fem and by scikit-fem with CHOLMOD.
+times as long, in float64. The force is exactly 3839.48 N. Forward: the ten equilibria, with all that a solve sets up,
+without compiling; gradient: the force's by Young's modulus and Poisson's ratio, after that. Cells are cut into five
+tetrahedra, where torch-fem has hexahedra. A table in Markdown, with torch-fem's published seconds; the exponent with which
+time grows with unknowns; with --peers, an interpreter that has it, the same stretch of the same tetrahedra by torch-fem.
 torch-fem: https://github.com/meyer-nils/torch-fem (its benchmark of large deformations).
 """
 
@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a small plate, once")
     parser.add_argument("--vertices", type=int, nargs="+", default=[35, 65], help="along the long edges, odd")
     parser.add_argument("--repeats", type=int, default=2)
-    parser.add_argument("--peers", help="an interpreter that has torch-fem or scikit-fem")
+    parser.add_argument("--peers", help="an interpreter that has torch-fem")
     options = parser.parse_args()
     sizes, repeats = ([9, 13], 1) if options.quick else (options.vertices, options.repeats)
     rows = []
