@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti.mechanics.energy.assembled import between_nodes, summed
+from diffsim_ti.mechanics.stress.blocks import between_nodes, summed
 
 
 class Projection:
