@@ -45,12 +45,11 @@ def states(n: int) -> dict[str, tuple[Callable, int]]:
         return scene_of(mesh, lambda t: [0.5 * speed * t, 0.0, 0.0], np.where(stiff, 1e7, 1e3))
 
     def pressed(speed):
-        mesh = cube()
+        mesh, felt = cube(), dict(width=2e-3, stiffness_per_area=1e8)
         lid = ds.Box(
-            [0.5, 1.253, 0.5], [1.0, 0.25, 1.0], path=lambda t: [0.5, 1.253 - 0.3 * speed * t, 0.5], width=2e-3
+            [0.5, 1.127, 0.5], [2.0, 0.25, 2.0], path=lambda t: [0.0, -0.3 * speed * t, 0.0], friction=0.5, **felt
         )
-        floor = ds.Ground(-0.002, width=2e-3, friction=0.5)
-        return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, [lid, floor], fixed="xmin", precision="f64")
+        return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, [lid], fixed="ymin", precision="f64")
 
     return {
         "stretched ten times": (
@@ -62,7 +61,7 @@ def states(n: int) -> dict[str, tuple[Callable, int]]:
         "twisted by half a turn": (
             lambda s: scene_of(column(), lambda t: [0, 0, 0, np.pi * s * t, 0, 0]), 10),
         "stiffness 1 to 10 000": (lambda s: contrast(cube, s), 6),
-        "pressed between plates": (pressed, 6),
+        "pressed by a plate": (pressed, 6),
     }  # fmt: skip
 
 

@@ -64,7 +64,8 @@ class Level:
 
     def _measure(self, M) -> None:
         blocks = diagonal_blocks(M)
-        self.theta = THETA * MARGIN * largest_eigenvalue(M, blocks)
+        largest = getattr(M, "largest", None)  # known since it was made
+        self.theta = THETA * MARGIN * (largest or largest_eigenvalue(M, blocks))
         self.put(blocks)
 
     def put_numbers(self, M) -> None:

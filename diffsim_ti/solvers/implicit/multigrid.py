@@ -221,7 +221,8 @@ def smoothed(matrix, motions: np.ndarray, aggregates: list | None = None) -> tup
         tentative, motions = fit_candidates(own, motions)
         blocks = diagonal_blocks(A)
         rows = np.repeat(np.arange(nodes_of(A)), np.diff(A.indptr))
-        data = inverses(blocks)[rows] @ A.data * (-4 / (3 * largest_eigenvalue(A, blocks)))
+        A.largest = largest_eigenvalue(A, blocks)  # which its level needs, too
+        data = inverses(blocks)[rows] @ A.data * (-4 / (3 * A.largest))
         data[rows == A.indices] += np.eye(A.blocksize[0])
         P = bsr_matrix((data, A.indices, A.indptr), shape=A.shape) @ tentative  # by a product, which keeps zeros
         ways.append(P)
