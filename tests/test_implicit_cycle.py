@@ -9,6 +9,7 @@ import diffsim_ti as ds
 from diffsim_ti.mechanics.stress.projection import Projection
 from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
+from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.newton import Newton
 
 
@@ -382,3 +383,41 @@ def test_rounds_that_the_device_leaves_go_on_on_the_host(monkeypatch):
         runs.append((workspace.u_star, workspace.newton.report.indefinite))
     assert runs[0][1] > 0 and runs[1][1] > 0
     assert np.abs(runs[0][0] - runs[1][0]).max() < 1e-4 * np.abs(runs[0][0]).max()
+
+
+def stretched() -> ds.StaticSolver:
+    """A plate that gets eight times as thick in six steps."""
+    mesh = ds.TetrahedralMesh.create_box((5, 11, 11), (0.4, 1.0, 1.0), pattern="five")
+    fixed = {"xmin": "x", "xmax": "x", "ymin": "y", "zmin": "z"}
+    motion = {"xmax": lambda t: [0.4 * (8 ** (t / 6) - 1), 0.0, 0.0]}
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e3, 0.3), 1.0, fixed=fixed, motion=motion, precision="f64")
+    return ds.StaticSolver(scene, dt=1.0, preconditioner="multigrid")
+
+
+def test_matrices_of_the_strained_state(monkeypatch):
+    """They save iterations, come back with a state to the bit, and leave results as they are."""
+    found = {}
+    for price in ((10, 0), (1e9, 0)):
+        monkeypatch.setattr(Multigrid, "price", price)
+        rollout = ds.Rollout(stretched(), 6, gradients=["poissons_ratio"])
+        frames = rollout.forward()
+        assert (rollout.sweep.workspace.preconditioner.following.place is not None) == (price[0] == 10)
+        gradient = rollout.vjp(frames, frames.displacements)["poissons_ratio"]
+        found[price[0]] = frames.displacements[-1], gradient, rollout.report.products
+        again = rollout.forward()
+        assert np.array_equal(frames.displacements, again.displacements)
+        assert gradient == rollout.vjp(again, again.displacements)["poissons_ratio"]
+    (u, g, few), (v, h, many) = found.values()
+    assert few < 0.8 * many
+    np.testing.assert_allclose(u, v, atol=1e-7 * np.abs(v).max())
+    np.testing.assert_allclose(g, h, rtol=1e-6)
+    monkeypatch.setattr(Multigrid, "price", (10, 0))
+    simulator, other = (ds.Simulator(stretched()) for _ in range(2))
+    simulator.run(5)
+    state = {name: x.copy() for name, x in simulator.state.items()}
+    simulator.step()
+    other.resume(state)
+    other.step()
+    assert len(state["preconditioner"]) > 2 and np.array_equal(simulator.displacements, other.displacements)
+    with pytest.raises(ValueError, match="preconditioner: expected 2 finite numbers, or 1817"):
+        other.resume(state | dict(preconditioner=np.zeros(3)))

@@ -324,7 +324,7 @@ def iterations(mesh: ds.TetrahedralMesh, nu: float, volume: str) -> int:
     workspace = ds.StaticSolver(scene).workspace(scene.inputs.derive(scene.inputs.values))
     potential, none = workspace.potential, np.zeros((mesh.num_vertices, 1))
     potential.place(np.zeros_like(mesh.vertices))
-    multigrid = Multigrid(potential, none, workspace.free, none)
+    multigrid = Multigrid(potential, none, workspace.free)
     multigrid.update(np.zeros_like(mesh.vertices))
     load = (none + [0, -1.0, 0]) * workspace.free
     return conjugate_gradients(Operator(potential, none, workspace.free), load, multigrid, 1e-6, 500, 1e-16)[2]

@@ -143,8 +143,8 @@ class JoinedCollisions(ObstacleCollisions):
 class JoinedPreconditioners(Preconditioners):
     """As those of one scene, whose linear systems are solved together."""
 
-    def make(self, kind, size, mass):
+    def make(self, kind, how, mass):
         ws = self.ws
-        made = kind(ws.potential, mass, ws.free, size, ws.parallel and not ws.arrays.by_scene)
+        made = kind(ws.potential, mass, ws.free, how, ws.parallel and not ws.arrays.by_scene)
         made.solver = JoinedCG(made.potential, getattr(made, "cycle", None), made.free, self.ws.parallel)
         return made

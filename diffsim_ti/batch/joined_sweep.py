@@ -102,13 +102,13 @@ class JoinedSweep(BatchSweep):
         self.joined = copy(solver)
         self.joined.scene = joined_scene(solver.scene, num_scenes)
 
-    def _make_workspace(self, derived):
+    def make_workspace(self, derived):
         return JoinedWorkspace(self.joined, derived)
 
     def _make_guard(self):
         return Unguarded(self.workspace)
 
-    def _make_adjoint(self, density, shape):
+    def make_adjoint(self, density, shape):
         return JoinedAdjoint(self.workspace, density, shape)
 
     def states(self):

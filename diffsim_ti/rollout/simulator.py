@@ -21,6 +21,7 @@ from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, warn_of_large_stretch
 from diffsim_ti.solvers import SemiImplicitSolver
+from diffsim_ti.solvers.implicit.multigrid import Following
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.substeps import MOST, needed
 from diffsim_ti.state.bending import FacesBend
@@ -266,8 +267,8 @@ class Simulator(metaclass=Public):
     @property
     def state(self) -> dict[str, np.ndarray]:
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
-        two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps,
-        what steps were given over time, and substeps where more were taken than at the start.
+        two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps and what
+        multigrid has learned there, what steps were given over time, and substeps where more were taken than at the start.
         `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
@@ -278,6 +279,8 @@ class Simulator(metaclass=Public):
             out["displacements_before"], out["velocities_before"] = before
         if self.workspace.last_multipliers is not None:
             out["constraint_pressures"] = self.workspace.last_multipliers
+        if state.beside[0] is not None and state.beside[0].usual is not None:
+            out["preconditioner"] = state.beside[0].numbers()
         if self.solver is not self._first_solver:
             out["substeps"] = np.array(int(self.solver.substeps))
         return out | self._set
@@ -293,7 +296,8 @@ class Simulator(metaclass=Public):
         over_time = set(self._step_values.names)
         held = {"constraint_pressures"} if self.workspace.volumes and not self.solver.explicit else set()
         more_substeps = {"substeps"} if self._first_solver.automatic else set()
-        optional = two_step | over_time | held | more_substeps
+        matrices = set() if self.solver.explicit else {"preconditioner"}
+        optional = two_step | over_time | held | more_substeps | matrices
         lacking, more = known.keys() - optional - given.keys(), given.keys() - known.keys() - optional
         if lacking or more or len(given.keys() & two_step) == 1:
             raise ValueError(
@@ -310,6 +314,7 @@ class Simulator(metaclass=Public):
                     f"resume: {name}: expected finite numbers, {own} of shape {shape}, got {value.dtype} of {value.shape}"
                 )
         law_state = self.workspace.checked_law_state(given["law_state"]) if "law_state" in given else None
+        following = Following.of(given["preconditioner"], shape) if matrices & given.keys() else None
         self.reset()
         kept = {name: given[name] for name in over_time & given.keys()}
         self._set = self._step_values.next(int(count), kept, {})
@@ -323,6 +328,7 @@ class Simulator(metaclass=Public):
             runtime.fill(now.before.u, given["displacements_before"][None])
             runtime.fill(now.before.v, given["velocities_before"][None])
             now.fresh[0] = False
+        now.beside[0] = following
         self.step_count = int(count)
         if more_substeps & given.keys():
             self._take_solver(self.solver.with_substeps(whole("substeps", given["substeps"], 1)))

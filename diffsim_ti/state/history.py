@@ -16,6 +16,7 @@ class History:
     def __init__(self, arrays: SceneArrays, num_slots: int, record: bool, remembers: bool = True):
         n = arrays.num_vertices
         self.num_slots = num_slots
+        self.beside: list = [None] * num_slots  # what solvers keep with each state
         self.u = runtime.array(arrays.vector, num_slots, n)
         self.v = runtime.array(arrays.vector, num_slots, n)
         self.f = runtime.array(arrays.vector, num_slots, n) if record else runtime.array(arrays.vector, 1, 1)
@@ -27,6 +28,7 @@ class History:
     def copy(self, slot: int, target: "History", to: int) -> None:
         """Copy the state in a slot to one of another history; on the CPU without the cost of launches."""
         runtime.check_alive(self.u.owner)
+        target.beside[to] = self.beside[slot]
         for k, view in enumerate(self._views):
             if view is None:
                 copy_slot(self._state[k], slot, target._state[k], to)

@@ -1,11 +1,14 @@
 """What a card computes, and how fast: for the day one is there. Ten minutes at most; exit code 1 if a part fails.
 
     python examples/benchmarks/gpu_gate.py [--arch cuda|vulkan|cpu] [--minutes 10] [--largest 5000000]
+    python examples/benchmarks/gpu_gate.py --record gate.jsonl --half 1   # and, another time, --half 2
 
 Each part runs in a process of its own with a time limit, prints one JSON line, and is a row of the table at the end: the
 device; copies and launches; correctness against the CPU, in float64 and float32; time per substep by size beside what
-copying the same bytes takes; many scenes at once; the same work by peers that are installed (compare_peers.py), on the same
-device. What does not fit the time or the memory is left out, and said so.
+copying the same bytes takes; implicit steps and their gradients by size, and what bytes their iterations of conjugate
+gradients move; many scenes at once, explicit and implicit; the same work by peers that are installed (compare_peers.py),
+on the same device. What does not fit the time or the memory is left out, and said so. With --record the rows go
+to a file, too, and parts that are done there are not done again; --half takes the first or the second part of the list.
 """
 
 import argparse
@@ -183,6 +186,65 @@ def speed(options, tetrahedra: int) -> dict:
     )
 
 
+def bytes_of_iteration(workspace, preconditioner) -> int:
+    """What an iteration of conjugate gradients with multigrid has to move at least: of elements indices, gradients, volumes,
+    coefficients, displacements and directions of their corners and forces on them; of each level its matrix six times; of
+    vertices five vectors read and three written."""
+    arrays, real = workspace.arrays, 4 if workspace.scene.precision == "f32" else 8
+    elements = arrays.num_tetrahedra * (16 + real * (9 + 1 + 2 + 3 * 12))
+    levels = getattr(getattr(preconditioner, "cycle", None), "levels", [])
+    cycle = sum(6 * 4 * np.prod((*x.values.shape, *x.values.element_shape)) for x in levels[:-1])
+    return int(elements + cycle + arrays.num_vertices * 3 * real * 8)
+
+
+def implicit(options, tetrahedra: int) -> dict:
+    """Backward Euler of a block that is held on one side and falls: time of a step and of its gradient, products with the
+    Hessian, and the bytes that these have to move by the time of the step."""
+    if tetrahedra > options.largest:
+        return dict(left_out="beyond --largest")
+    mesh, steps = ds.TetrahedralMesh.create_cube(SIZES[tetrahedra], 1.0), 3
+    precision = "f32" if runtime.arch_name() == "vulkan" else "f64"
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 1000.0, [ds.Gravity(-9.81)], "xmin", precision=precision)
+    rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=1e-2), steps, gradients=["youngs_modulus"])
+    begin = time.perf_counter()
+    frames = rollout.forward()
+    rollout.vjp(frames, frames.displacements)
+    first = time.perf_counter() - begin
+    forward = seconds(rollout.forward, 2) / steps
+    frames = rollout.forward()
+    gradient = seconds(lambda: rollout.vjp(frames, frames.displacements), 2) / steps
+    products, ws = rollout.report.products / steps, rollout.sweep.workspace
+    moved = bytes_of_iteration(ws, ws.newton.preconditioner)
+    return dict(
+        first_s=round(first, 1),
+        step_ms=round(1e3 * forward, 1),
+        gradient_ms=round(1e3 * gradient, 1),
+        products=round(products, 1),
+        megabytes_of_iteration=round(moved / 1e6, 1),
+        step_GB_per_s=round(products * moved / forward / 1e9, 2),
+        passed=bool(np.isfinite(frames.positions).all()),
+    )
+
+
+def implicit_batch(options, scenes: int) -> dict:
+    """Many scenes of 750 tetrahedra on a rough floor by backward Euler: time of a step of one, and of its gradient."""
+    if 750 * scenes > max(options.largest, 6_000):
+        return dict(left_out="beyond --largest")
+    mesh, steps = ds.TetrahedralMesh.create_cube(6, 0.1), 2
+    precision = "f32" if runtime.arch_name() == "vulkan" else "f64"
+    terms = [ds.Gravity(-9.8), ds.Ground(mesh.vertices[:, 1].min() - 1e-3, 1e3, 2e-3, friction=0.3)]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, terms, precision=precision)
+    batch = ds.Batch(ds.ImplicitEulerSolver(scene, dt=5e-3), steps, scenes, gradients=["youngs_modulus"])
+    values = dict(youngs_modulus=np.random.default_rng(0).uniform(4e4, 6e4, scenes))
+    frames = batch.forward(**values)
+    seeds = np.ones_like(frames.positions)
+    batch.vjp(frames, seeds)
+    forward = seconds(lambda: batch.forward(**values), 1) / (steps * scenes)
+    both = seconds(lambda: batch.vjp(batch.forward(**values), seeds), 1) / (steps * scenes)
+    alive = bool(frames.alive.all())
+    return dict(step_ms=round(1e3 * forward, 3), with_gradient_ms=round(1e3 * both, 3), lanes=batch.lanes, passed=alive)
+
+
 def batch(options, scenes: int) -> dict:
     """Many scenes of 750 tetrahedra, with contact: time of a substep of one, forward and with its reverse; some against
     what they are alone."""
@@ -226,8 +288,11 @@ for _kind in ("explicit", "implicit", "self-contact"):
     for _precision in ("f64", "f32"):
         PARTS[f"{_kind} {_precision}"] = lambda options, k=_kind, p=_precision: correctness(options, k, p)
 PARTS |= {"divergence": divergence, "torch": torch_streams}
+PARTS |= {f"implicit, {n:,} tetrahedra": lambda options, n=n: implicit(options, n) for n in list(SIZES)[:4]}
+SECOND = len(PARTS)  # parts of the first half
 PARTS |= {f"{n:,} tetrahedra": lambda options, n=n: speed(options, n) for n in SIZES}
-PARTS |= {f"{n:,} scenes": lambda options, n=n: batch(options, n) for n in (1, 64, 4096)}
+PARTS |= {f"{n:,} scenes": lambda options, n=n: batch(options, n) for n in (1, 64, 256, 4096)}
+PARTS |= {f"implicit, {n:,} scenes": lambda options, n=n: implicit_batch(options, n) for n in (1, 64, 256, 4096)}
 PARTS |= {f"{who}, 48,000": lambda options, who=who: peers(options, who) for who in work.PEERS}
 
 
@@ -266,22 +331,33 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help="these parts alone")
     parser.add_argument("--part", help=argparse.SUPPRESS)
     parser.add_argument("--folder", help=argparse.SUPPRESS)
+    parser.add_argument("--half", type=int, choices=[1, 2], help="the parts of one half alone")
+    parser.add_argument("--record", type=Path, help="a file of rows, whose parts are not done again")
     options = parser.parse_args()
     if options.part:
         print(json.dumps(run_part(options, options.part)))
         return 0
     end, rows = time.monotonic() + 60 * options.minutes, {}
+    if options.record and options.record.exists():
+        known = (json.loads(line) for line in options.record.read_text().splitlines())
+        rows = {row["part"]: row for row in known if "no time left" not in row.get("left_out", "")}
+        rows.pop("reference", None)  # which those that follow read
+    half = {None: slice(None), 1: slice(SECOND), 2: slice(SECOND, None)}[options.half]
     with tempfile.TemporaryDirectory() as folder:
-        for name in options.only or PARTS:
-            left = end - time.monotonic()
-            start = time.monotonic()
-            rows[name] = ask(options, name, min(left, 120), folder) if left > 5 else dict(left_out="no time left")
-            print(json.dumps(dict(part=name, seconds=round(time.monotonic() - start, 1)) | rows[name]), flush=True)
+        for name in [name for name in options.only or list(PARTS)[half] if name not in rows]:
+            left, start = end - time.monotonic(), time.monotonic()
+            row = ask(options, name, min(left, 120), folder) if left > 5 else dict(left_out="no time left")
+            rows[name] = dict(part=name, seconds=round(time.monotonic() - start, 1)) | row
+            print(json.dumps(rows[name]), flush=True)
+            if options.record:
+                with options.record.open("a") as file:
+                    file.write(json.dumps(rows[name]) + "\n")
     print("\n| part | |\n| --- | --- |")
     for name, row in rows.items():
         cells = (
             f"{key} {value:.2g}" if isinstance(value, float) and value < 1 else f"{key} {value}"
             for key, value in row.items()
+            if key not in ("part", "seconds")
         )
         print(f"| {name} | {', '.join(cells) or 'done'} |")
     return int(any(row.get("passed") is False for row in rows.values()))

@@ -5,6 +5,7 @@ import numpy as np
 from diffsim_ti.inputs import ConsistentMass, Mass
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.stress.blocks import between_nodes, summed
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of, projectors_of
 from diffsim_ti.state.arrays import SceneArrays
 
@@ -20,11 +21,7 @@ def element_matrices(potential) -> np.ndarray:
     if a.points == 1:
         out = np.empty((count, k, k, 3, 3))
         for part, C in potential.tangent_chunks(CHUNK):
-            own, scaled = N[part], np.swapaxes(N[part] * V[part, None, None], 1, 2)
-            right = np.matmul(C.reshape(-1, 27, 3), scaled).reshape(-1, 3, 3, 3 * k)  # i, j, (k, b)
-            right = np.ascontiguousarray(np.swapaxes(right, 1, 2)).reshape(-1, 3, 9 * k)
-            both = np.matmul(own, right).reshape(-1, k, 3, 3, k)  # a, i, k, b
-            out[part] = np.moveaxis(both, 4, 2)
+            out[part] = between_nodes(C, N[part], V[part])
         return out
     C = potential.tangents().reshape(count, 27, 3)
     right = np.matmul(C * V[:, None, None], np.swapaxes(N, 1, 2)).reshape(count, 3, 3, 3, k)
@@ -56,13 +53,7 @@ def assemble(potential, mass: Mass, free: Free, more=()):
         places = np.concatenate([places, np.repeat(np.arange(n), np.diff(own.indptr)) * n + own.indices])
         parts.append(own.data.reshape(-1, 9))
     each = np.arange(n, dtype=np.int64) * (n + 1)  # also of vertices in no tetrahedron
-    places, inverse = np.unique(np.concatenate([places, each]), return_inverse=True)
-    data, first = np.zeros((len(places), 9)), 0
-    for entries in parts:
-        own, first = inverse[first : first + len(entries)], first + len(entries)
-        for k in range(9):
-            data[:, k] += np.bincount(own, entries[:, k], len(places))
-    data = data.reshape(-1, 3, 3)
+    places, data = summed(np.concatenate([places, each]), np.concatenate([*parts, np.zeros((n, 9))]))
     rows, columns = places // n, places % n
     is_free, P = mask_of(free)[:, 0] > 0, projectors_of(free)
     data[~(is_free[rows] & is_free[columns])] = 0

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.mechanics.stress.blocks import between_nodes, summed
+
 
 class Projection:
     """w -> sum over points of V B^T (C+ - C) B w, with C = d2psi/dF2 and C+ the same without negative eigenvalues, and the
@@ -30,21 +32,16 @@ class Projection:
         blocks = potential.obstacle_blocks() if a.contacts else np.zeros((a.num_vertices, 3, 3))
         self.raised = without_negative(blocks) - blocks
 
-    def matrix(self):
-        """The same as a SciPy matrix [N/m]."""
-        from scipy.sparse import bsr_matrix, coo_matrix
+    def matrix(self, obstacles: bool = True):
+        """The same as a SciPy matrix [N/m], with obstacles or of tetrahedra alone."""
+        from scipy.sparse import bsr_matrix
 
-        C = self.C.reshape(-1, 3, 3, 3, 3)
-        blocks = np.einsum("eai,ecidj,ebj->eacbd", self.N, C, self.N, optimize=True)
-        at, size = (
-            (3 * self.nodes[:, :, None] + np.arange(3)).reshape(len(C), 3 * self.nodes.shape[1]),
-            3 * self.num_vertices,
-        )
-        rows, columns = (x.ravel() for x in np.broadcast_arrays(at[:, :, None], at[:, None]))
-        raised = bsr_matrix((self.raised, np.arange(self.num_vertices), np.arange(self.num_vertices + 1)))
-        out = coo_matrix((blocks.ravel(), (rows, columns)), shape=(size, size)).tocsr() + raised.tocsr()
-        out.eliminate_zeros()
-        return out
+        n = self.num_vertices
+        places = (self.nodes[:, :, None].astype(np.int64) * n + self.nodes[:, None, :]).ravel()
+        places, blocks = summed(places, between_nodes(self.C, self.N))
+        start = np.searchsorted(places, n * np.arange(n + 1))
+        out = bsr_matrix((blocks, places % n, start), shape=(3 * n, 3 * n))
+        return out + bsr_matrix((self.raised, np.arange(n), np.arange(n + 1))) if obstacles else out
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         dH = np.einsum("eac,eaj->ecj", w[self.nodes], self.N)

@@ -12,42 +12,66 @@ from diffsim_ti.solvers.implicit.cycle_kernels import THETA, CycleKernels, Level
 SWEEPS, MARGIN = 20, 1.05  # power iterations for a largest eigenvalue, and what they are trusted to
 
 
-def upload_rows(blocks: np.ndarray, numbers: int):
-    """Columns of blocks, shape (k, numbers, columns), as an array of k x columns vectors."""
-    width = {3: 4, 6: 8}[numbers]
-    out = np.zeros((len(blocks), blocks.shape[2], width), np.float32)
+def rows_of(blocks: np.ndarray) -> np.ndarray:
+    """Columns of blocks, shape (k, numbers, columns), as k x columns vectors."""
+    numbers = blocks.shape[1]
+    out = np.zeros((len(blocks), blocks.shape[2], {3: 4, 6: 8}[numbers]), np.float32)
     out[:, :, :numbers] = np.swapaxes(blocks, 1, 2)
-    return runtime.upload(out.reshape(-1, width), ROWS[numbers])
+    return out.reshape(-1, out.shape[2])
+
+
+def upload_rows(blocks: np.ndarray):
+    """The same on the device."""
+    return runtime.upload(rows_of(blocks), ROWS[blocks.shape[1]])
 
 
 def block_matrix(M) -> SimpleNamespace:
     """A SciPy matrix of blocks on the device."""
     return SimpleNamespace(
-        start=runtime.upload(M.indptr, ti.i32),
-        column=runtime.upload(M.indices, ti.i32),
-        values=upload_rows(M.data, M.blocksize[0]),
+        start=runtime.upload(M.indptr, ti.i32), column=runtime.upload(M.indices, ti.i32), values=upload_rows(M.data)
     )
+
+
+def nodes_of(M) -> int:
+    """Rows of blocks."""
+    return M.shape[0] // M.blocksize[0]
+
+
+def diagonal_blocks(M) -> np.ndarray:
+    """Of a matrix of square blocks."""
+    rows = np.repeat(np.arange(nodes_of(M)), np.diff(M.indptr))
+    out, on = np.zeros((nodes_of(M), *M.blocksize)), rows == M.indices
+    out[rows[on]] = M.data[on]
+    return out
 
 
 class Level:
     """A level: a matrix of square blocks whose largest eigenvalue against its diagonal blocks is found here."""
 
     def __init__(self, M, parallel: bool):
-        self.numbers, self.nodes = M.blocksize[0], M.shape[0] // M.blocksize[0]
+        self.numbers, self.nodes = M.blocksize[0], nodes_of(M)
         rows = np.repeat(np.arange(self.nodes), np.diff(M.indptr))
-        on = rows == M.indices
-        self.diagonal_blocks = np.zeros((self.nodes, self.numbers, self.numbers))
-        self.diagonal_blocks[rows[on]] = M.data[on]
-        start = np.concatenate([[0], np.cumsum(np.bincount(rows[~on], minlength=self.nodes))])
-        self.start, self.column = runtime.upload(start, ti.i32), runtime.upload(M.indices[~on], ti.i32)
-        self.values = upload_rows(M.data[~on], self.numbers)
+        self._off = rows != M.indices
+        start = np.concatenate([[0], np.cumsum(np.bincount(rows[self._off], minlength=self.nodes))])
+        self.start, self.column = runtime.upload(start, ti.i32), runtime.upload(M.indices[self._off], ti.i32)
+        self.values = upload_rows(M.data[self._off])
         self.b, self.x, self.d, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(4))
         self.diagonal, self.inverse = (runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2))
         self.kernels = kernels_of(LevelKernels, self.numbers, "f32", parallel)
         shape = self.nodes, self.numbers, self.inverse.element_shape[0]
         self._columns = [np.zeros(shape, np.float32) for _ in range(2)]  # of blocks, filled up with zeros
-        self.theta = THETA * MARGIN * largest_eigenvalue(M, self.diagonal_blocks)
-        self.put(self.diagonal_blocks)
+        self._measure(M)
+
+    def _measure(self, M) -> None:
+        blocks = diagonal_blocks(M)
+        largest = getattr(M, "largest", None)  # known since it was made
+        self.theta = THETA * MARGIN * (largest or largest_eigenvalue(M, blocks))
+        self.put(blocks)
+
+    def put_numbers(self, M) -> None:
+        """Set those of another matrix with the same places."""
+        runtime.fill(self.values, rows_of(M.data[self._off]))
+        self._measure(M)
 
     def put(self, diagonal: np.ndarray, nodes=slice(None)) -> None:
         """Set the diagonal blocks of some nodes."""
@@ -94,7 +118,7 @@ def inverse_matrix(M):
     from scipy.sparse import bsr_matrix
     from scipy.sparse.csgraph import connected_components
 
-    k, b = M.shape[0] // M.blocksize[0], M.blocksize[0]
+    k, b = nodes_of(M), M.blocksize[0]
     graph = bsr_matrix((np.ones((len(M.indices), 1, 1)), M.indices, M.indptr), shape=(k, k)).tocsr()
     count, label = connected_components(graph, directed=False)
     M, rows, columns, data = M.tocsr(), [], [], []
@@ -128,6 +152,7 @@ class Cycle:
     def __init__(self, matrices: list, ways: list, frames, parallel: bool):
         self.frames = frames
         self.levels = [Level(M, self._wide(M, parallel)) for M in matrices]
+        self._entries = [len(M.data) for M in (*matrices, *ways)]
         self._down, self._up = [], []  # (kernel, records, numbers)
         for level, below, P in zip(self.levels, self.levels[1:], ways):
             kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel))
@@ -136,15 +161,27 @@ class Cycle:
             )
             self._down.append((kernels.down, between, dict(nodes=level.nodes, below=below.nodes)))
             self._up.insert(0, (kernels.up, between, dict(nodes=level.nodes)))
-        last = self.levels[-1]
-        inverse = dict(level=last, inverse=block_matrix(inverse_matrix(matrices[-1])))
+        last, self._inverse = self.levels[-1], block_matrix(inverse_matrix(matrices[-1]))
+        inverse = dict(level=last, inverse=self._inverse)
         self._solve = last.kernels.solve, inverse, dict(nodes=last.nodes)
         vectors = "f32" if runtime.arch_name() == "vulkan" else "f64"
         self._ends = kernels_of(LevelKernels, 3, vectors, self._wide(matrices[0], parallel))
         self._bound = {}
 
     def _wide(self, M, parallel: bool) -> bool:
-        return parallel and M.shape[0] // M.blocksize[0] > self.wide or not runtime.runs_on_cpu()
+        return parallel and nodes_of(M) > self.wide or not runtime.runs_on_cpu()
+
+    def put(self, matrices: list, ways: list) -> bool:
+        """Set the numbers of other matrices and ways; False where their entries are not in the same places."""
+        if [len(M.data) for M in (*matrices, *ways)] != self._entries:
+            return False
+        for level, M in zip(self.levels, matrices):
+            level.put_numbers(M)
+        for (_, between, _), P in zip(self._down, ways):
+            runtime.fill(between["down"].values, rows_of(P.T.tobsr(P.blocksize[::-1]).data))
+            runtime.fill(between["up"].values, rows_of(P.data))
+        runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
+        return True
 
     def put_diagonal(self, blocks: np.ndarray, nodes=slice(None)) -> None:
         """Set the diagonal blocks of some nodes of the finest level."""

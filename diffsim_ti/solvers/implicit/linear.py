@@ -111,9 +111,10 @@ def _in_turn(operator, preconditioner, most: int):
     yield other, most
 
 
-def _count(preconditioner, products: int) -> None:
+def _count(preconditioner, residual: float, products: int) -> None:
     if isinstance(preconditioner, Preconditioner):
         preconditioner.spent += products
+        preconditioner.learn(residual, products)
 
 
 def _say(preconditioner, message: str) -> None:
@@ -132,7 +133,7 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
     """
     for own, most in _in_turn(operator, preconditioner, max_iterations):
         found = _conjugate_gradients(operator, b, own, tolerance, most, eps)
-        _count(own, found[2])
+        _count(own, *found[1:3])
         if found[1] <= tolerance or found[3] is not None:
             break
         if own is preconditioner and not np.isfinite(found[1]):
@@ -182,7 +183,7 @@ def gmres(operator, b, preconditioner, tolerance: float, max_iterations: int, re
     """
     for own, most in _in_turn(operator, preconditioner, max_iterations):
         found = _gmres(operator, b, own, tolerance, most, restart)
-        _count(own, found[2])
+        _count(own, *found[1:3])
         if found[1] <= tolerance:
             break
     return found

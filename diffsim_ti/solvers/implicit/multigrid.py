@@ -1,24 +1,64 @@
 """Algebraic multigrid of the body at rest, turned with it, as a preconditioner for c M + d2E/du2."""
 
+from dataclasses import dataclass
+from types import SimpleNamespace
+
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.energy.assembled import assemble
-from diffsim_ti.mechanics.stress.projection import without_negative
+from diffsim_ti.mechanics.stress.projection import Projection, without_negative
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, projectors_of
-from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
+from diffsim_ti.solvers.implicit.cycle import (
+    Cycle,
+    diagonal_blocks,
+    inverses,
+    largest_eigenvalue,
+    nodes_of,
+    upload_rows,
+)
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 from diffsim_ti.solvers.implicit.factorised import eliminated
 from diffsim_ti.solvers.implicit.preconditioners import Preconditioner
 from diffsim_ti.solvers.implicit.rotations import Frames
 
+STRONG = 0.07  # share of the mean of two diagonals from which on aggregates join; measured
+
+
+@dataclass(frozen=True)
+class Following:
+    """The state that the matrices of a run are of: its displacements, None at rest; iterations of conjugate gradients per
+    decade of residual there; iterations spent beyond that since. It goes with the states of a run, so that one that starts
+    again from any of them takes the same steps."""
+
+    place: np.ndarray | None = None
+    usual: float | None = None
+    excess: float = 0.0
+
+    def numbers(self) -> np.ndarray:
+        """For a file."""
+        place = () if self.place is None else self.place.ravel()
+        return np.array([self.excess, self.usual or 0.0, *place])
+
+    @classmethod
+    def of(cls, numbers: np.ndarray, shape: tuple) -> "Following":
+        """Of `numbers`, for displacements of a shape. Raises ValueError."""
+        if numbers.shape not in ((2,), (2 + np.prod(shape),)) or not np.all(np.isfinite(numbers)):
+            raise ValueError(
+                f"resume: preconditioner: expected 2 finite numbers, or {2 + np.prod(shape)}, as `state` has them, got an "
+                f"array of shape {numbers.shape}"
+            )
+        return cls(numbers[2:].reshape(shape) if len(numbers) > 2 else None, float(numbers[1]), float(numbers[0]))
+
 
 class Multigrid(Preconditioner):
-    """Smoothed aggregation on the assembled matrix of the rest state, host forces included, with rigid motions as near
-    kernel.
+    """Smoothed aggregation on the assembled matrix, host forces included, with rigid motions as near kernel: of the rest
+    state, or of the one that `following` names.
 
     Isotropic laws: turning a body turns its stiffness, K(R u) = R K(u) R^T. So residuals are turned back by each vertex's
     mean rotation, and corrections forth. Contact stiffness, and that of host forces as it changes, join the finest level.
+    Where strains have grown so much that iterations in excess cost more than numbers of the matrices do, these are made anew
+    at the present state, its tetrahedra made positive semidefinite, on the same aggregates.
     The V-cycle over it is cycle.py's.
     Below ten-node tetrahedra lie the linear ones of their corners, and aggregates of these (p-multigrid): aggregates of all
     ten nodes take half as many iterations again.
@@ -28,44 +68,126 @@ class Multigrid(Preconditioner):
     """
 
     direct = 200  # nodes of which the inverse itself takes less time than levels below them
+    # measured: iterations that new numbers cost, of a large body, and more, times the vertices, of a small one
+    price = 40, 50_000
+    # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
+    usual, strained = (1.5, 3.0), 0.1
 
-    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = False):
-        self.potential, self.free = potential, free
-        mesh, rest = potential.arrays.mesh, potential.arrays.values.rest
-        with potential.at_rest():
-            at, hosts = potential.held_at, potential.hosts.matrices(potential.held_at)
-            potential.blocks()
-            matrix, diagonal = assemble(potential, mass, free, [own for own, _ in hosts])
-            self._ties = getattr(free, "elimination", None)
-            if self._ties is not None:
-                matrix, diagonal = glued(matrix, _short(self._ties))
-            self._known = np.zeros((len(at), 3, 3))  # of what `update` adds
-            for _, own in hosts:
-                self._known = self._known + (free.around(own) if isinstance(free, FreeDirections) else own)
-        aggregated, allowed = matrix, free
-        if mesh.order == 2:
-            aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest, self._ties)
-        matrices, ways = [aggregated], []
-        changes = potential.arrays.contacts or potential.pairs or potential.hosts  # on the finest level
-        scenes = potential.arrays.num_scenes
-        if changes or len(rest) > scenes * self.direct:
-            matrices, ways = _aggregated(aggregated, _allowed(_rigid_motions(rest), allowed), scenes)
-        if mesh.order == 2:
-            matrices, ways = [matrix, *matrices], [up, *ways]
-        self._at_rest = matrix.data[diagonal]
+    def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
+        """run: what has the `following` of a run."""
+        self.potential, self.mass, self.free = potential, mass, free
+        self.run = run or SimpleNamespace(following=Following())
+        self._ties = getattr(free, "elimination", None)
+        a = potential.arrays
+        self._follows = (
+            potential.z is None and potential.held is None and not potential.hosts and a.values.growths is None
+        ) and a.num_scenes == 1
         self.frames = Frames(potential, parallel)
-        self.frames.allowed = upload_rows(projectors_of(free), 3)
-        matrices, ways = [as_blocks(M) for M in matrices], [as_blocks(P) for P in ways]
+        self.frames.allowed = upload_rows(projectors_of(free))
+        self._aggregates = None
+        with potential.at_rest():
+            self.frames.update()
+            matrices, ways = self._levels()
+        self.place = None
         self.cycle = Cycle(matrices, ways, self.frames, parallel)
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
-        self._contact = None
+
+    def begin(self) -> None:
+        super().begin()
+        if self.place is not self.run.following.place:
+            self._go_to(self.run.following.place)
+
+    def _go_to(self, place: np.ndarray | None) -> None:
+        """Make the numbers of the matrices those of another state."""
+        self.place, u = place, self.potential.held_at
+        if place is None:
+            with self.potential.at_rest():
+                self.frames.update()
+                self.cycle.put(*self._levels())
+            return
+        self.potential.place(place)
+        self.frames.update()
+        for slight in (0.01, 0.0):
+            correction = Projection(self.potential, slight)
+            matrices, ways = self._levels([correction.matrix(obstacles=False)] if len(correction.C) else [])
+            if is_definite(matrices[-1]):
+                break
+        self._follows = self.cycle.put(matrices, ways)
+        self.potential.place(u)
+
+    def _levels(self, more=()) -> tuple[list, list]:
+        """(matrices of all levels, ways from each to the one before) where the potential stands, turned back by frames."""
+        potential, free = self.potential, self.free
+        a, mesh = potential.arrays, potential.arrays.mesh
+        hosts, x, R = (
+            potential.hosts.matrices(potential.held_at),
+            a.values.rest + potential.held_at,
+            self.frames.matrices(),
+        )
+        potential.blocks()
+        matrix, diagonal = assemble(potential, self.mass, free, [*more, *(own for own, _ in hosts)])
+        if self._ties is not None:
+            matrix, diagonal = glued(matrix, _short(self._ties))
+        self._known = np.zeros((len(x), 3, 3))  # of what `update` adds
+        for _, own in hosts:
+            self._known = self._known + (free.around(own) if isinstance(free, FreeDirections) else own)
+        self._contact, aggregated, allowed, above, ways = None, matrix, free, [], []
+        if mesh.order == 2:
+            aggregated, allowed, x, up = of_corners(matrix, free, mesh, x, self._ties)
+            ways, above = [turned(as_blocks(up), R, R[mesh.corners])], [turned(matrix, R, R)]
+            R = R[mesh.corners]
+        matrices = [turned(aggregated, R, R)]
+        self._diagonal = (above or matrices)[0].data[diagonal]
+        if self._changes or len(x) > a.num_scenes * self.direct:  # changes are on the finest level
+            motions = np.swapaxes(R, 1, 2) @ (projectors_of(allowed) @ _rigid_motions(x))
+            motions = motions.reshape(-1, 6)
+            matrices, found, self._aggregates = smoothed(matrices[0], motions, self._aggregates, a.num_scenes)
+            ways = [*ways, *found]
+        return [as_blocks(M) for M in (*above, *matrices)], [as_blocks(P) for P in ways]
+
+    def learn(self, residual: float, iterations: int) -> None:
+        """What a solve took."""
+        if not (0 < residual < 0.5 and iterations > 1):
+            return
+        now, known = self.run.following, iterations / -np.log10(residual)
+        usual = now.usual or max(known, self.usual[0])
+        if now.place is None:  # a solve that was the first one, but not at rest, says too much
+            usual = min(usual, self.usual[1])
+        excess = max(iterations * (1 - usual / known), 0.0)
+        self.run.following = Following(now.place, usual, now.excess + excess)
+
+    def _is_poor(self, u: np.ndarray) -> bool:
+        """Whether other numbers would pay."""
+        fixed, small = self.price
+        now = self.run.following
+        if not self._follows or now.excess <= fixed + small / len(u):
+            return False
+        nodes, N, V = self.potential.stress_points
+        here, there = (
+            np.einsum("eai,eaj->eij", (np.zeros_like(u) if w is None else w)[nodes], N) + np.eye(3)
+            for w in (u, self.place)
+        )
+        here, there = (np.swapaxes(F, 1, 2) @ F for F in (here, there))
+        change = ((here - there) ** 2).sum((1, 2)) / (there**2).sum((1, 2))
+        self.run.following = Following(now.place, now.usual)
+        return bool((V * change).sum() > self.strained**2 * V.sum())
+
+    @property
+    def _changes(self) -> bool:
+        """Whether the finest level changes beside its turning."""
+        return bool(self.potential.arrays.contacts or self.potential.pairs or self.potential.hosts)
 
     def updating(self) -> tuple[list, object]:
-        changes = self.potential.arrays.contacts or self.potential.pairs or self.potential.hosts
-        return ([], None) if changes else ([self.frames.part], self.frames.body)
+        return ([], None) if self._changes else ([self.frames.part], self.frames.body)
+
+    def follow(self, u: np.ndarray) -> None:
+        if self._is_poor(u):
+            self.run.following = Following(u.copy())
+            self._go_to(self.run.following.place)
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
+        self.follow(u)
         self.frames.update()
         contact = self.potential.contact_blocks()
         if contact is None:
@@ -78,7 +200,7 @@ class Multigrid(Preconditioner):
         before = np.zeros_like(contact) if self._contact is None else self._contact
         changed = np.flatnonzero((contact != before).any((1, 2)))
         if len(changed):
-            self.cycle.put_diagonal(self._at_rest[changed] + contact[changed], changed)
+            self.cycle.put_diagonal(self._diagonal[changed] + contact[changed], changed)
         self._contact = contact
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
@@ -90,32 +212,61 @@ class Multigrid(Preconditioner):
         return (z if T is None else (T @ z.ravel()).reshape(z.shape)) * self.free
 
 
-def _aggregated(matrix, motions: np.ndarray, scenes: int = 1) -> tuple[list, list]:
-    """(matrices of all levels, ways from each to the one before) by smoothed aggregation, which leaves rigid motions to the
-    coarse ones. Of several scenes those of the first say the ways of all."""
-    import pyamg
+def smoothed(
+    matrix, motions: np.ndarray, aggregates: list | None = None, scenes: int = 1
+) -> tuple[list, list, list | None]:
+    """(matrices of all levels, ways from each to the one before, aggregates of each level but the last) by smoothed
+    aggregation, which leaves motions, shape (3 nodes, 6), to the coarse ones; aggregates: of the same matrix with other
+    numbers. Of several scenes those of the first say the ways of all."""
+    from pyamg.aggregation import standard_aggregation
+    from pyamg.aggregation.tentative import fit_candidates
+    from pyamg.strength import symmetric_strength_of_connection
+    from scipy.sparse import bsr_matrix
 
     if scenes > 1:
         n = matrix.shape[0] // scenes
-        one = matrix.tocsr()[:n, :n].tobsr(matrix.blocksize)
-        ways, matrices = [_repeated(P, scenes) for P in _aggregated(one, motions[:n])[1]], [matrix]
+        one = smoothed(matrix.tocsr()[:n, :n].tobsr(matrix.blocksize), motions[:n])[1]
+        ways, matrices = [_repeated(P, scenes) for P in one], [matrix]
         for P in ways:
-            matrices.append((P.T @ matrices[-1] @ P).tobsr((P.blocksize[1],) * 2))
-        return matrices, ways
+            matrices.append((P.T @ (matrices[-1] @ P)).tobsr((6, 6)))
+        return matrices, ways, None
 
-    state = np.random.get_state()
-    np.random.seed(0)  # pyamg estimates a spectral radius from a random vector
-    try:
-        levels = pyamg.smoothed_aggregation_solver(
-            matrix,
-            B=motions,
-            strength=("symmetric", {"theta": 0.08}),
-            improve_candidates=(("block_gauss_seidel", {"sweep": "symmetric", "iterations": 2}), None),
-            max_coarse=min(100, matrix.shape[0] // (4 * matrix.blocksize[0])),
-        ).levels
-    finally:
-        np.random.set_state(state)
-    return [matrix, *(level.A for level in levels[1:])], [level.P for level in levels[:-1]]
+    matrices, ways, found = [matrix], [], []
+    most = min(100, matrix.shape[0] // (4 * matrix.blocksize[0]))
+    while len(found) < len(aggregates) if aggregates is not None else nodes_of(matrices[-1]) > most:
+        A = matrices[-1]
+        if aggregates is not None:
+            own = aggregates[len(found)]
+        else:
+            own, _ = standard_aggregation(symmetric_strength_of_connection(A, STRONG))
+            if not 0 < own.shape[1] < own.shape[0]:
+                break
+        tentative, motions = fit_candidates(own, motions)
+        blocks = diagonal_blocks(A)
+        rows = np.repeat(np.arange(nodes_of(A)), np.diff(A.indptr))
+        A.largest = largest_eigenvalue(A, blocks)  # which its level needs, too
+        data = inverses(blocks)[rows] @ A.data * (-4 / (3 * A.largest))
+        data[rows == A.indices] += np.eye(A.blocksize[0])
+        P = bsr_matrix((data, A.indices, A.indptr), shape=A.shape) @ tentative  # by a product, which keeps zeros
+        ways.append(P)
+        matrices.append((P.T @ (A @ P)).tobsr((6, 6)))
+        found.append(own)
+    return matrices, ways, found
+
+
+def turned(M, rows: np.ndarray, columns: np.ndarray):
+    """R^T M Q for rotations R of the rows of blocks, and Q of the columns."""
+    from scipy.sparse import bsr_matrix
+
+    at = np.repeat(np.arange(nodes_of(M)), np.diff(M.indptr))
+    data = np.swapaxes(rows, 1, 2)[at] @ M.data @ columns[M.indices]
+    return bsr_matrix((data, M.indices, M.indptr), shape=M.shape)
+
+
+def is_definite(M) -> bool:
+    """Whether the least eigenvalue of a matrix is not negative, but for rounding."""
+    values = np.linalg.eigvalsh(M.toarray())
+    return bool(values[0] > -1e-9 * values[-1])
 
 
 def _repeated(M, count: int):
@@ -184,11 +335,6 @@ def _block_diagonal(blocks: np.ndarray):
     return bsr_matrix((blocks, np.arange(k), np.arange(k + 1)), shape=(3 * k, 3 * k)).tocsr()
 
 
-def _allowed(motions: np.ndarray, free: Free) -> np.ndarray:
-    """What may be done of motions, shape (3 num_vertices, k)."""
-    return (projectors_of(free) @ motions.reshape(-1, 3, motions.shape[1])).reshape(motions.shape)
-
-
 def _rigid_motions(X: np.ndarray) -> np.ndarray:
     x, y, z = (X - X.mean(0)).T
     out = np.zeros((len(X), 3, 6))
@@ -196,4 +342,4 @@ def _rigid_motions(X: np.ndarray) -> np.ndarray:
     out[:, 0, 3], out[:, 1, 3] = -y, x
     out[:, 1, 4], out[:, 2, 4] = -z, y
     out[:, 0, 5], out[:, 2, 5] = z, -x
-    return out.reshape(-1, 6)
+    return out

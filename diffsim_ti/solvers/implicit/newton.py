@@ -224,14 +224,14 @@ class Newton:
         """Whether Phi falls in some direction where the potential stands."""
         return self._downhill() is not None
 
-    def follows(self, u: np.ndarray, change: np.ndarray, way: np.ndarray) -> np.ndarray | None:
+    def follows(self, u: np.ndarray, change: np.ndarray, way: np.ndarray, tolerance: float = 0.01) -> np.ndarray | None:
         """How the equilibrium at u goes on for a change of loads [N] and a motion of fixed vertices, linearised there, with
         the mass of the last solve; None where it is not stable."""
         self.potential.place(u)
         A = self.operator()
         self.preconditioner.update(u)
         R = (change - A.of_places(way)) * self.free
-        d, *_, negative = conjugate_gradients(A, R, self.preconditioner, 0.01, 10 * len(R), self.eps)
+        d, *_, negative = conjugate_gradients(A, R, self.preconditioner, tolerance, 10 * len(R), self.eps)
         return d + way if negative is None else None
 
     def residual_at(self, u: np.ndarray) -> np.ndarray:

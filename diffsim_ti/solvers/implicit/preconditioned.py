@@ -5,7 +5,7 @@ import weakref
 import numpy as np
 
 from diffsim_ti.inputs import Mass, diagonal_of
-from diffsim_ti.solvers.implicit.multigrid import Multigrid
+from diffsim_ti.solvers.implicit.multigrid import Following, Multigrid
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, BodyBlocks
 
 
@@ -16,6 +16,7 @@ class Preconditioners:
 
     def __init__(self, workspace):
         self.ws, self._kept = weakref.proxy(workspace), {}  # which holds this: no circle
+        self.following = Following()
 
     def __call__(self, mass: Mass) -> tuple:
         """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
@@ -26,17 +27,19 @@ class Preconditioners:
             with ws.potential.at_rest():
                 blocks, contact = ws.potential.blocks(), ws.potential.contact_blocks()
             size = np.abs(blocks if contact is None else blocks - contact).sum((1, 2))[:, None]
-            kind = Multigrid if self._wants_multigrid(size, mass) else BodyBlocks if ws.scene.reduced else BlockJacobi
+            kind, how = BodyBlocks if ws.scene.reduced else BlockJacobi, size
+            if self._wants_multigrid(size, mass):
+                kind, how = Multigrid, weakref.proxy(self)
             if len(self._kept) > 5:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self.make(kind, size, mass), size
+            self._kept[key] = self.make(kind, how, mass), size
         kept, size = self._kept[key]
         kept.begin()
         return kept, size + size_of
 
-    def make(self, kind: type, size: np.ndarray, mass: np.ndarray):
-        """A preconditioner of a kind."""
-        return kind(self.ws.potential, mass, self.ws.free, size, self.ws.parallel)
+    def make(self, kind: type, how, mass: np.ndarray):
+        """A preconditioner of a kind; how: the sizes that one of blocks takes, or the run that a hierarchy follows."""
+        return kind(self.ws.potential, mass, self.ws.free, how, self.ws.parallel)
 
     def _rounded(self, inertia: np.ndarray) -> np.ndarray:
         """c m, of unequal steps for the nearest power of four of c, so that some preconditioners serve all steps."""

@@ -5,6 +5,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.supports.free import cleaned
 from diffsim_ti.solvers.implicit.linear import Operator, solve
+from diffsim_ti.solvers.implicit.multigrid import Following
 
 
 class RecordedPasses:
@@ -37,7 +38,7 @@ class RecordedPasses:
         ws.take_multipliers(j, ws.potential.held_at)
         if ws.rigid:  # forces on them turn with them
             ws.newton.residual_of(ws.problem(j, stage, self.x, self.y))
-        self._preconditioner = None
+        self._preconditioner, ws.preconditioner.following = None, ws.record.beside[j - base + 1] or Following()
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         """A^-1 b, or A^-T b, on the free vertices, zero elsewhere; of sets that do not deform their motion, or of A^-T, what

@@ -23,6 +23,7 @@ from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.implicit.closing import Closing
 from diffsim_ti.solvers.implicit.load_stepping import LoadStepping
+from diffsim_ti.solvers.implicit.multigrid import Following
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
@@ -124,6 +125,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.check_apart()
 
     def _restart(self) -> None:
+        self.state.beside[0] = None
         if self.solver.multistep:
             self.state.fresh[0] = True
 
@@ -164,6 +166,7 @@ class ImplicitWorkspace(PrescribedInPasses):
                 self.save_frame(frame)
             u, v, before = self.read(self.state, 0)
             self.potential.hold(self.state, 0)
+            self.preconditioner.following = self.state.beside[0] or Following()
             begin, self.newton.reports = time.perf_counter(), []
             try:
                 u_next, v_next = self._pass(j, u, v, before)
@@ -181,6 +184,7 @@ class ImplicitWorkspace(PrescribedInPasses):
             runtime.fill(self.state.v, v_next[None])
             if self.state.z is not None:
                 self.launch_law_state("forward", self.arrays.features(), j, 0, 0, at=self.state)
+            self.state.beside[0] = self.preconditioner.following
             if base is not None:
                 self.state.copy(0, self.record, j + 1 - base)
                 if self.solver.multistep:
@@ -226,6 +230,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         if self.strains:
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
+        if stage.static and (held != u).any():
+            starts = self._led(u, held, problem)
         try:
             u_star = self.solve_pass(j, u, held, starts, problem, stage)
         except NotConverged as error:
@@ -249,6 +255,14 @@ class ImplicitWorkspace(PrescribedInPasses):
             added = 0.0 if keeps else self._kinetic_added(u, v, u_next, v_star, undamped, stage)
             self.energy_watch.note(u, u_star, u_next, v_next, places, added)
         return u_next, np.zeros_like(v) if stage.static else v_next
+
+    def _led(self, u, held, problem: tuple) -> list:
+        """Where the equilibrium at u leads, linearised there, for motions of fixed vertices; nowhere if it is not stable."""
+        self.potential.place(u)
+        R = self.newton.residual_of(problem)
+        self.newton.preconditioner, self.newton.stiffness = self.preconditioner(problem[0])
+        way = self.newton.follows(u, R, held - u, self.newton.inexact)
+        return [] if way is None else [u + way]
 
     def problem(self, j: int, stage: Stage, x: np.ndarray, y: np.ndarray) -> tuple:
         """Mass, inertial and loads of `Newton.solve` in pass j, inertia starting from (x, y)."""
