@@ -78,7 +78,7 @@ class JoinedWorkspace(ImplicitWorkspace):
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 
-    def _solve(self, j, u, held, starts, problem, stage) -> np.ndarray:
+    def solve_pass(self, j, u, held, starts, problem, stage) -> np.ndarray:
         going, newton = ~self.left, self.newton
         newton.going = going
         self.potential.only(going)
@@ -101,6 +101,9 @@ class JoinedWorkspace(ImplicitWorkspace):
             solved &= newton.rounds <= self.noted.usual  # else a run alone says whether a branch was left
         self.leave(~solved)
         return np.where(newton.spread(self.left), u, there)
+
+    def _led(self, u, held, problem):
+        return []  # motions of supports start where bodies are
 
     def _in_front(self, u, held, starts, problem) -> np.ndarray:
         """As Approach of one scene: `held`, or where bodies stand in front of obstacles that come to them within the pass.
