@@ -339,6 +339,8 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("materials/patch_law.py", "does not say what its theta is"): "test_open_laws.py, with a law of one's own",
     ("mesh/checks.py", "in no tetrahedron"): "test_mesh.py",
     ("mesh/enclosure.py", "must not be moved"): "test_chambers.py",
+    ("outputs/contact_slip.py", "pass friction= to it"): "test_contact_force.py",
+    ("outputs/pixel_tracks.py", "take frames.computed"): "test_camera.py",
     ("monitor/chatter.py", "vibrates at {} m/s"): "test_contact_friction.py",
     ("monitor/guard.py", "has gained {} J"): "test_energy_watch.py",
     ("monitor/guard.py", "reduce the substep to {} s"): "test_contact_crossing.py, battery_of_impacts.py",
