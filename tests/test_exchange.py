@@ -215,8 +215,7 @@ def written(tmp_path_factory):
     terms = [ds.Gravity(up="z"), ball, wall]
     scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), terms=terms, fixed="xmin")
     simulator, places, times = ds.Simulator(ds.SemiImplicitSolver(scene, dt=0.02, substeps=20)), [], []
-    (folder / "run_0009.ply").touch()  # of a longer sequence
-    names = ["run.glb", "run.ply", "run.usda", "run.usdc"] if USD else ["run.glb", "run.ply"]
+    names = ["run.glb", "run.ply", "run_%04d.ply", *(["run.usda", "run.usdc"] if USD else [])]
     with contextlib.ExitStack() as stack:
         view = View(colour="displacement", fps=25.0)
         out = [stack.enter_context(open_writer(folder / name, scene, view)) for name in names]
@@ -269,6 +268,8 @@ def test_sequences_of_ply_are_read_back_equal(written):
 
     folder, places, _ = written
     assert len(list(folder.glob("run_*.ply"))) == len(places)
+    last, end = (meshio.read(folder / name).points for name in ("run_0003.ply", "run.ply"))
+    np.testing.assert_array_equal(end, last)
     for k, x in enumerate(places):
         read = meshio.read(folder / f"run_{k:04d}.ply")
         np.testing.assert_array_equal(read.points[: len(x)], x)

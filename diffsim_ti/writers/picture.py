@@ -4,7 +4,7 @@ from pathlib import Path
 
 from diffsim_ti.visual.frame import Frame
 from diffsim_ti.writers.drawn import DrawnWriter
-from diffsim_ti.writers.writer import View, register
+from diffsim_ti.writers.writer import View, file_of, numbered, register
 
 
 @register
@@ -19,14 +19,7 @@ class PictureWriter(DrawnWriter):
 
     def __init__(self, path: str | Path, view: View | None = None):
         super().__init__(path, view)
-        self.numbered = "%" in self.path.name
-        try:
-            self.numbered and self._file(0)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"output: {self.path.name!r} has no place for one number; write it as %04d") from error
-
-    def _file(self, k: int) -> Path:
-        return self.path.with_name(self.path.name % k) if self.numbered else self.path
+        self.numbered = numbered(self.path)
 
     def write(self, frame: Frame) -> None:
         if not self.numbered:  # only the last one waits
@@ -41,7 +34,7 @@ class PictureWriter(DrawnWriter):
         from PIL import Image
 
         for k, image in enumerate(self.images() if self.count else ()):
-            Image.fromarray(image).save(self._file(k))
+            Image.fromarray(image).save(file_of(self.path, k) if self.numbered else self.path)
         self._waiting.close()
 
     def describe(self) -> str:

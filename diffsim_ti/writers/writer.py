@@ -94,6 +94,19 @@ class Writer(metaclass=Public):
         self.close()
 
 
+def file_of(path: Path, k: int) -> Path:
+    """That of frame k, of a name such as "run_%04d.png"."""
+    return path.with_name(path.name % k)
+
+
+def numbered(path: Path) -> bool:
+    """Whether a name has a place for the number of a frame. Raises ValueError for a % that is none."""
+    try:
+        return "%" in path.name and bool(file_of(path, 0))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"output: {path.name!r} has no place for one number; write it as %04d") from error
+
+
 def register(kind: type[Writer]) -> type[Writer]:
     """Make `writer_for` know a class by its suffixes. Raises ValueError for none, or one that another class has."""
     if not kind.suffixes or not all(s.startswith(".") and s == s.lower() for s in kind.suffixes):
