@@ -161,7 +161,7 @@ def test_second_init_is_noticed():
         ds.init("cpu", precision="f64", threads=1)
         for use in (simulator.step, simulator.reset, lambda: simulator.positions, lambda: simulator.compute_energy(),
                     lambda: simulator.set_state(velocities=mesh.vertices), rollout.forward, lambda: rollout.vjp(frames),
-                    rollout.run, lambda: rollout.positions):
+                    rollout.run, lambda: rollout.positions, simulator.tetrahedron_fields):
             try:
                 use()
                 print("used")
@@ -176,7 +176,8 @@ def test_second_init_is_noticed():
     lines = out.splitlines()
     assert lines[-1] == "f64 done"
     assert (
-        lines[:-1] == ["ti.init was called again, which destroys all Taichi data: build the scene and solver again"] * 9
+        lines[:-1]
+        == ["ti.init was called again, which destroys all Taichi data: build the scene and solver again"] * 10
     )
 
 

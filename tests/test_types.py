@@ -203,7 +203,8 @@ def test_help_fits_on_a_screen():
     assert "create_cube" in shown and "surface_vertices" in shown and "create_cube" in dir(ds.TetrahedralMesh)
 
 
-def test_the_typed_client_runs():
+def test_the_typed_client_runs(monkeypatch):
+    monkeypatch.setattr(ds, "init", lambda precision, **_: ds.runtime.set_precision(precision))
     assert typed_client.fall() > 0
     assert typed_client.parts() > 50
 
