@@ -123,10 +123,12 @@ class DeviceNewton:
 
     # ---- rounds ------------------------------------------------------------------------------------------------------
 
-    def __call__(self, newton, most: int) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, newton, most: int, rough: bool) -> tuple[np.ndarray, np.ndarray]:
         """(displacement, numbers of newton_kernels.py) after at most so many rounds from where the potential stands, which
-        the report of `newton` has; solved where the phase is DONE."""
-        state = self._run(self._begin(newton, nk.START, most), newton.eps)
+        the report of `newton` has; solved where the phase is DONE. rough: whether the linear solve that led there was."""
+        state = self._begin(newton, nk.START, most)
+        state[nk.ROUGH] = rough
+        state = self._run(state, newton.eps)
         return self._report(newton, state), state
 
     def _run(self, state: np.ndarray, eps: float = 0.0) -> np.ndarray:
@@ -139,7 +141,7 @@ class DeviceNewton:
         while state[nk.PHASE] > nk.TROUBLE and self._is_going_well(state):
             phase, solving = state[nk.PHASE], state[nk.PHASE] == nk.SOLVE and not state[STOPPED]
             if phase == nk.UPDATE and (served or not self._update):
-                self.preconditioner.update(self.potential.held_at)
+                self.preconditioner.update(self._here())
                 state[nk.PHASE], state[STOPPED], served = nk.SOLVE, 0, False
                 runtime.fill(cg.state, state)
                 continue
@@ -155,7 +157,8 @@ class DeviceNewton:
                 self._residual(1, **numbers)
             served = bool(self._update) and (self.whole or phase == nk.UPDATE or ahead)
             if served and not self.whole:
-                self.preconditioner.follow(runtime.fetch_row(self.potential.u, 0)) if on_cpu else None
+                if on_cpu:
+                    self.preconditioner.follow(self._here())
                 self._update(1, **numbers)
             state = runtime.fetch(cg.state)
             if state[STOPPED] == 1 and not self.whole:
@@ -163,6 +166,11 @@ class DeviceNewton:
                 if solving:
                     self.preconditioner.learn(float(np.sqrt(state[SQUARE])), cg.last)
         return state
+
+    def _here(self) -> np.ndarray:
+        """The displacement on the device, of which the host is told."""
+        self.potential.held_at = runtime.fetch_row(self.potential.u, 0)
+        return self.potential.held_at
 
     @staticmethod
     def _is_going_well(state: np.ndarray) -> bool:
@@ -181,7 +189,4 @@ class DeviceNewton:
         if state[nk.CUTS]:
             report.met = self.detection.read()
         newton.upright = state[nk.UPRIGHT] == 1
-        if not solved:
-            return runtime.fetch(self.u).astype(np.float64)
-        self.potential.held_at = runtime.fetch_row(self.potential.u, 0)
-        return self.potential.held_at
+        return self._here() if solved else runtime.fetch(self.u).astype(np.float64)

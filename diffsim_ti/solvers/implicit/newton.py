@@ -128,7 +128,7 @@ class Newton:
         while self._goes_on(most, rounds is None):
             device = None if on_host else self._on_device()
             if device:
-                u, numbers = device(self, max(most - len(report.residuals), 1))
+                u, numbers = device(self, max(most - len(report.residuals), 1), rough)
                 if numbers[PHASE] == DONE and not leave_saddles:
                     return u
                 u, E, norm, floor = self.potential.place(u), None, numbers[BEFORE] or np.inf, numbers[FLOOR]
