@@ -313,9 +313,10 @@ class Batch(metaclass=Public):
                 part[~alive] = 0  # they have left no trace in others
         out = self._by_inputs(frames, derived.mapped(np.asarray), direct)
         for b in sorted(alone.intersection(np.flatnonzero(frames.alive).tolist())):
-            for name, own in self.one.vjp(frames[b], **{name: x[b] for name, x in given.items()}).items():
+            by_one = self.one.vjp(frames[b], **{name: x[b] for name, x in given.items()})
+            for name in self.wanted:
                 target = out[name] = np.array(out[name])
-                target[b if isinstance(frames.values[name], Own) else ...] += own
+                target[b if isinstance(frames.values[name], Own) else ...] += by_one[name]
         return out
 
     def _by_inputs(self, frames: BatchFrames, adjoint: Derived, direct: list) -> dict[str, np.ndarray]:
