@@ -66,7 +66,7 @@ class JoinedNewton(Newton):
             resting = left & ~moved & (small | (norm <= 100 * floor))  # rounding has the last word
             solved, left = solved | resting, left & moved
         self.potential.only(going)
-        if leave_saddles and solved.any() and not self.others:
+        if leave_saddles and solved.any() and not self.by_residual:
             solved &= self._stable(u, solved)
         return u, solved
 
@@ -111,8 +111,8 @@ class JoinedNewton(Newton):
             change = after[0] - E0[0] + self._against_loads_all(u, step)
             if self.others:
                 change = change - self._work(u, step)
-            low = (after[2] > 0.1 * E0[2]).all(1)
-            change = np.where(self.upright & (share > self.insist) & ~low, np.inf, change)
+            kept = (after[2] > 0.1 * E0[2]).all(1)
+            change = np.where(self.upright & (share > self.insist) & ~kept, np.inf, change)
             size = E0[1] + after[1] + self._rows(self.stiffness * trial**2).sum(1)
             noise = 10 * self.eps * size
             with np.errstate(invalid="ignore"):

@@ -50,8 +50,8 @@ class JoinedAdjoint(ImplicitAdjoint):
             self._preconditioner.update(self.u_star)
         newton.mass, going = self.mass, ~ws.left
         mass, more = newton.system()
-        tolerances = np.full(len(going), self.tolerance)
-        x, solved, *_ = self._preconditioner.solver(mass, more, b, tolerances, going, 20 * len(b), self.eps)
+        tolerances, most = np.full(len(going), self.tolerance), 20 * len(b) // len(going)
+        x, solved, *_ = self._preconditioner.solver(mass, more, b, tolerances, going, most, self.eps)
         ws.leave(~solved)
         return x * ws.free
 
