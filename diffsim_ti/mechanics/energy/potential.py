@@ -264,9 +264,7 @@ class Potential:
         a, y = self.arrays, np.zeros_like(w)
         runtime.fill(self.w, w[None])
         if a.contacts:
-            self.launch("contact_blocks", lanes=False, out=self.barriers)
-            blocks = np.swapaxes(runtime.fetch(self.barriers.blocks).astype(np.float64), 0, 1)
-            y += np.einsum("kij,kj->ki", blocks, w)
+            y += np.einsum("kij,kj->ki", self.obstacle_blocks(), w)
         if self.pairs:
             self.pairs.hessian_product(self.u, self.w, False)
             y[a.mesh.surface_vertices] -= runtime.fetch(a.corner)[a.first_contact_corner :][

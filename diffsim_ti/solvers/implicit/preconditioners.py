@@ -1,6 +1,7 @@
 """Preconditioners for c M + d2E/du2: block Jacobi here, multigrid in multigrid.py.
 
-Both are functions of the present state alone, so that a run that is started again from a checkpoint takes the same steps.
+Block Jacobi is a function of the present state alone, multigrid of that and of what goes with the states of a run
+(`Following`), so that a run that is started again from a checkpoint takes the same steps.
 """
 
 from types import SimpleNamespace
