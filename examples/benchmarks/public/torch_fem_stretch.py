@@ -75,7 +75,7 @@ def stretched(n: int) -> ds.Rollout:
 def measured(n: int, repeats: int) -> tuple[float, float, float, float, dict]:
     """(forward [s], gradient [s], products with the Hessian, force [N], its gradient by both moduli), the least of some."""
     best = (np.inf, np.inf)
-    for _ in range(repeats + 1):  # the first compiles
+    for run in range(repeats + 1):  # the first compiles
         rollout, begin = stretched(n), time.perf_counter()
         frames = rollout.forward()
         middle = time.perf_counter()
@@ -84,7 +84,7 @@ def measured(n: int, repeats: int) -> tuple[float, float, float, float, dict]:
         seed[-1, 0] = 1.0
         gradient = rollout.vjp(frames, reaction=seed)
         times = middle - begin, time.perf_counter() - middle
-        best = tuple(min(pair) for pair in zip(best, times if _ else (np.inf, np.inf)))
+        best = tuple(min(pair) for pair in zip(best, times if run else (np.inf, np.inf)))
     return *best, rollout.report.products, float(force[-1, 0]), gradient
 
 
