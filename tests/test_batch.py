@@ -10,6 +10,7 @@ from gradient_fuzz.loads import load, over_time
 from gradient_fuzz.ties import tie
 
 import diffsim_ti as ds
+from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_scene import JoinedArrays
 from diffsim_ti.diff_simulator import rollout_frames
 
@@ -473,6 +474,25 @@ def test_steps_of_implicit_scenes_go_on_from_their_ends():
         state = batch.forward(**own, **state).end
     frames = whole.forward(**own, initial_velocities=start)
     np.testing.assert_allclose(state["initial_positions"], frames.positions[:, -1], rtol=0, atol=1e-8)
+
+
+def test_gradients_of_a_scene_that_is_given_up_are_of_its_run_alone(monkeypatch):
+    solve_all = JoinedNewton.solve_all
+
+    def without_the_second(self, *more):
+        u, solved = solve_all(self, *more)
+        return u, solved & (np.arange(3) != 1)
+
+    monkeypatch.setattr(JoinedNewton, "solve_all", without_the_second)
+    scene = ds.Scene(MESH, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    solver, found = ds.ImplicitEulerSolver(scene, dt=0.005, tolerance=1e-9), []
+    for lanes in (True, False):
+        batch = ds.Batch(solver, 2, 3, gradients=["shape", "youngs_modulus"], lanes=lanes)
+        frames = batch.forward(youngs_modulus=[6e4, 1e5, 1.7e5])
+        assert frames.alive.all() and frames.alone == ((1,) if lanes else ())
+        found.append(batch.vjp(frames, frames.displacements))
+    for name, expected in found[1].items():
+        np.testing.assert_allclose(found[0][name], expected, rtol=0, atol=1e-6 * np.abs(expected).max(), err_msg=name)
 
 
 def test_scenes_of_other_drag_take_implicit_steps_by_turns():
