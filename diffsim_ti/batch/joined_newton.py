@@ -126,7 +126,7 @@ class JoinedNewton(Newton):
             moved |= found
             open_ &= ~lower
             share = np.where(open_, 0.5 * share, share)
-            given_up = open_ & (share <= self.shortest)
+            given_up = open_ & ~(share > self.shortest)  # also a share that is no number
             open_ &= ~given_up
             share = np.where(given_up, 0.0, share)
         if (left & ~moved).any():  # these stay

@@ -34,7 +34,7 @@ def _why_not_joined(solver) -> str | None:
     if there:
         return f"it has {' and '.join(there)}"
     if solver.loose:
-        return f"but for contact {solver.loose}"
+        return f"but for contact {solver.loose}, and each scene closes its contact by itself"
     values = scene.inputs.derive(scene.inputs.at_times([0.0, solver.dt]))
     hosts, u = host_forces(scene).take(values), values.displacement
     free = scene.supports.freedom(scene.mesh.num_vertices)
