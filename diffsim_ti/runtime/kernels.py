@@ -118,6 +118,20 @@ def _compiled(name: str, arguments: dict, lines: list, scope: dict):
     return kernel(scope[name])
 
 
+def named_arrays(parts: list) -> tuple[tuple, list]:
+    """(names of the arguments of each part, as pairs ((bundle, array), argument); the arrays, each once) of several kernels
+    with their records that are one kernel."""
+    known, arrays, names = {}, [], []
+    for k, (kernel, records) in enumerate(parts):
+        own = {(b, a): _found(records[b], a) for b, of in kernel.arrays.items() for a in of}
+        for (b, a), array in own.items():
+            if id(array) not in known:
+                known[id(array)] = f"k{k}_{b}_{a}"
+                arrays.append(array)
+        names.append(tuple((place, known[id(array)]) for place, array in own.items()))
+    return tuple(names), arrays
+
+
 class Repeated:
     """Kernels one after the other, again and again in one launch: `launch(times, **numbers)`.
 
@@ -128,17 +142,11 @@ class Repeated:
     """
 
     def __init__(self, name: str, groups: list[list], parallel: bool, vectorized: bool = False):
-        parts, known, arrays, names = [part for group in groups for part in group], {}, [], []
+        parts = [part for group in groups for part in group]
+        names, arrays = named_arrays([(kernel, records) for kernel, records, _ in parts])
         kernels, own_numbers = tuple(kernel for kernel, *_ in parts), [numbers for *_, numbers in parts]
-        for k, (kernel, records, _) in enumerate(parts):
-            own = {(b, a): _found(records[b], a) for b, of in kernel.arrays.items() for a in of}
-            for (b, a), array in own.items():
-                if id(array) not in known:
-                    known[id(array)] = f"k{k}_{b}_{a}"
-                    arrays.append(array)
-            names.append(tuple((place, known[id(array)]) for place, array in own.items()))
         one_thread, shared = runs_on_cpu() and not parallel, tuple(numbers is None for numbers in own_numbers)
-        made, numbers = _repeated_kernel(name, kernels, tuple(names), shared, tuple(map(len, groups)), one_thread)
+        made, numbers = _repeated_kernel(name, kernels, names, shared, tuple(map(len, groups)), one_thread)
         title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
         options = dict(title=title, loops=0 if one_thread else -1)
         launch = Launch(made, *arrays, vectorized=vectorized, **options)

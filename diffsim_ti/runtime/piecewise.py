@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import taichi as ti
 
-from diffsim_ti.runtime.kernels import _compiled, _found
+from diffsim_ti.runtime.kernels import _compiled, named_arrays
 from diffsim_ti.runtime.language import Bundle, at, let, traced
 from diffsim_ti.runtime.launch import Launch
 
@@ -38,16 +38,9 @@ class Piecewise:
     """
 
     def __init__(self, name: str, parts: list, count: int, whole: set, counting: dict, vectorized: bool):
-        kernels, known, arrays, names = [kernel for kernel, _ in parts], {}, [], []
-        for k, (kernel, records) in enumerate(parts):
-            own = {(b, a): _found(records[b], a) for b, of in kernel.arrays.items() for a in of}
-            for (b, a), array in own.items():
-                if id(array) not in known:
-                    known[id(array)] = f"k{k}_{b}_{a}"
-                    arrays.append(array)
-            names.append(tuple((place, known[id(array)]) for place, array in own.items()))
+        kernels, (names, arrays) = [kernel for kernel, _ in parts], named_arrays(parts)
         self._names, self._count = [kernel.numbers for kernel in kernels], count
-        made = _kernel(name, tuple(kernels), tuple(names), frozenset(whole), tuple(counting.items()))
+        made = _kernel(name, tuple(kernels), names, frozenset(whole), tuple(counting.items()))
         title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
         self._launch = Launch(made, *arrays, vectorized=vectorized, title=title)
 
