@@ -111,6 +111,7 @@ def init(
         and current_program() is not None
         and _settings["started"]() is current_program()
     ):
+        ti.set_logging_level(options.get("log_level", ti.ERROR).lower())
         set_precision(precision)
         return
     options.setdefault("log_level", ti.ERROR)
