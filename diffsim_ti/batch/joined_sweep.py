@@ -97,6 +97,8 @@ class JoinedAdjoint(ImplicitAdjoint):
 class JoinedSweep(BatchSweep):
     """Runs of an implicit solver of all scenes at once; `left`: those that are to be run alone."""
 
+    held = property(lambda self: self.num_scenes)  # in vectors of four
+
     def __init__(self, solver, steps, num_scenes: int, **options):
         super().__init__(solver, steps, num_scenes, **options)
         self.joined = copy(solver)

@@ -76,9 +76,12 @@ class BatchSweep(Sweep):
 
     def __init__(self, solver, steps: int, num_scenes: int, memory: float | None = None, **options):
         self.num_scenes = num_scenes
-        whole = -(-num_scenes // runtime.LANES) * runtime.LANES  # in blocks, of vectors of three; else of four
-        self.held = whole / 4 * 3 if runtime.runs_on_cpu() else num_scenes
         super().__init__(solver, steps, memory=memory, **options)
+
+    @property
+    def held(self) -> float:
+        whole = -(-self.num_scenes // runtime.LANES) * runtime.LANES  # in blocks, of vectors of three; else of four
+        return whole / 4 * 3 if runtime.runs_on_cpu() else self.num_scenes
 
     def values_of(self, values: dict, b: int) -> dict:
         """The values of scene b."""

@@ -276,7 +276,8 @@ class Sweep:
     def _expects_gradient(self) -> bool:
         """Whether a run is worth its record: one was asked for before, or passes are solves, which cost more than that."""
         solves = not self.solver.explicit and bool(self.wanted)
-        return self._adjoint is not None or solves and self.checkpoints.states() * self.state_bytes <= RECORD_BYTES
+        size = self.checkpoints.states() * self.state_bytes * self.held
+        return self._adjoint is not None or solves and size <= RECORD_BYTES
 
     def _record(self, first: int, last: int) -> None:
         """Passes first .. last - 1 from the current state, recorded."""
