@@ -6,7 +6,7 @@ from example_files import example
 
 import diffsim_ti as ds
 from diffsim_ti.accuracy import estimate
-from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
+from diffsim_ti.accuracy.finer import on_finer, rollout_on_ten_nodes
 from diffsim_ti.mesh.reference_element import quadrature
 
 BARS = example("benchmarks/error_bars")
@@ -39,7 +39,10 @@ def test_refined_meshes_are_conforming_and_keep_the_body(order, edges):
     mesh = body(order)
     for where in (None, "left", np.random.default_rng(order).choice(mesh.num_tetrahedra, 9, replace=False)):
         fine = mesh.refined(where, edges)
-        ds.TetrahedralMesh(fine.vertices, fine.elements)  # every check there is, of faces that do not fit, too
+        checked = ds.TetrahedralMesh(
+            fine.vertices, fine.elements
+        )  # every check there is, of faces that do not fit, too
+        np.testing.assert_allclose(fine.volumes, checked.volumes, rtol=1e-12)
         assert fine.num_tetrahedra == 8 * mesh.num_tetrahedra or where is not None or edges == "longest"
         assert curved_volume(fine) == pytest.approx(curved_volume(mesh), rel=1e-13)
         for name, rows in fine.surface_sets.items():
@@ -158,8 +161,21 @@ def test_a_loss_and_a_place_by_the_vertices_are_numbers_too():
     assert "end: " in said and "mesh +" in said and f"corrected {place.corrected:.6g}" in said
 
 
+def test_tetrahedra_and_relations_stay_where_they_are_on_a_finer_mesh():
+    mesh = body(1)
+    relation = ds.MultiPointConstraint("left end", [[1, 0, 0], [-1, 0, 0]], stiffness=1e6)
+    terms = [ds.BodyForce((0, 0, 1.0), [1, 5]), relation]
+    scene = ds.Scene(mesh.with_vertex_set("left end", [0, 3]), ds.StableNeoHookean(1e6, 0.3), terms=terms, fixed="xmin")
+    fine = on_finer(scene, ds.TetrahedralMesh.refined)
+    load, relation = fine.terms_of(ds.BodyForce, ds.MultiPointConstraint)
+    np.testing.assert_array_equal(load.chosen(fine.mesh), np.flatnonzero(np.isin(fine.mesh.refinement.parents, [1, 5])))
+    np.testing.assert_array_equal(relation.indices(fine.mesh), [0, 3])
+
+
 def test_what_cannot_be_estimated_is_refused():
     rollout = block()
+    with pytest.raises(ValueError, match="finer: must return the mesh of 12 vertices"):
+        rollout.accuracy("end", (0.0, 0.0, 1.0), lambda mesh: mesh.refined().refined())
     with pytest.raises(ValueError, match="did you mean 'end'"):
         rollout.accuracy("ende")
     with pytest.raises(ValueError, match="pass weights of this shape"):

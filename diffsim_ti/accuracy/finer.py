@@ -9,7 +9,7 @@ import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
-from diffsim_ti.terms import ExternalForce, Obstacle
+from diffsim_ti.terms import ExternalForce, MultiPointConstraint, Obstacle
 from diffsim_ti.terms.pose import Pose
 
 if TYPE_CHECKING:
@@ -34,22 +34,32 @@ def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) 
     """The same scene on a finer mesh of the body, `TetrahedralMesh.quadratic` or `refined`, whose first vertices are its
     own.
 
-    What is chosen by indices becomes a set, which new vertices on its sides join; forces on single vertices stay there.
+    What is chosen by indices becomes a set, which new vertices on its sides join; forces on single vertices, and relations
+    between them, stay there.
     Raises ValueError for what cannot be carried over.
     """
     given, base, terms = dict(scene.arguments), scene.mesh, []
     for k, term in enumerate(given["terms"]):
         surface, own = None if isinstance(term, Obstacle) else getattr(term, "surface", None), copy(term)
-        if isinstance(term, ExternalForce):
+        if isinstance(term, ExternalForce | MultiPointConstraint):
             own.vertices, terms = term.indices(scene.mesh), [*terms, own]
             continue
         if not callable(surface) and not is_named(surface):
             own.surface = f"surface of term {k}"
             base, term = base.with_surface_set(own.surface, surface), own
+        if not is_named(chosen := getattr(term, "tetrahedra", None)):
+            own.tetrahedra = f"tetrahedra of term {k}"
+            base, term = base.with_tetrahedron_set(own.tetrahedra, chosen), own
         terms.append(term)
     if not is_named(given["fixed"]):
         base, given["fixed"] = base.with_vertex_set(HELD, given["fixed"]), HELD
     mesh = finer(base)
+    known = mesh.refinement is not None or mesh.order > base.order
+    if not known or interpolation(mesh).shape != (mesh.num_vertices, base.num_vertices):
+        raise ValueError(
+            f"finer: must return the mesh of {base.num_vertices} vertices that it is given as quadratic() or refined() make "
+            f"it in one call, new vertices at other places if need be; got {mesh.num_vertices} vertices, made otherwise"
+        )
     for name in ("initial_positions", "initial_velocities"):
         if np.ndim(given[name]) == 2:
             given[name] = interpolation(mesh) @ np.asarray(given[name], np.float64)
