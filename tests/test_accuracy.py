@@ -188,6 +188,9 @@ def test_what_cannot_be_estimated_is_refused():
     stress = rollout.on(rollout.solver, outputs=ds.Stress(at="vertices"))
     with pytest.raises(ValueError, match="Stress at points"):
         stress.accuracy("stress", np.ones(stress.outputs["stress"].shape(2)[1:]))
+    greatest = ds.SmoothMaximum(ds.Stress(von_mises=True, of=[0, 1]))
+    with pytest.raises(ValueError, match="name them as a set"):
+        rollout.on(rollout.solver, outputs=greatest).accuracy("smooth_maximum", finer=ds.TetrahedralMesh.refined)
 
 
 # ---- refinement by it ---------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.outputs import SmoothMaximum, Strain, Stress
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import ExternalForce, MultiPointConstraint, Obstacle
 from diffsim_ti.terms.pose import Pose
@@ -115,9 +116,10 @@ def rollout_on_finer(rollout: "Rollout", finer: Callable, values: dict | None = 
     """The same rollout on a finer mesh, as in `on_finer`, with some arguments of its solver replaced."""
     scene, outputs = rollout.scene, []
     for k, output in enumerate(rollout.given_outputs):
-        if getattr(output, "per_vertex", False):
+        inner = output.of if isinstance(output, SmoothMaximum) else output
+        if getattr(inner, "per_vertex", False):
             raise ValueError(f"{output!r} is of each vertex, and forces on those of ten-node tetrahedra are others")
-        parts = [getattr(output, name, None) for name in ("on", "sets")]
+        parts = [getattr(inner, name, None) for name in ("on", "sets")]
         if not all(is_named(part) for part in parts):
             raise ValueError(f"{output!r} is of vertices by their indices: name them as a set")
         if not is_named(getattr(output, "support", None)):
@@ -126,6 +128,10 @@ def rollout_on_finer(rollout: "Rollout", finer: Callable, values: dict | None = 
             scene, output = scene.replace(mesh=scene.mesh.with_vertex_set(name, output.support)), own
         outputs.append(output)
     fine, solver = on_finer(scene, finer), rollout.solver
+    for output in outputs if fine.mesh.refinement else ():
+        inner = output.of if isinstance(output, SmoothMaximum) else output
+        if isinstance(inner, Stress | Strain) and not is_named(inner.of):
+            raise ValueError(f"{output!r} is of tetrahedra by their indices: name them as a set")
     if solver.explicit:
         if solver.unequal_steps is not None:
             raise ValueError(
