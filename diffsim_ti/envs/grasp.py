@@ -39,9 +39,9 @@ class SoftGrasps(SoftBodies):
         floor = Ground(stiffness=500.0, width=WIDTH)
         return Scene(cube, StableNeoHookean(1e5, 0.3), 300.0, [Gravity(), Drag(2.0), left, right, floor])
 
-    def __init__(self, num_envs: int = 32, **more):
+    def __init__(self, num_envs: int = 32):
         self.pads = np.zeros((num_envs, 2))  # closed, risen [m]
-        super().__init__(num_envs, **more)
+        super().__init__(num_envs)
 
     def start(self, rows):
         self.pads[rows] = 0.0
