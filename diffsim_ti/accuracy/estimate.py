@@ -196,8 +196,9 @@ def estimated(
 
 
 def _run(rollout: "Rollout", number: Number, values: dict, given: list | None) -> tuple:
-    """(J of the rollout, Replay of it in float64, its frames)"""
-    own, value = rollout.on(rollout.solver, gradients="initial_positions", runs=None), None
+    """(J of the rollout, Replay of it in float64, its frames), without options that change gradients or hide errors."""
+    plain = dict(gradients="initial_positions", runs=None, clip=None, truncate=None, health=False, raise_errors=True)
+    own, value = rollout.on(rollout.solver, **plain), None
     if rollout.scene.precision == "f32":
         value = number.of(own.forward(**values))[0]
         own = own.with_scene(precision="f64")
