@@ -6,7 +6,7 @@ from example_files import example
 
 import diffsim_ti as ds
 from diffsim_ti.accuracy import estimate
-from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
+from diffsim_ti.accuracy.finer import on_finer, rollout_on_ten_nodes
 from diffsim_ti.mesh.reference_element import quadrature
 
 BARS = example("benchmarks/error_bars")
@@ -39,7 +39,10 @@ def test_refined_meshes_are_conforming_and_keep_the_body(order, edges):
     mesh = body(order)
     for where in (None, "left", np.random.default_rng(order).choice(mesh.num_tetrahedra, 9, replace=False)):
         fine = mesh.refined(where, edges)
-        ds.TetrahedralMesh(fine.vertices, fine.elements)  # every check there is, of faces that do not fit, too
+        checked = ds.TetrahedralMesh(
+            fine.vertices, fine.elements
+        )  # every check there is, of faces that do not fit, too
+        np.testing.assert_allclose(fine.volumes, checked.volumes, rtol=1e-12)
         assert fine.num_tetrahedra == 8 * mesh.num_tetrahedra or where is not None or edges == "longest"
         assert curved_volume(fine) == pytest.approx(curved_volume(mesh), rel=1e-13)
         for name, rows in fine.surface_sets.items():
@@ -121,7 +124,8 @@ def test_small_motions_have_the_exact_difference_of_two_meshes(kind, steps, monk
     outputs = ds.MaterialPoints([[2, 0.5, 0.5], [1.2, 0.3, 0.7]], "places")
     rollout = ds.Rollout(kind(scene, dt=0.02, tolerance=1e-9), steps, outputs=outputs)
     weights = np.array([[1.0, -2.0, 3.0], [0.5, 1.0, -1.0]])
-    found = rollout.accuracy("places", weights)
+    scaled = rollout.on(rollout.solver, clip=1e-9, truncate=1)  # which change gradients, but no estimate
+    found = scaled.accuracy("places", weights)
     other = rollout_on_ten_nodes(rollout, {}).forward()["places"][-1]
     difference = (weights * (rollout.forward()["places"][-1] - other)).sum()
     assert found.by == "adjoint" and found.mesh + found.solver == pytest.approx(difference, rel=2e-3, abs=1e-14)
@@ -158,8 +162,21 @@ def test_a_loss_and_a_place_by_the_vertices_are_numbers_too():
     assert "end: " in said and "mesh +" in said and f"corrected {place.corrected:.6g}" in said
 
 
+def test_tetrahedra_and_relations_stay_where_they_are_on_a_finer_mesh():
+    mesh = body(1)
+    relation = ds.MultiPointConstraint("left end", [[1, 0, 0], [-1, 0, 0]], stiffness=1e6)
+    terms = [ds.BodyForce((0, 0, 1.0), [1, 5]), relation]
+    scene = ds.Scene(mesh.with_vertex_set("left end", [0, 3]), ds.StableNeoHookean(1e6, 0.3), terms=terms, fixed="xmin")
+    fine = on_finer(scene, ds.TetrahedralMesh.refined)
+    load, relation = fine.terms_of(ds.BodyForce, ds.MultiPointConstraint)
+    np.testing.assert_array_equal(load.chosen(fine.mesh), np.flatnonzero(np.isin(fine.mesh.refinement.parents, [1, 5])))
+    np.testing.assert_array_equal(relation.indices(fine.mesh), [0, 3])
+
+
 def test_what_cannot_be_estimated_is_refused():
     rollout = block()
+    with pytest.raises(ValueError, match="finer: must return the mesh of 12 vertices"):
+        rollout.accuracy("end", (0.0, 0.0, 1.0), lambda mesh: mesh.refined().refined())
     with pytest.raises(ValueError, match="did you mean 'end'"):
         rollout.accuracy("ende")
     with pytest.raises(ValueError, match="pass weights of this shape"):
@@ -172,6 +189,9 @@ def test_what_cannot_be_estimated_is_refused():
     stress = rollout.on(rollout.solver, outputs=ds.Stress(at="vertices"))
     with pytest.raises(ValueError, match="Stress at points"):
         stress.accuracy("stress", np.ones(stress.outputs["stress"].shape(2)[1:]))
+    greatest = ds.SmoothMaximum(ds.Stress(von_mises=True, of=[0, 1]))
+    with pytest.raises(ValueError, match="name them as a set"):
+        rollout.on(rollout.solver, outputs=greatest).accuracy("smooth_maximum", finer=ds.TetrahedralMesh.refined)
 
 
 # ---- refinement by it ---------------------------------------------------------------------------------------------------

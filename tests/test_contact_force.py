@@ -176,15 +176,22 @@ def test_slip_on_a_turntable():
     )
     frames, simulator = rollout.forward(), ds.Simulator(solver, contact_forces=True)
     simulator.run(8)
-    x, v, push = frames.positions[-1], frames.velocities[-1], frames["push"][-1]
-    pressed_on = np.linalg.norm(push, axis=1) > 0
-    assert pressed_on.sum() == 4 and not frames["contact_slip"][-1][~pressed_on].any()
     h, row = 1e-6, lambda t: np.array([0.3 * t, 0.05 * t, 0.1 * t, 0.2 * t, 5 * t, 0.1 * t])
-    term = solver.scene.obstacles[0]
-    own = [carried(brought_back(x, row(0.008), term.about), row(0.008 + s * h), term.about) for s in (-1, 1)]
-    w = (v - (own[1] - own[0]) / (2 * h))[pressed_on]
-    n = push[pressed_on] / np.linalg.norm(push[pressed_on], axis=1, keepdims=True)
-    np.testing.assert_allclose(frames["contact_slip"][-1][pressed_on], w - n * (n * w).sum(1, keepdims=True), atol=1e-6)
+    about = solver.scene.obstacles[0].about
+
+    def check(frames) -> np.ndarray:
+        x, v, push, t = frames.positions[-1], frames.velocities[-1], frames["push"][-1], frames.times[-1]
+        pressed_on = np.linalg.norm(push, axis=1) > 0
+        assert pressed_on.sum() == 4 and not frames["contact_slip"][-1][~pressed_on].any()
+        own = [carried(brought_back(x, row(t), about), row(t + s * h), about) for s in (-1, 1)]
+        w = (v - (own[1] - own[0]) / (2 * h))[pressed_on]
+        n = push[pressed_on] / np.linalg.norm(push[pressed_on], axis=1, keepdims=True)
+        expected = w - n * (n * w).sum(1, keepdims=True)
+        np.testing.assert_allclose(frames["contact_slip"][-1][pressed_on], expected, atol=1e-6)
+        return pressed_on
+
+    pressed_on = check(frames)
+    check(ds.Rollout(solver, ds.UnequalSteps([1e-3] * 7 + [5e-4], 4), 1, outputs=named).forward())
     np.testing.assert_allclose(simulator.output(ds.ContactSlip("disc")), frames["contact_slip"][-1], atol=1e-9)
     np.testing.assert_allclose(
         frames["share"][-1][pressed_on], 1.0, atol=1e-4

@@ -60,9 +60,10 @@ def test_pads_lift_a_cube():
     height, total = envs.positions[..., 1].mean(1), np.zeros(2)
     for k in range(envs.horizon - 1):
         squeeze = 1.0 if k < 5 else 0.0
-        actions = np.tile([squeeze, 0.0 if k < 8 else 0.5], (2, 1))
+        actions = np.tile([squeeze, -1.0 if k < 8 else 0.5], (2, 1))  # pads on the floor go no lower
         observed, rewards, terminated, *_ = envs.step(actions)
         total += rewards
+        assert k != 7 or (rewards > -0.1).all()  # nothing slips past pads that stand still
         assert not terminated.any()
     assert (envs.positions[..., 1].mean(1) - height > HEIGHT).all() and (total > 10).all(), total
     weight = 9.81 * 300.0 * envs.scene.mesh.volume

@@ -22,7 +22,7 @@ from diffsim_ti.terms import SelfContact
 if TYPE_CHECKING:
     from diffsim_ti.rollout import Frames, Rollout
 
-LARGE = 0.2  # of the value: beyond it an estimate to first order gives way to the solution that it is about
+LARGE = 0.2  # of the number's change: beyond it an estimate to first order gives way to the solution that it is about
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
 PER_VERTEX = (
     "positions",
@@ -38,7 +38,7 @@ class Accuracy(metaclass=Public):
     value: the number on the rollout's own mesh, in its own steps and precision; size: how much the corrected value differs
         from that of the first frame.
     mesh: what the mesh costs; the number of elements of ten nodes, or of halved edges, is taken for the truth.
-    step: what steps of this length cost (NaN: not known; zero of equilibria). solver: what the solver's tolerance leaves.
+    step: what steps of this length cost (zero of equilibria). solver: what the solver's tolerance leaves.
     rounding: what rounding may cost: of float32 the distance from float64, of float64 a bound without sign.
     shares: of `mesh` by tetrahedron; their sum is `mesh`. `save_picture(path, mesh, positions, accuracy.shares)` shows them.
     by: "adjoint", to first order from residuals and adjoint on the finer mesh; "solution", of that mesh.
@@ -63,7 +63,7 @@ class Accuracy(metaclass=Public):
     @property
     def error(self) -> float:
         """What has a sign of the error, added up: value less truth."""
-        return float(np.nansum([self.mesh, self.step, self.solver]))
+        return self.mesh + self.step + self.solver
 
     @property
     def bar(self) -> float:
@@ -102,7 +102,7 @@ class Number:
     def __init__(self, rollout: "Rollout", output: str, weights: ArrayLike | Callable | None):
         if output not in rollout.outputs:
             raise ValueError(no_such("output", output, rollout.outputs, "this rollout"))
-        self.output, self.loss, self.count = output, None, None
+        self.output, self.loss = output, None
         shape = tuple(rollout.outputs[output].shape(rollout.num_frames))
         self.linear = rollout.outputs[output].linear and not callable(weights)
         self.count = rollout.scene.mesh.num_vertices if output in PER_VERTEX else None
@@ -188,7 +188,7 @@ def estimated(
     else:
         rounding = exact["rounding"]
     step = _of_steps(own, frames, number, values)
-    size = abs(value - np.nansum([mesh, step, solver]) - number.start(frames))
+    size = abs(value - mesh - step - solver - number.start(frames))
     errors = dict(mesh=mesh, step=step, solver=solver, rounding=rounding)
     found = Accuracy(number.output, value, size or abs(value), **errors, shares=shares, by=by, cost=cost)
     found.notes = tuple(_doubts(rollout.scene, found, exact))
@@ -196,8 +196,9 @@ def estimated(
 
 
 def _run(rollout: "Rollout", number: Number, values: dict, given: list | None) -> tuple:
-    """(J of the rollout, Replay of it in float64, its frames)"""
-    own, value = rollout.on(rollout.solver, gradients="initial_positions", runs=None), None
+    """(J of the rollout, Replay of it in float64, its frames), without options that change gradients or hide errors."""
+    plain = dict(gradients="initial_positions", runs=None, clip=None, truncate=None, health=False, raise_errors=True)
+    own, value = rollout.on(rollout.solver, **plain), None
     if rollout.scene.precision == "f32":
         value = number.of(own.forward(**values))[0]
         own = own.with_scene(precision="f64")

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.outputs import SmoothMaximum, Strain, Stress
 from diffsim_ti.scene import Scene
-from diffsim_ti.terms import ExternalForce, Obstacle
+from diffsim_ti.terms import ExternalForce, MultiPointConstraint, Obstacle
 from diffsim_ti.terms.pose import Pose
 
 if TYPE_CHECKING:
@@ -34,22 +35,32 @@ def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) 
     """The same scene on a finer mesh of the body, `TetrahedralMesh.quadratic` or `refined`, whose first vertices are its
     own.
 
-    What is chosen by indices becomes a set, which new vertices on its sides join; forces on single vertices stay there.
+    What is chosen by indices becomes a set, which new vertices on its sides join; forces on single vertices, and relations
+    between them, stay there.
     Raises ValueError for what cannot be carried over.
     """
     given, base, terms = dict(scene.arguments), scene.mesh, []
     for k, term in enumerate(given["terms"]):
         surface, own = None if isinstance(term, Obstacle) else getattr(term, "surface", None), copy(term)
-        if isinstance(term, ExternalForce):
+        if isinstance(term, ExternalForce | MultiPointConstraint):
             own.vertices, terms = term.indices(scene.mesh), [*terms, own]
             continue
         if not callable(surface) and not is_named(surface):
             own.surface = f"surface of term {k}"
             base, term = base.with_surface_set(own.surface, surface), own
+        if not is_named(chosen := getattr(term, "tetrahedra", None)):
+            own.tetrahedra = f"tetrahedra of term {k}"
+            base, term = base.with_tetrahedron_set(own.tetrahedra, chosen), own
         terms.append(term)
     if not is_named(given["fixed"]):
         base, given["fixed"] = base.with_vertex_set(HELD, given["fixed"]), HELD
     mesh = finer(base)
+    known = mesh.refinement is not None or mesh.order > base.order
+    if not known or interpolation(mesh).shape != (mesh.num_vertices, base.num_vertices):
+        raise ValueError(
+            f"finer: must return the mesh of {base.num_vertices} vertices that it is given as quadratic() or refined() make "
+            f"it in one call, new vertices at other places if need be; got {mesh.num_vertices} vertices, made otherwise"
+        )
     for name in ("initial_positions", "initial_velocities"):
         if np.ndim(given[name]) == 2:
             given[name] = interpolation(mesh) @ np.asarray(given[name], np.float64)
@@ -105,9 +116,10 @@ def rollout_on_finer(rollout: "Rollout", finer: Callable, values: dict | None = 
     """The same rollout on a finer mesh, as in `on_finer`, with some arguments of its solver replaced."""
     scene, outputs = rollout.scene, []
     for k, output in enumerate(rollout.given_outputs):
-        if getattr(output, "per_vertex", False):
+        inner = output.of if isinstance(output, SmoothMaximum) else output
+        if getattr(inner, "per_vertex", False):
             raise ValueError(f"{output!r} is of each vertex, and forces on those of ten-node tetrahedra are others")
-        parts = [getattr(output, name, None) for name in ("on", "sets")]
+        parts = [getattr(inner, name, None) for name in ("on", "sets")]
         if not all(is_named(part) for part in parts):
             raise ValueError(f"{output!r} is of vertices by their indices: name them as a set")
         if not is_named(getattr(output, "support", None)):
@@ -116,6 +128,10 @@ def rollout_on_finer(rollout: "Rollout", finer: Callable, values: dict | None = 
             scene, output = scene.replace(mesh=scene.mesh.with_vertex_set(name, output.support)), own
         outputs.append(output)
     fine, solver = on_finer(scene, finer), rollout.solver
+    for output in outputs if fine.mesh.refinement else ():
+        inner = output.of if isinstance(output, SmoothMaximum) else output
+        if isinstance(inner, Stress | Strain) and not is_named(inner.of):
+            raise ValueError(f"{output!r} is of tetrahedra by their indices: name them as a set")
     if solver.explicit:
         if solver.unequal_steps is not None:
             raise ValueError(

@@ -80,7 +80,7 @@ def refine(
         found, run = estimated(problem, wanted, None, values, given)
         history.append((found.cost["unknowns"], found))
         reached = found.relative <= tolerance
-        if reached or len(history) > rounds or 3 * found.cost["finer unknowns"] > most:
+        if reached or len(history) > rounds or found.cost["finer unknowns"] > most:
             return Refined(problem, history, reached, values)
         where = largest(found.shares)
         problem, values, P, _ = on_finer_mesh(problem, lambda mesh: mesh.refined(where, "longest", onto), values)

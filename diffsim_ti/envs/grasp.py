@@ -39,9 +39,9 @@ class SoftGrasps(SoftBodies):
         floor = Ground(stiffness=500.0, width=WIDTH)
         return Scene(cube, StableNeoHookean(1e5, 0.3), 300.0, [Gravity(), Drag(2.0), left, right, floor])
 
-    def __init__(self, num_envs: int = 32, **more):
+    def __init__(self, num_envs: int = 32):
         self.pads = np.zeros((num_envs, 2))  # closed, risen [m]
-        super().__init__(num_envs, **more)
+        super().__init__(num_envs)
 
     def start(self, rows):
         self.pads[rows] = 0.0
@@ -51,6 +51,7 @@ class SoftGrasps(SoftBodies):
         moved = self.pads + self.step_time * actions * [CLOSING, LIFTING]
         moved = np.clip(moved, [-WIDTH, 0.0], [0.25 * SIZE, 2 * HEIGHT])
         rows = np.stack([self.pads, moved], 1)
+        self.rising = (moved - self.pads)[:, 1] / self.step_time  # [m/s]
         self.pads = moved
         return {
             name: np.stack([sign * rows[..., 0], rows[..., 1], np.zeros(rows.shape[:2])], -1)
@@ -71,9 +72,8 @@ class SoftGrasps(SoftBodies):
 
     def rewards(self, actions):
         lifted = self.positions[..., 1].mean(1) - self.scene.mesh.vertices[:, 1].mean()
-        rising = LIFTING * actions[:, 1] * (self.pads[:, 1] < 2 * HEIGHT)
         force = self.forces(self.positions, self.pads)
-        slip = np.abs(rising - self.velocities[..., 1].mean(1)) * (force.min(1) > 0)
+        slip = np.abs(self.rising - self.velocities[..., 1].mean(1)) * (force.min(1) > 0)
         return np.clip(lifted / HEIGHT, 0, 1) - slip - np.maximum(force / TOO_MUCH - 1, 0).sum(1)
 
 

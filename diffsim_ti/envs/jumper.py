@@ -23,9 +23,9 @@ class SoftJumpers(SoftBodies):
     gradients = ("initial_positions", "initial_velocities", "external_forces")
     num_actions = 2
 
-    def __init__(self, num_envs: int = 32, **more):
+    def __init__(self, num_envs: int = 32):
         self.best = np.zeros(num_envs)  # progress so far
-        super().__init__(num_envs, **more)
+        super().__init__(num_envs)
         self.pressing = self.forces(self.scene.mesh)
 
     @staticmethod

@@ -28,7 +28,7 @@ class SoftBodies(gymnasium.vector.VectorEnv):
     num_actions = 0
     step_time, horizon, substeps = 0.01, 50, 20
 
-    def __init__(self, num_envs: int = 32, **_):
+    def __init__(self, num_envs: int = 32):
         self.scene, self.num_envs = self.make_scene(), num_envs
         solver = SemiImplicitSolver(self.scene, dt=self.step_time, substeps=self.substeps)
         self.batch = Batch(solver, 1, num_envs, gradients=self.gradients)

@@ -107,10 +107,11 @@ class Elements:
 
         where: tetrahedra, as in `tetrahedron_indices`. edges: "all" six of them, which makes eight of a tetrahedron, or the
         "longest" alone, two. Vertices keep their indices, new ones follow; sets stay on their places, and curved ten-node
-        elements keep their shape exactly.
+        elements keep their shape exactly. A new vertex joins a vertex set that has all vertices of a tetrahedron or surface
+        face that it lies in; a set along a line it does not join.
         onto: function of the places of new vertices [m], shape (k, 3), that returns where they are to be, such as on a round
-        surface that edges are chords of. `refinement` of the mesh says whose parts its
-        tetrahedra are, and has the matrix that carries fields: `fine.refinement.from_coarse @ displacements`.
+        surface that edges are chords of. `refinement` of the mesh says whose parts its tetrahedra are, and has the matrix
+        that carries fields: `fine.refinement.from_coarse @ displacements`.
         Rivara 1997, New longest-edge algorithms for the refinement of unstructured meshes,
         doi:10.1002/(SICI)1097-0207(19970930)40:18<3313::AID-NME214>3.0.CO;2-#.
 

@@ -80,7 +80,7 @@ def parts_of_refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable 
         vertices = checks.checked_vertices(vertices)
         volumes = checks.checked_volumes(vertices, elements[:, :4])
         checks.oriented(elements, volumes, fix_orientation=False)
-        volumes = checks.checked_curved_volumes(vertices, elements, volumes)
+    volumes = checks.checked_curved_volumes(vertices, elements, volumes)
 
     def sets(fine: "TetrahedralMesh") -> tuple[dict, dict]:
         within = {name: np.isin(cut.parents, rows) for name, rows in mesh.tetrahedron_sets.items()}

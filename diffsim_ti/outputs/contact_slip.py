@@ -24,7 +24,8 @@ class ContactSlip(Output):
         obstacle's friction_speed), at 1 it slides.
 
     p_i and t_i: normal force and friction, n_i = p_i / |p_i|, all as of `ContactForce(obstacle, per_vertex=True)`, so means
-    since the frame before: with save_every=1 those of the step that ends in the frame. States of static solves have no
+    since the frame before: with save_every=1 those of the step that ends in the frame. Of steps of unequal lengths v_o is
+    that of a step of their mean length since the frame before, exact with save_every=1. States of static solves have no
     velocity; their "share" is that of the last equilibrium.
     obstacle: its name, or the term as the scene lists it. The gradient is exact by all inputs; a "share" of 0 has none.
 
@@ -65,15 +66,11 @@ class ContactSlip(Output):
 
     # ---- the obstacle's velocity: u + w x (x - c), of its path's rows ----------------------------------------------------
 
-    def _at(self, frames: "Frames") -> tuple[np.ndarray, float]:
-        """(row of the path at each frame, 1 at least; length of a step [s]); a simulator's has rows of one step alone."""
-        first, last = frames.steps[0], frames.steps[-1]
-        dt = (
-            float(frames.times[-1] - frames.times[0]) / (last - first)
-            if last > first
-            else frames.times[0] / max(last, 1)
-        )
-        return np.clip(frames.steps, 1, len(frames.inputs[self.path]) - 1), dt or 1.0
+    def _at(self, frames: "Frames") -> tuple[np.ndarray, np.ndarray]:
+        """(row of the path at each frame, 1 at least; mean length of the steps since the frame before [s], as a column); a
+        simulator's has rows of one step alone. At the start, where no contact is known, the length is 1."""
+        dt = np.diff(frames.times, prepend=0.0) / np.maximum(np.diff(frames.steps, prepend=0), 1)
+        return np.clip(frames.steps, 1, len(frames.inputs[self.path]) - 1), np.where(dt > 0, dt, 1.0)[:, None]
 
     def _of_rows(self, frames: "Frames", columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of each frame (u, w, where the point that it turns about has gone), or their changes."""

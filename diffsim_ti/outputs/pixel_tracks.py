@@ -95,7 +95,9 @@ class PixelTracks(Output):
         for k in range(len(x)):
             seen = self.camera.project(x[k], self.size)
             inside = np.all((seen[:, :2] >= 0) & (seen[:, :2] <= self.size), 1)
-            triangles = self.camera.project(frames.positions[k].astype(np.float64)[self.triangles], self.size)
+            body = frames.positions[k].astype(np.float64)
+            ahead = ((body - self.camera.position) @ self.camera.axes[2] < 0)[self.triangles].all(1)
+            triangles = self.camera.project(body, self.size)[self.triangles[ahead]]
             out[k] = inside & (_nearest_depth(triangles, seen[:, :2]) > seen[:, 2] - within * self.length)
         return out
 

@@ -21,10 +21,11 @@ def _monomials(z: np.ndarray, order: int, slopes: bool) -> tuple[np.ndarray, np.
 
 class PatchRecovery:
     """T at each vertex x_v: the value there of the polynomial, of the order of the elements' displacements, that is nearest
-    in the mean square to T at the points x_k of the elements around, and around these where they are too few:
+    in the weighted mean square to T at the points x_k of the elements around, and around these where they are too few:
 
-        T(x_v) = sum_k c_k T_k,    c_k = e_0 . A^-1 p(x_k - x_v),    A = sum_k p p^T
+        T(x_v) = sum_k c_k T_k,    c_k = w_k e_0 . A^-1 p(x_k - x_v),    A = sum_k w_k p p^T
 
+    w_k: the distance |x_k - x_v| in the mesh as it was made to the power -4, the greatest of a vertex being 1.
     of: tetrahedra that count alone at their vertices, none: all.
     Zienkiewicz, Zhu 1992, The superconvergent patch recovery, doi:10.1002/nme.1620330702.
     """

@@ -24,7 +24,8 @@ class MultiPointConstraint(GivenOverTime, Term):
 
     such as equal motion of two places, the mean motion of a face, or a lever. In implicit and static solvers.
 
-    vertices: a vertex set's name, several, indices or a mask; coefficients c_j [-]: shape (k, 3), in their order.
+    vertices: a vertex set's name, several, indices or a mask; coefficients c_j [-]: shape (k, 3), in the order of the
+        indices, of sets and masks in that of ascending indices.
     value [m], over time as the amount of `Pressure`; static load steps apply it in parts.
     stiffness [N/m]: g is the force over it; a hundred to a million times E times the body's size costs little, for solvers
         know the relation's matrix. `MultiPointConstraint.mean` makes the relation of a face's mean motion.
@@ -76,7 +77,8 @@ class MultiPointConstraint(GivenOverTime, Term):
         name: str | None = None,
     ) -> "MultiPointConstraint":
         """The mean motion of a surface along a `direction`, by areas at rest; with turn=True its mean rotation [rad] about
-        that direction through its centre, for small rotations. The surface stays free to deform."""
+        that direction through its centre, for small rotations, with value [rad] and stiffness [N m]. The surface stays free
+        to deform."""
         faces = mesh.faces_of(surface)
         vertices, n = np.unique(faces), numbers("MultiPointConstraint: direction", direction)
         if n.shape != (3,) or not n.any():
@@ -93,7 +95,9 @@ class MultiPointConstraint(GivenOverTime, Term):
         return self.described[1].value.size + 1
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
-        return mesh.vertex_indices(self.vertices)
+        """Vertices in the order of the coefficients."""
+        ascending, given = mesh.vertex_indices(self.vertices), np.asarray(self.vertices)
+        return given.astype(np.int64) if given.dtype.kind in "iu" and given.shape == ascending.shape else ascending
 
     def check(self, mesh: TetrahedralMesh) -> None:
         k, given = len(self.indices(mesh)), len(self.described[1].value)

@@ -27,7 +27,7 @@ class RemoteLoad(OnSurface, Load):
 
     load: (F_x, F_y, F_z, M_x, M_y, M_z), over time as in `Traction`. surface: as there. point: p [m]; None: c.
     Input with gradient: "remote_load" or "<name>.load", of the shape given, (steps + 1, 6) of what is linear within steps.
-    Raises ValueError for other shapes, what is not finite, unknown sets, and a surface whose vertices lie on one line.
+    Raises ValueError for other shapes, what is not finite, and unknown sets.
     MSC Nastran, Linear Static Analysis User's Guide, sec. 5, on RBE3.
 
     >>> import diffsim_ti as ds

@@ -30,7 +30,9 @@ class Camera(metaclass=Public):
         cls, matrix: ArrayLike, size: tuple[int, int], rotation: ArrayLike, translation: ArrayLike
     ) -> "Camera":
         """A camera as calibrations give it (OpenCV): x' = rotation x + translation has z' ahead and y' downwards, and its
-        pixel is matrix x' / z'; matrix [pixels], shape (3, 3), is that of a picture of `size`, width and height.
+        pixel is matrix x' / z'; matrix [pixels], shape (3, 3), is that of a picture of `size`, width and height, and counts
+        from the picture's corner. OpenCV counts from the middle of the first pixel: add 0.5 to its c_x and c_y, and to the
+        places that it finds in pictures.
 
         Raises ValueError for shapes that do not fit, a matrix with skew, and a rotation that is none.
         Hartley, Zisserman, Multiple View Geometry, 2nd ed., 2004, sec. 6.1.

@@ -28,21 +28,12 @@ def stiffness_of_impact(
 
 def pressed_by(terms, mesh, density: float) -> float:
     """What muscles, loads and gases of a scene press with at most, together [Pa]: muscles by their stress, activations of
-    less than 1 being taken for 1; forces by the section of the body that they go through."""
+    less than 1 being taken for 1; forces by the section of the body that they go through, moments as couples across it."""
     size, total = np.ptp(mesh.bounding_box, 0), 0.0
     section = float(np.sort(size)[:2].prod())
     for term in terms:
         kind, most = type(term).__name__, {}
-        if kind in (
-            "Muscle",
-            "Cable",
-            "Traction",
-            "Pressure",
-            "GasChamber",
-            "BodyForce",
-            "ExternalForce",
-            "RemoteLoad",
-        ):
+        if kind in ("Muscle", "Cable", "Traction", "Pressure", "GasChamber", "BodyForce", "ExternalForce"):
             most = {described.plain: _most(term, described) for described in term.described}
         if kind == "Muscle":
             total += most["muscle_stress"] * max(1.0, most["activation"])
@@ -56,16 +47,24 @@ def pressed_by(terms, mesh, density: float) -> float:
         elif kind == "BodyForce":
             total += most["body_force"] * (density if term.per == "mass" else 1.0) * float(size.max())
         elif kind == "RemoteLoad":
-            total += most["remote_load"] / section
+            force, moment = np.linalg.norm(_amounts(term, term.described[0]).reshape(-1, 2, 3), axis=2).max(
+                0, initial=0
+            )
+            total += (force + moment / float(np.sort(size)[1])) / section
         elif kind == "ExternalForce":
             total += most["external_forces"] * len(term.indices(mesh)) / section
     return total
 
 
+def _amounts(term, described) -> np.ndarray:
+    """Sizes of an input's numbers over time."""
+    value = over_time(term.rows) if described.value is None and hasattr(term, "rows") else described.value
+    return np.abs(np.zeros(1) if value is None else np.asarray(value, np.float64))
+
+
 def _most(term, described) -> float:
     """The largest amount of a number, or of rows of three, over time."""
-    value = over_time(term.rows) if described.value is None and hasattr(term, "rows") else described.value
-    value = np.abs(np.zeros(1) if value is None else np.asarray(value, np.float64))
+    value = _amounts(term, described)
     return float((np.linalg.norm(value, axis=-1) if value.shape[-1:] == (3,) else value).max(initial=0.0))
 
 
