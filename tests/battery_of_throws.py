@@ -96,15 +96,14 @@ class Judge:
 def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
     """(what the runs said, the last one of all, which is empty if it came to its end; intersections that nothing said);
     looks: substeps from one look of the judge to the next."""
-    said, dt, contact, silent, judges = [], None, dict(case["contact"]), 0, {}
-    reduced = case["reduced"]
+    said, dt, silent, judges, reduced = [], None, 0, {}, case["reduced"]
     for _ in range(ROUNDS):
         try:
             scene = ds.Scene(
                 case["mesh"],
                 ds.StableNeoHookean(case["E"], 0.35),
                 1000.0,
-                [ds.SelfContact(**contact)],
+                [ds.SelfContact(**case["contact"])],
                 initial_velocities=case["v"],
                 reduced=reduced,
                 precision=case["precision"],
@@ -121,14 +120,11 @@ def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
             return [*said, ""], silent
         except (FloatingPointError, ValueError) as error:
             said.append(str(error))
-        stiffness, step = (
-            re.search(rf"{what} {NUMBER}", said[-1]) for what in ("stiffness to", "(?:substeps of|substep to)")
-        )
-        contact["stiffness"] = float(stiffness[1]) if stiffness else contact["stiffness"]
+        step = re.search(rf"(?:substeps of|substep to) {NUMBER}", said[-1])
         dt = float(step[1]) if step else dt
         affine = 'pass "affine" in place of "rigid"' in said[-1]
         reduced = {name: "affine" for name in reduced} if affine else reduced
-        if not (stiffness or step or affine):
+        if not (step or affine):
             return said, silent
     return said, silent
 

@@ -276,10 +276,11 @@ def run(name: str, posed: Posed, steps: int | None = None, judged: bool = True, 
         x, t, x_before, t_before = simulator.positions, simulator.time, x, t
         out.positions.append(x)
         if judged:
-            here = judge.count(places(x, t))
-            out.intersections += here
-            out.on_the_way += judge.count_along(places(x_before, t_before), places(x, t), samples) - here
-            out.turned += len(judge.turned(places(x, t)))
+            before, after = places(x_before, t_before), places(x, t)
+            out.intersections += judge.count(after)
+            last = before + (after - before) * (1 - 1 / samples)
+            out.on_the_way += judge.count_along(before, last, samples - 1)
+            out.turned += len(judge.turned(after))
         if say:
             say(out)
     return out
@@ -600,8 +601,7 @@ SCENES["pin cushion of segments"] = _cushion(True)
 
 @scene("funnel")
 def funnel(meshes: Meshes) -> Posed:
-    """A body is pulled into a tube of 40 mm by what of it is lowest. Where facets of the tube are equally near their
-    distance has a kink, and equilibria that lie there are found roughly alone."""
+    """A body is pulled into a tube of 40 mm by what of it is lowest."""
     vertices, triangles = meshes.surface("funnel")
     tube, speed = Surface(vertices, triangles), 0.06
     if meshes.folder:

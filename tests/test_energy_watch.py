@@ -74,6 +74,10 @@ SHAKEN = dict(fixed="xmin", motion=lambda t: [0.01 * np.sin(40 * t), 0.01 * np.s
 PLATE = lambda t: [0.3 * np.sin(20 * t), 0.01 * np.sin(60 * t), 0]  # noqa: E731
 
 
+PEAK = ds.Sphere([0.05, -0.04, 0.05], 0.05, stiffness=50.0, width=0.02, by_pairs=True)
+DOWN = lambda t: [0, -0.008 * np.sin(30 * t), 0]  # noqa: E731
+
+
 def ball(by_pairs: bool) -> ds.Sphere:
     place, path = [0.05, -0.04, 0.05], lambda t: [0, 0.05 * np.sin(30 * t), 0]
     return ds.Sphere(place, 0.05, stiffness=400.0, width=0.02, path=path, by_pairs=by_pairs)
@@ -93,6 +97,8 @@ WORK = {
     ),
     "a ball": lambda: body([ball(False)], ABOVE),
     "a ball by pairs": lambda: body([ball(True)], ABOVE),
+    "supports above a ball by pairs": lambda: body([PEAK], ABOVE, fixed=dict(ymin="xyz"), motion=dict(ymin=DOWN)),
+    "rollers above a ball by pairs": lambda: body([PEAK], ABOVE, fixed=dict(ymin="y"), motion=dict(ymin=DOWN)),
     "a belt": lambda: body([ds.Gravity(), ds.Ground(0.0, 2e3, width=0.01, friction=0.5, path=PLATE)], ABOVE),
 }
 

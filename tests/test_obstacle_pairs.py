@@ -61,6 +61,8 @@ def test_which_way_an_obstacle_acts_is_fixed_when_the_scene_is_built():
         (ball(1.01 * limit), False),
         (ball(1.01 * limit, by_pairs=True), True),
         (ball(0.01, by_pairs=False), False),
+        (ds.MeshObstacle([[0, -1, 0], [0.1, -1, 0]], segments=[[0, 1]], **BARRIER), True),
+        (ds.MeshObstacle([[0, -1, 0], [0.1, -1, 0]], segments=[[0, 1]], by_pairs=False, **BARRIER), False),
         (ds.Ground(-1, **BARRIER), False),
         (ds.Sphere((0, 0, 0), 5.0, inside=True, **BARRIER), False),
     ):

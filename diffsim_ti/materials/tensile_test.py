@@ -42,8 +42,9 @@ class TensileTest:
     def from_file(cls, path: str | Path, kind: str = "uniaxial") -> "TensileTest":
         """A table of numbers below a line of titles, which say what they are and their unit: a stretch, or an engineering or
         true strain (in % where the title says so), or a displacement; and an engineering or true stress, or a force. A
-        displacement needs the length, and a force the cross-section, in lines "Length (mm);33" and "Width (mm);6" above. The
-        stress of rows with the same stretch is their mean.
+        displacement needs the length, and a force the cross-section, in lines "Length (mm);33", "Width (mm);6" and
+        "Thickness (mm);3", or "Cross-section (mm2);18", above. Rows that follow each other with the same stretch count as
+        one, with the mean of their stresses.
 
         Cells stand between semicolons, tabs, commas or blanks; decimals follow a point or a comma; any encoding. What goes
         back from a larger stretch, what follows the largest stress, and slack before the first one are left out, and said.
@@ -199,7 +200,8 @@ def _stress(columns: dict, header: dict, stretch: np.ndarray, path) -> np.ndarra
         area = factor * given if area is None and given else area
     if area is None:
         raise ValueError(
-            f'{path}: {title!r} needs the cross-section: lines "Width (mm);6" and "Thickness (mm);3" above'
+            f'{path}: {title!r} needs the cross-section: lines "Width (mm);6" and "Thickness (mm);3", or '
+            '"Cross-section (mm2);18", above'
         )
     return columns[title] * (1e3 if _unit(title) == "kn" else 1) / area
 

@@ -16,7 +16,8 @@ A pair that presses with P slides with the velocity t = T B v across its normal,
 
     r = -h mu P f(s / eps) t / |t|,   s + c f(s / eps) = |t|,   c = h sum_i (|B_i| / m_i) S_i,   S_i = sum |B_i| mu P
 
-over nodes i, the last sum over all pairs; f is that of terms/obstacles/friction.py. c / (h mu P) is a bound W of the inverse
+over nodes i, the last sum over all pairs, with the sizes of the entries of the inverse mass where an affine set has a matrix
+(NearPairs.lightened); f is that of terms/obstacles/friction.py. c / (h mu P) is a bound W of the inverse
 mass that the pair meets while all others have friction, too: by Cauchy and Schwarz |sum_p r_p B_p|^2 / m is at most
 sum_p W_p |r_p|^2. With r_p = -(1 - s / |t|) t / W_p all frictions together change the kinetic energy by no more than
 

@@ -44,9 +44,9 @@ class ContactPass:
 
     near: NearPairs
     numbers: np.ndarray  # of the pairs in the list
-    nodes: np.ndarray
-    points: np.ndarray
-    pairs: np.ndarray
+    nodes: np.ndarray  # places among those of the stage
+    points: np.ndarray  # vertices of the surface
+    pairs: np.ndarray  # corners, which are such vertices, (pairs, 4)
     rest: tuple  # of pairs: plane and weights at rest, which coefficient of friction
     start: np.ndarray
     u: np.ndarray | None = None
@@ -110,16 +110,17 @@ class PairContact(Stage):
         """C of points, (points, nodes by number), with all four entries of each set that a point belongs to."""
         from scipy.sparse import coo_matrix, identity
 
-        whole = (identity(count, format="csr") if self.matrix is None else self.matrix).tocoo()
-        kept = ~np.isin(whole.col, np.concatenate([x.vertices for x in self.sets]))
-        rows, columns, data = ([x[kept]] for x in (whole.row, whole.col, whole.data))
+        C = identity(count, format="csr") if self.matrix is None else self.matrix.tocsr()
+        entries = C.tocoo()
+        kept = ~np.isin(entries.col, np.concatenate([x.vertices for x in self.sets]))
+        rows, columns, data = ([x[kept]] for x in (entries.row, entries.col, entries.data))
         for k, x in enumerate(self.sets):
-            B = whole.tocsr()[:, x.vertices] @ x.basis
-            points = np.flatnonzero(abs(whole.tocsr()[:, x.vertices]).sum(1))
+            of_set = C[:, x.vertices]
+            B, points = of_set @ x.basis, np.flatnonzero(abs(of_set).sum(1))
             rows.append(np.repeat(points, 4))
             columns.append(np.tile(count + 4 * k + np.arange(4), len(points)))
             data.append(B[points].ravel())
-        shape = whole.shape[0], count + 4 * len(self.sets)
+        shape = C.shape[0], count + 4 * len(self.sets)
         out = coo_matrix((np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))), shape).tocsr()
         out.sort_indices()
         return out
@@ -337,7 +338,7 @@ class PairContact(Stage):
         return ContactPass(near, numbers, place, points, corners, (*rest, self.numbers.of(numbers, corners)), None)
 
     def _numbers(self, one: ContactPass, now, changes=None) -> SimpleNamespace:
-        """What parts read; changes: of it, as imaginary parts of the size `TINY`."""
+        """What parts read; changes: of it, as imaginary parts that are tiny."""
         a, own = self.a, one.rest[2]
         nodes, numbers = self.nodes[one.nodes], a.values.parameters.astype(float)
         rest, mass, inverse_mass, radius = a.values.rest - a.origin, a.values.mass, self.inverse, 0.0
@@ -403,11 +404,12 @@ class PairContact(Stage):
         moved = runtime.fetch_row(*self._fine(at.history.u, at.end))[surface] - runtime.fetch(inner.before)
         ways = np.linalg.norm(moved - moved.mean(0), axis=1)
         i, h = int(ways.argmax()), now.h
+        where = inner.part("vertex", surface[i : i + 1])
         inner.fresh = False
         copy_slot(*((at.history.u, at.slot) if at.stride else (self.begin, 0)), at.ws.state.u, 0)
         error = Tunnelling(
             f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep "
-            f"of {h:.3g} s, {ways[i] / h:.3g} m/s at vertex {surface[i]}: take substeps of {0.25 * h:.3g} s"
+            f"of {h:.3g} s, {ways[i] / h:.3g} m/s at {where}: take substeps of {0.25 * h:.3g} s"
         )
         error.stable_dt = 0.25 * h
         raise error

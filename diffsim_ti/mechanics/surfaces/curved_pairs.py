@@ -107,7 +107,6 @@ class FinerArrays:
         self.self_contact, self.num_vertices = arrays.self_contact, surface.num_vertices
         self.parameters_of_self_contact = arrays.parameters_of_self_contact
         self.fp, self.vector = arrays.fp, arrays.vector
-        self.supports = SimpleNamespace(partly_fixed=())  # nodes are held
         self.rest = runtime.array(arrays.vector, surface.num_vertices)
         self.corner = runtime.array(arrays.vector, len(surface.surface_vertices))
         self._taken = None
@@ -119,11 +118,6 @@ class FinerArrays:
     @property
     def parameters(self):
         return self.scene.parameters
-
-    @property
-    def inverse_mass(self):
-        lightness = self.mesh.matrix.power(2) @ runtime.fetch(self.scene.inverse_mass).astype(np.float64)
-        return runtime.upload(lightness, self.scene.fp)
 
     def follow(self) -> None:
         """Take the rest shape that the scene has loaded."""

@@ -151,7 +151,7 @@ class FrictionKernels(ListedPair):
         pressing = scene.pressing[p]
         w_adj, of_pressing, mu = scene.weights_adj[p], scene.pressing_adj[p], self.mu(p, scene)
         by_load = of_pressing[3]
-        y1, y2, y3 = self.corners(p, scene, at.place, plan.begin)
+        y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
         h1, h2, h3, by_k, by_width, by_radius = self.pair.pressed_vjp(
             kind, p, y1, y2, y3, w_adj, three(of_pressing), mu * by_load, scene, plan
         )
@@ -188,7 +188,7 @@ class FrictionKernels(ListedPair):
 
     @cached_property
     def measure_vjp(self) -> Kernel:
-        """Adjoint of the displacement place[begin] (`by_place`) for `weights_adj` and `pressing_adj`; adds those of the
+        """Adjoint of the displacement u[slot] (`by_place`) for `weights_adj` and `pressing_adj`; adds those of the
         numbers and of the rest shape."""
-        at = dict(place="vectors2", by_place="vectors", by_mu="scalars")
-        return self.kernel("measure_vjp", self.measure_all_vjp, at, OWN | ADJ | SUMS, begin="int", num_rows="int")
+        at = dict(u="vectors2", by_place="vectors", by_mu="scalars")
+        return self.kernel("measure_vjp", self.measure_all_vjp, at, OWN | ADJ | SUMS, num_rows="int")

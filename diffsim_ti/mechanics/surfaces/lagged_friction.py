@@ -226,8 +226,8 @@ class LaggedFriction:
             every = np.zeros((array.shape[0], 4))
             every[self.felt] = data
             runtime.fill(array, every)
-        at = dict(place=self.pairs.next, **self.adjoints)
-        self.pairs.run(self.kernels.measure_vjp, at, self.own, slot=0, begin=0, num_rows=self.num_rows)
+        at = dict(u=self.pairs.next, **self.adjoints)
+        self.pairs.run(self.kernels.measure_vjp, at, self.own, slot=0, num_rows=self.num_rows)
         return runtime.fetch(self.adjoints["by_place"])
 
     def clear_sums(self) -> None:

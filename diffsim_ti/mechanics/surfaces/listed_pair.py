@@ -15,7 +15,7 @@ from diffsim_ti.terms.self_contact import SelfContact
 A = ti.template()
 MARGIN = 1.001
 MANY = -1
-SAFE = 0.9  # share of its gap by which a pair may close in one pass
+SAFE = 0.9  # share of its gap by which a pair may close on the way of one step
 # which corners belong to different primitives
 OPPOSITE = (((0, 1), (0, 2), (0, 3)), ((0, 2), (0, 3), (1, 2), (1, 3)))
 LIST = dict(pairs="ints", scale="scalars", surface="ints", place="ints", row="ints", corner_of="ints")  # broad_phase.py

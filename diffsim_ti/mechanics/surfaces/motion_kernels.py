@@ -1,4 +1,4 @@
-"""Kernels that follow the motion of a surface: whether a list of pairs still holds, and whether a pair may have crossed.
+"""Kernels that follow the motion of a surface: whether a list of pairs still holds, and which of them may have come near.
 
 A list holds until a vertex has used up its slack by moving relative to its body, or to the mean of all bodies. Two convex
 sets that a plane parts cannot meet while their corners move in straight lines and stay parted.

@@ -87,9 +87,9 @@ class NearSet:
     def begin(self, x: np.ndarray, anew: bool) -> None:
         """A pass begins with nodes at x; anew: and no pair is chosen."""
         put(self.arrays["nodes"].x, x)
-        runtime.fill(self.arrays["state"].numbers, 0)
         if anew:
             runtime.fill(self.arrays["pairs"].chosen, 0)
+            runtime.fill(self.arrays["state"].numbers, 0)
 
     def choose(self, motion: np.ndarray) -> int:
         """Choose the pairs that come near while nodes move so: how many are new."""
@@ -102,17 +102,13 @@ class NearSet:
     def start(self, motion: np.ndarray) -> None:
         """Parts begin, of a pass in which nodes would move so without contact."""
         put(self.arrays["nodes"].motion, motion)
-        for name in ("e", "b"):
+        for name in ("e", "b", "numbers"):
             runtime.fill(getattr(self.arrays["state"], name), 0)
 
     def take(self, **numbers) -> tuple[int, float]:
         """(what came of a part, its damping)"""
         self._take_part(**self.acting, **numbers)
         return int(whole(self.arrays["state"].result)[0]), float(whole(self.arrays["state"].numbers)[0])
-
-    @property
-    def motion(self) -> np.ndarray:
-        return whole(self.arrays["nodes"].motion)[: self.sizes["num_nodes"], :3].copy()
 
     @property
     def moved(self) -> tuple[np.ndarray, np.ndarray]:

@@ -408,7 +408,7 @@ class PartKernels(Pair):
 
     @ti.func
     def act(self, c, pairs: A, nodes: A, state: A, work: A, plan: A):
-        """e and b after the part (PartSolver.take); the work of what moves nodes of infinite mass against pushes [J]."""
+        """e and b after the part (PartSolver.take); the work of what holds nodes, or moves obstacles, against pushes [J]."""
         h, alpha = plan.share * plan.h, plan.share * plan.alpha
         done = ti.cast(0, self.fp)
         for i in range(plan.num_nodes):
@@ -433,9 +433,10 @@ class PartKernels(Pair):
         for i in range(plan.num_nodes):
             delta = h * self.lightened(i, work.residual, nodes)
             friction = self.lightened(i, work.sum, nodes)
-            if nodes.inverse[i] == 0:
-                given = h * three(work.residual[i]) + three(work.sum[i])
-                done = done - given.dot(three(nodes.motion[i])) / plan.h
+            given = h * three(work.residual[i]) + three(work.sum[i])
+            if nodes.inverse[i] > 0:  # what holds it in some directions takes the rest
+                given = given - self.freed(i, given, nodes)
+            done = done - given.dot(three(nodes.motion[i])) / plan.h
             way = three(state.b[i]) + 0.5 * (1 + c) * delta + friction
             state.e_next[i] = state.e[i] + alpha * self.four(way)
             state.b_next[i] = state.b[i] + self.four(delta + friction)
@@ -502,6 +503,6 @@ class PartKernels(Pair):
     @cached_property
     def take(self) -> Kernel:
         """The part `begin` .. `begin + share` of a pass of length h; result: what came of it; numbers: its damping, and
-        the work of all parts since `NearSet.begin`."""
+        the work of all parts since `NearSet.start`."""
         numbers = dict.fromkeys(("begin", "share", "h", "alpha", "damping", "wall", "rounding"), "float")
         return self._kernel("take_part", self.take_all, rough="int", **numbers)

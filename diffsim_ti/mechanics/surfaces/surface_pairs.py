@@ -139,7 +139,7 @@ class SurfacePairs:
             self.build(u, 0)
         found = self.list.first_piercing(self.a.rest, u, 0)
         if found:
-            edge, triangle = self._part("edge", self.edges[found[0]]), self.mesh.surface_triangles[found[1]]
+            edge, triangle = self.part("edge", self.edges[found[0]]), self.mesh.surface_triangles[found[1]]
             raise Overlap(
                 f"surfaces pass through each other: {edge} and triangle {_numbers(triangle)}; move the bodies apart"
             )
@@ -239,12 +239,12 @@ class SurfacePairs:
     def _name(self, pair: int, pairs: np.ndarray) -> str:
         c = pairs[pair]
         if pair < self.list.num_vt:
-            return f"{self._part('vertex', c[:1])} and triangle {_numbers(c[1:])}"
+            return f"{self.part('vertex', c[:1])} and triangle {_numbers(c[1:])}"
         if self.kinematic and self.kinematic.name(c[2]):
-            return f"edge {_numbers(c[:2])} and {self._part('edge', c[2:])}"
+            return f"edge {_numbers(c[:2])} and {self.part('edge', c[2:])}"
         return f"edges {_numbers(c[:2])} and {_numbers(c[2:])}"
 
-    def _part(self, kind: str, corners: np.ndarray) -> str:
+    def part(self, kind: str, corners: np.ndarray) -> str:
         """A vertex or an edge in words."""
         obstacle = self.kinematic.name(corners[0]) if self.kinematic else None
         if obstacle is None:

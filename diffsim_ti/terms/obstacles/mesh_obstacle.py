@@ -33,15 +33,13 @@ class MeshObstacle(Obstacle):
     push out what got into them, and no body may start there; triangles that face inwards bound a room. All
     other triangles, segments and points act on both sides alike. Vertices of bodies find what is nearest in a tree
     of boxes, so that triangles that are far away cost next to nothing. Segments, points, and edges and corners that are
-    sharp for the body's faces also act on edges and faces of bodies, by pairs.
+    sharp for the body's faces also act on edges and faces of bodies, by pairs, unless by_pairs is False.
     shapeable: whether vertices are an input; in gradients each vertex of the body then has 3 k numbers of its own.
     `resolution` has no meaning, for nothing is sampled.
 
     Inputs with gradient: "mesh_position", shape (3,), "mesh_radius", "mesh_vertices", shape (k, 3), if it is shapeable, and
     those of every `Obstacle`, whose other arguments it takes. The distance is C1 but where two parts are equally near;
-    where the nearest goes from a face to an edge or a corner the contact's stiffness jumps. A vertex that is pressed into
-    the crease between two faces rests where the force jumps from one to the other: there Newton's method may get no
-    further than a relative residual of 1e-3 to 1e-2, and says so.
+    where the nearest goes from a face to an edge or a corner the contact's stiffness jumps.
     Raises ValueError for vertices or indices that do not fit.
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
     """
@@ -69,7 +67,7 @@ class MeshObstacle(Obstacle):
         self._base = middle_far_part(self._made.vertices)
         self._tree = SurfaceTree(self._made, self._base)
         super().__init__([place("position", position, "mesh_position"), thick], **options)
-        self.by_pairs, self.shapeable = True, bool(shapeable)
+        self.by_pairs, self.shapeable = self.by_pairs is not False, bool(shapeable)
         if self.shapeable:  # behind all other numbers, as kernels read few of them at a time
             shape = Input("vertices", vertices, (self._made.vertices.shape,), "m", change=length, plain="mesh_vertices")
             self.described = (*self.described, shape)

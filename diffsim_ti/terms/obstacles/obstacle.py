@@ -71,7 +71,7 @@ class Obstacle(Term):
     the mesh, or by a third of that of the triangles at the edge. None: it does where it is narrow, that is where a ball of
     its least radius R, which touches a face whose longest edge in the mesh is L, could be nearer to it than to its corners
     by more than 0.12 widths, (1.2 L)^2 > 6 R 0.12 width; a ball or a capsule also where faces are curved. That is decided
-    when the scene is built. Mesh obstacles always do so with what is sharp of them.
+    when the scene is built. Mesh obstacles do so with what is sharp of them.
     A face of ten-node tetrahedra counts as the four triangles of its six nodes, and by pairs as many smaller ones as its
     bow asks for; a warning says where it lies farther than half a width from triangles that act at nodes alone.
 
