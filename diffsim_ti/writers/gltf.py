@@ -23,6 +23,7 @@ class GltfWriter(SurfacesWriter):
     """
 
     suffixes = (".glb",)
+    coloured = False
 
     def close(self) -> None:
         if self._places:

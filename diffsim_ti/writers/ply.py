@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from diffsim_ti.visual.frame import Frame
 from diffsim_ti.writers.surfaces import SurfacesWriter
 from diffsim_ti.writers.writer import View, file_of, numbered, register
 
@@ -22,6 +23,11 @@ class PlyWriter(SurfacesWriter):
     def __init__(self, path: str | Path, view: View | None = None):
         super().__init__(path, view)
         self.numbered = numbered(self.path)
+
+    def write(self, frame: Frame) -> None:
+        if not self.numbered:  # only the last one waits
+            self.open(self.setting)
+        super().write(frame)
 
     def close(self) -> None:
         import meshio

@@ -14,7 +14,10 @@ Surface = tuple[str, np.ndarray, list[np.ndarray], list[np.ndarray]]
 
 
 class SurfacesWriter(Writer):
-    """Keeps of each frame its time, the places of surface vertices, and the field that `view.colour` names."""
+    """Keeps of each frame its time, the places of surface vertices, and the field that `view.colour` names, where the format
+    has colours of vertices."""
+
+    coloured = True
 
     def open(self, setting: Setting) -> None:
         self.setting, self._times, self._places, self._values, self.count = setting, [], [], [], 0
@@ -23,7 +26,7 @@ class SurfacesWriter(Writer):
     def write(self, frame: Frame) -> None:
         standing, surface = [points for points, _ in self.setting.obstacles], self.setting.mesh.surface_vertices
         places = [frame.positions[surface], *(frame.obstacles or standing)]
-        if self.view.colour is not None:
+        if self.coloured and self.view.colour is not None:
             values = frame.colour_values(self.view.colour)
             self._values.append(to_vertices(self.setting.mesh, values)[surface])
         self._times.append(frame.time)
