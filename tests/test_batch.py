@@ -503,6 +503,12 @@ def test_scenes_of_other_drag_take_implicit_steps_by_turns():
     speed = frames.velocities[:, -1, 0, 1]
     np.testing.assert_allclose(speed, -0.0981 * (1 + np.exp([-0.005, -0.02])), rtol=1e-6)
     assert batch.vjp(frames, velocities=np.ones(frames.velocities.shape))["drag_rate"].shape == (2,)
+    asked = ds.Batch(ds.ImplicitEulerSolver(scene, dt=0.01), 2, 2, lanes=True)
+    with pytest.raises(
+        ValueError, match="implicit steps have one drag_rate; give it once for all, or leave out lanes=True"
+    ):
+        asked.forward(drag_rate=[0.5, 2.0])
+    assert asked.forward(drag_rate=0.5).alive.all()
 
 
 def test_a_control_loop_goes_on_from_its_ends():

@@ -8,6 +8,7 @@ import pytest
 from contact_scenes import BASE, FORCE, RESTING, G, points, resting_gap, tetrahedron
 
 import diffsim_ti as ds
+from diffsim_ti.terms.obstacles import friction
 
 solvers = pytest.mark.parametrize("solver", FORCE + RESTING)
 
@@ -23,13 +24,28 @@ def on_incline(friction: float, friction_speed: float, **options):
     return points(mesh, plane, terms=[ds.Gravity(-G)], **options), down
 
 
+def test_friction_has_its_digits_in_single_precision():
+    """s + c f(s / eps) = s* by its formula, wherever the friction is weak, strong, or just holds."""
+    eps, rng = 1e-3, np.random.default_rng(0)
+    c = eps * 10.0 ** rng.uniform(-6, 6, 2000)
+    speed = (eps + c) * np.concatenate([rng.uniform(0, 1, 1500), 1 + rng.uniform(-1e-3, 1e-3, 500)])
+    exact = friction.slip(speed, c, eps, friction.ARRAYS)
+    s, f = exact[2] * eps, exact[1]
+    sticks = speed < eps + c
+    np.testing.assert_allclose((s + c * f)[sticks], speed[sticks], rtol=1e-14)
+    single = friction.slip(speed.astype(np.float32), c.astype(np.float32), np.float32(eps), friction.ARRAYS)
+    assert single[1].dtype == np.float32
+    np.testing.assert_allclose(single[1], f, rtol=3e-6)
+    np.testing.assert_allclose(single[0], exact[0], rtol=3e-6)
+
+
 @solvers
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_incline(solver, precision):
     """R21: friction 0.50 sticks, but for a creep slower than friction_speed; 0.49 slides 0.274198 m in 2.5 s."""
     T, eps = 2.5, 1e-4
-    for friction, slides in ((0.50, False), (0.49, True)):
-        scene, down = on_incline(friction, eps, precision=precision)
+    for coefficient, slides in ((0.50, False), (0.49, True)):
+        scene, down = on_incline(coefficient, eps, precision=precision)
         frames = ds.Rollout(solver(scene, dt=2e-3), 1250).forward()
         way = (frames.positions[-1] - frames.positions[0])[:3] @ down
         if slides:

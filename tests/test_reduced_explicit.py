@@ -337,7 +337,7 @@ def test_a_narrow_obstacle_pushes_an_affine_body():
 
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_surfaces_push_an_affine_body(friction):
-    """Momenta are kept to round-off, angular momentum where nothing rubs; gradients know that four nodes share its mass."""
+    """Momenta are kept to round-off, angular momentum without friction; gradients know that four nodes share its mass."""
     low = ds.TetrahedralMesh.create_box(2, size=0.1)
     up = ds.TetrahedralMesh.create_box(2, size=0.08, origin=(0.01, 0.104, 0.02)).rotated([0, 1, 0], 0.1)
     mesh = ds.TetrahedralMesh.joined([low, up])

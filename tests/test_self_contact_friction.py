@@ -146,7 +146,7 @@ def turned(width, friction, solver, steps, **options):
     "solver, steps, options", [(ds.SemiImplicitSolver, 200, {}), (ds.ImplicitMidpointSolver, 60, dict(tolerance=1e-11))]
 )
 def test_angular_momentum_but_for_the_couple_of_friction_across_the_gap(solver, steps, options):
-    """The couple's arm is the gap, half the width here; it falls with the width, and is none where nothing rubs."""
+    """The couple's arm is the gap, half the width here; it falls with the width, and there is none without friction."""
     (wide, by_wide), (narrow, by_narrow) = (turned(width, 0.4, solver, steps, **options) for width in (4e-3, 2e-3))
     assert narrow == pytest.approx(0.5 * wide, rel=0.05)
     for gained, impulse, width in ((wide, by_wide, 4e-3), (narrow, by_narrow, 2e-3)):

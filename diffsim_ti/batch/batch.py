@@ -145,6 +145,11 @@ class Batch(metaclass=Public):
         drag = None if self.solver.explicit else self.scene.term(Drag)
         name = self.scene.input_names(drag)["drag_rate"] if drag else None
         if drag and isinstance(values[name], Own) and np.ptp(values[name]) > 0:
+            if self._lanes_asked:
+                raise ValueError(
+                    f"scenes cannot be computed side by side: implicit steps have one {name}; give it once for all, or "
+                    "leave out lanes=True"
+                )
             warn(f"scenes that differ in {name} take implicit steps one after the other")
             return False
         return True

@@ -179,7 +179,7 @@ def simulate(
         typer.Option(
             "--accuracy",
             help="also say what mesh, steps, solver and rounding cost the height of the centre of mass at the end, and draw "
-            "the share of each tetrahedron; of implicit solvers, without --dt in as many steps as were taken last",
+            "the share of each tetrahedron; of implicit solvers; without --dt by steps as long as the last ones",
         ),
     ] = False,
     backend: opt.Backend = "cpu",

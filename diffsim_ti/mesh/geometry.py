@@ -95,6 +95,16 @@ def triangle_areas_vjp(vertices: np.ndarray, triangles: np.ndarray, areas_adj: n
     return triangle_normals_vjp(vertices, triangles, areas_adj[:, None] * unit)
 
 
+def barycentric_in_plane(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Where a point of a plane lies in triangles with these corners, shape (k, 3, 2 or more), whose first two coordinates
+    count: weights of the corners, shape (k, 3); of triangles without area they are not finite."""
+    (a, b), q = (corners[:, k, :2] - corners[:, 0, :2] for k in (1, 2)), point - corners[:, 0, :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        u, v = (q[:, 0] * b[:, 1] - q[:, 1] * b[:, 0]) / area, (a[:, 0] * q[:, 1] - a[:, 1] * q[:, 0]) / area
+    return np.stack([1 - u - v, u, v], 1)
+
+
 def nearest_on_triangles(point: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The point nearest to `point` of each triangle, shape (k, 3): its foot where that lies inside, else on an edge."""
     edges = np.roll(triangles, -1, 1) - triangles  # edge a runs from corner a to the next

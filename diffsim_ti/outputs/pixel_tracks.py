@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh.geometry import barycentric_in_plane
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
 
@@ -104,15 +105,9 @@ class PixelTracks(Output):
 
 def _nearest_depth(triangles: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Depth [m] of the nearest triangle, of corners (column, row, depth), at each place; infinite for none."""
-    A, edges = triangles[:, 0], triangles[:, 1:] - triangles[:, :1]
-    wide = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
     out = np.full(len(places), np.inf)
     for k, place in enumerate(places):
-        q = place - A[:, :2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = (q[:, 0] * edges[:, 1, 1] - q[:, 1] * edges[:, 1, 0]) / wide
-            v = (edges[:, 0, 0] * q[:, 1] - edges[:, 0, 1] * q[:, 0]) / wide
-        w = np.stack([1 - u - v, u, v], 1)
+        w = barycentric_in_plane(place, triangles)
         hit = np.flatnonzero((w > -1e-9).all(1))
         if len(hit):
             out[k] = (1 / (w[hit] / triangles[hit, :, 2]).sum(1)).min()  # 1 / depth is linear over the picture

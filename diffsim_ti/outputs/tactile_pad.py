@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+from diffsim_ti.mesh.geometry import barycentric_in_plane, triangle_normals, triangle_normals_jvp, triangle_normals_vjp
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.output import Change, Output
@@ -156,16 +156,11 @@ def _longer_side(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def _within(points: np.ndarray, p: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of each point of a plane (corners of the triangle around it, weights there); weights of 0 where there is none."""
-    A, B, C = (p[triangles[:, k]] for k in range(3))
-    level = np.abs((B - A)[:, 0] * (C - A)[:, 1] - (B - A)[:, 1] * (C - A)[:, 0]) > 0  # seen from above not as a line
-    A, B, C, triangles = A[level], B[level], C[level], triangles[level]
-    wide = (B - A)[:, 0] * (C - A)[:, 1] - (B - A)[:, 1] * (C - A)[:, 0]
     corners, weights = np.zeros((len(points), 3), np.int64), np.zeros((len(points), 3))
-    for k, q in enumerate(points):
-        u = ((q - A)[:, 0] * (C - A)[:, 1] - (q - A)[:, 1] * (C - A)[:, 0]) / wide
-        v = ((B - A)[:, 0] * (q - A)[:, 1] - (B - A)[:, 1] * (q - A)[:, 0]) / wide
-        w = np.stack([1 - u - v, u, v], 1)
-        best = np.argmax(w.min(1))
-        if w[best].min() > -1e-9:
+    for k, point in enumerate(points):
+        w = barycentric_in_plane(point, p[triangles])
+        least = np.where(np.isfinite(w).all(1), w.min(1), -np.inf)  # what is seen as a line has none
+        best = np.argmax(least)
+        if least[best] > -1e-9:
             corners[k], weights[k] = triangles[best], w[best]
     return corners, weights

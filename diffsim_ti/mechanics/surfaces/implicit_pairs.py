@@ -9,7 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import put, whole
 from diffsim_ti.mechanics.surfaces.hessian_kernels import HessianKernels
 from diffsim_ti.mechanics.surfaces.lagged_friction import LaggedFriction
-from diffsim_ti.mechanics.surfaces.listed_pair import SAFE
+from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, SAFE
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs, Tunnelling
 from diffsim_ti.runtime import kernels_of
 
@@ -52,7 +52,7 @@ class ImplicitPairs(SurfacePairs):
             k, count = self.list, self.list.count
             gaps, at_rest = (whole(x)[:count, 3] for x in (self.plane, self.rest_plane))
             widest = self.contacts.widths.max() if self.kinematic else self.width
-            own = np.flatnonzero(gaps <= 1.001 * np.minimum(widest, 0.5 * at_rest))
+            own = np.flatnonzero(gaps <= MARGIN * np.minimum(widest, 0.5 * at_rest))
             corners, num_vt = whole(k.pairs)[: 4 * count].reshape(-1, 4)[own], int(np.searchsorted(own, k.num_vt))
             meets = self._places[corners.ravel()]
             counts = np.bincount(meets, minlength=k.num_surface)

@@ -106,11 +106,16 @@ class ExplicitSolver(Solver):
             )
 
     def check_contact_forces(self) -> None:
-        between = self.scene.reduced and meets_between_vertices(self.scene)
-        if between or self.contact == "force" and any(term.acts_on_surface for term in self.scene.terms):
+        obstacles = any(term.acts_on_surface for term in self.scene.terms)
+        if obstacles and self.scene.reduced:
+            raise ValueError(
+                f"ContactForce and ContactTraction are not known beside reduced sets in explicit steps: this "
+                f"{type(self).__name__} moves them by their own laws; take an implicit solver"
+            )
+        if obstacles and self.contact == "force":
             raise ValueError(
                 f"ContactForce and ContactTraction are of obstacles that act as a stage, and this {type(self).__name__} "
-                'takes them as forces: pass it contact="stage", or take an implicit solver, as reduced sets need'
+                'takes them as forces: pass it contact="stage"'
             )
 
     @property

@@ -98,7 +98,7 @@ class DeviceNewton:
         self.cg.put_mass(newton.mass)
         self._put("inertial", newton.inertial)
         self._put("loads", newton.loads)
-        self._put("stiffness", newton.stiffness.ravel())
+        runtime.fill(self.stiffness, newton.stiffness.ravel())
         if self.contact:
             self.detection.put(runtime.fetch(self.potential.poses)[::3])
         state[nk.TOLERANCE], state[nk.EPS], state[nk.MOST] = newton.tolerance, newton.eps, min(most, self.most_rounds)

@@ -94,8 +94,9 @@ class Multigrid(Preconditioner):
 
     def begin(self) -> None:
         super().begin()
-        if self.place is not self.run.following.place:
-            self._go_to(self.run.following.place)
+        place = self.run.following.place if self._follows else None
+        if self.place is not place:
+            self._go_to(place)
 
     def _go_to(self, place: np.ndarray | None) -> None:
         """Make the numbers of the matrices those of another state."""
@@ -113,6 +114,8 @@ class Multigrid(Preconditioner):
             if is_definite(matrices[-1]):
                 break
         self._follows = self.cycle.put(matrices, ways)
+        if not self._follows:  # entries lie in other places: from here on as at rest
+            self._go_to(None)
         self.potential.place(u)
 
     def _levels(self, more=()) -> tuple[list, list]:

@@ -19,20 +19,19 @@ import taichi as ti
 from diffsim_ti.runtime import traced
 
 # what a law of numbers is written in: NumPy's arrays, or numbers of kernels; a graph has the same names
-ARRAYS = SimpleNamespace(
-    sqrt=lambda x: np.sqrt(np.maximum(x, 0)), minimum=np.minimum, maximum=np.maximum, select=np.where
-)
-KERNELS = SimpleNamespace(
-    sqrt=traced(lambda x: ti.sqrt(ti.max(x, 0))), minimum=ti.min, maximum=ti.max, select=ti.select
-)
+ARRAYS = SimpleNamespace(sqrt=np.sqrt, minimum=np.minimum, maximum=np.maximum, select=np.where)
+KERNELS = SimpleNamespace(sqrt=ti.sqrt, minimum=ti.min, maximum=ti.max, select=ti.select)
 
 
 @traced
 def _roots(g, speed, c, eps):
     """(a, b, c + eps - s*) with s / s* = 2 eps / (a + b) where a vertex sticks, s* = speed < eps + c."""
-    inside = g.minimum(speed, eps + c)  # where the root is real
-    both = eps + c * 2
-    return both, g.sqrt(both * both - c * inside * 4), c + eps - inside
+    left = c + eps - g.minimum(speed, eps + c)
+    return (
+        eps + c * 2,
+        g.sqrt(eps * eps + c * left * 4),
+        left,
+    )  # the root of (eps + 2 c)^2 - 4 c s*, with all its digits
 
 
 @traced
