@@ -4,14 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces
-from diffsim_ti.mesh.sets import components, without_unused
+from diffsim_ti.mesh import geometry
+from diffsim_ti.mesh.checks import SLIVER
+from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes, sorted_faces, squared_edges, triangle_normals
+from diffsim_ti.mesh.sets import components, parts_of_vertices, without_unused
 from diffsim_ti.mesh.ten_nodes import MIRRORED
 
 COINCIDING = 1e-9  # of the size of the body: nodes that near are one place
 TOUCHING = 1e-6  # of the size: how far a vertex may lie from a face that it is said to lie on
 LARGEST = 5.0  # [m] beyond which lengths look like millimetres
-SLIVER = 0.1  # quality
 SOFT = 10.0  # [m/s], the speed of sound of a soft body: E = 1e5 Pa, 1000 kg/m^3
 
 
@@ -46,52 +47,46 @@ def findings(parts: tuple) -> Findings:
     constructor of a mesh refuses."""
     vertices, elements, vertex_sets, tetrahedron_sets, triangles = parts
     corners, out = elements[:, :4], []
-    if not np.all(np.isfinite(vertices)):
-        bad = int((~np.isfinite(vertices)).any(1).sum())
-        what = f"{counted(bad, 'vertex has', 'vertices have')} coordinates that are not finite"
-        return Findings([Finding(what, "export the file again")])
-    volumes = signed_volumes(edge_matrices(vertices, corners))
+
+    def note(count: int, noun: str, plural: str, more: str, remedy: str, mended: bool = False) -> None:
+        if count:
+            out.append(Finding(counted(count, noun, plural) + more, remedy, mended))
+
+    if bad := int((~np.isfinite(vertices)).any(1).sum()):
+        note(bad, "vertex has", "vertices have", " coordinates that are not finite", "export the file again")
+        return Findings(out)
+    volumes, squares = signed_volumes(edge_matrices(vertices, corners)), squared_edges(vertices, corners)
     size = float(np.ptp(vertices[np.unique(corners)], 0).max())
     turned, repeated = int((volumes < 0).sum()), len(corners) - len(np.unique(np.sort(corners, 1), axis=0))
-    if turned:
-        out.append(
-            Finding(f"{counted(turned, 'tetrahedron', 'tetrahedra')} inside-out", "pass fix_orientation=True", True)
-        )
-    if repeated:
-        out.append(
-            Finding(f"{counted(repeated, 'repeated tetrahedron', 'repeated tetrahedra')}", "keep one of each", True)
-        )
-    longest = np.linalg.norm(vertices[corners] - np.roll(vertices[corners], 1, axis=1), axis=2).max(1)
-    flat = np.nonzero(np.abs(volumes) <= 1e-12 * longest**3)[0]
-    if len(flat):
-        what = f"{counted(len(flat), 'flat tetrahedron', 'flat tetrahedra')}, the first is {flat[0]}"
-        out.append(Finding(what, "remesh there"))
-    orphans = len(vertices) - len(np.unique(elements))
-    if orphans:
-        what = f"{counted(orphans, 'vertex', 'vertices')} in no tetrahedron"
-        out.append(Finding(what, "pass drop_orphans=True to from_file", True))
+    note(turned, "tetrahedron", "tetrahedra", " inside-out", "pass fix_orientation=True", True)
+    note(repeated, "repeated tetrahedron", "repeated tetrahedra", "", "keep one of each", True)
+    flat = np.nonzero(np.abs(volumes) <= 1e-12 * squares.max(1) ** 1.5)[0]
+    note(len(flat), "flat tetrahedron", "flat tetrahedra", f", the first is {[*flat, 0][0]}", "remesh there")
+    orphans, remedy = len(vertices) - len(np.unique(elements)), "pass drop_orphans=True to from_file"
+    note(orphans, "vertex", "vertices", " in no tetrahedron", remedy, True)
     out += _connections(vertices, elements, size)
-    altitude = 3 * np.abs(volumes) / np.maximum(_largest_face(vertices, corners), 1e-300)
-    quality = 12 * np.cbrt(3 * np.abs(volumes)) ** 2 / np.maximum(_squared_edges(vertices, corners), 1e-300)
+    areas = np.linalg.norm(triangle_normals(vertices, corners[:, FACES].reshape(-1, 3)), axis=1).reshape(-1, 4)
+    altitude = 3 * np.abs(volumes) / np.maximum(areas.max(1), 1e-300)
+    quality = 12 * np.cbrt(3 * np.abs(volumes)) ** 2 / np.maximum(squares.sum(1), 1e-300)
     if len(bad := np.nonzero(quality < SLIVER)[0]):
         worst, without = int(np.argmin(altitude)), altitude[quality >= SLIVER]
         gain = float(without.min() / altitude[worst]) if len(without) and altitude[worst] > 0 else np.inf
         what = (
-            f"{counted(len(bad), 'sliver')} (quality below {SLIVER}), worst tetrahedron {bad[np.argmin(quality[bad])]}; "
+            f" (quality below {SLIVER}), worst tetrahedron {bad[np.argmin(quality[bad])]}; "
             f"without them explicit steps could be {gain:.3g} times longer"
         )
-        out.append(Finding(what, "remesh, or use an implicit solver"))
+        note(len(bad), "sliver", "slivers", what, "remesh, or use an implicit solver")
     out += _sets(vertex_sets, tetrahedron_sets, triangles, len(elements))
     if size > LARGEST:
         what = f"the body is {size:.4g} m long, which looks like millimetres"
         out.append(Finding(what, "lengths are metres: take mesh.scaled(1e-3), or leave a body of that size as it is"))
     far, thinnest = float(np.abs(vertices.mean(0)).max()), float(altitude.min())
-    if np.finfo(np.float32).eps * far > 1e-3 * thinnest:
+    if (coarse := np.finfo(np.float32).eps * far) > 1e-3 * thinnest:
         what = (
-            f"it lies {far:.3g} m from the origin, where float32 resolves {np.finfo(np.float32).eps * far:.2g} m of the "
-            f"smallest altitude of {thinnest:.2g} m"
+            f"it lies {far:.3g} m from the origin, where float32 resolves {coarse:.2g} m of the smallest altitude of "
         )
-        out.append(Finding(what, "move it to the origin by mesh.translated, or compute in float64"))
+        remedy = "move it to the origin by mesh.translated, or compute in float64"
+        out.append(Finding(f"{what}{thinnest:.2g} m", remedy))
     return Findings(out)
 
 
@@ -134,28 +129,23 @@ def coinciding(vertices: np.ndarray, tolerance: float) -> np.ndarray:
 def coinciding_of_pieces(vertices: np.ndarray, elements: np.ndarray) -> int:
     """How many vertices lie where a vertex of another piece does."""
     used = np.unique(elements)
-    part = components(np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel(), len(vertices))
-    if len(np.unique(part[used])) == 1:
+    x, part = vertices[used], parts_of_vertices(elements, len(vertices))[used]
+    if len(np.unique(part)) == 1:
         return 0
-    grid = np.round(
-        (vertices[used] - vertices[used].min(0)) / (COINCIDING * max(float(np.ptp(vertices[used], 0).max()), 1e-300))
-    )
+    grid = np.round((x - x.min(0)) / (COINCIDING * max(float(np.ptp(x, 0).max()), 1e-300)))
     _, place = np.unique(grid, axis=0, return_inverse=True)
-    pairs = np.unique(np.stack([place.ravel(), part[used]], 1), axis=0)
+    pairs = np.unique(np.stack([place.ravel(), part], 1), axis=0)
     several = np.bincount(pairs[:, 0])
     return int((several[several > 1] - 1).sum())
 
 
 def _connections(vertices: np.ndarray, elements: np.ndarray, size: float) -> list[Finding]:
     """Pieces, nodes that coincide, faces that touch without common nodes, and hinges."""
-    out, used = [], np.unique(elements)
-    part = components(np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel(), len(vertices))
+    out, used, part = [], np.unique(elements), parts_of_vertices(elements, len(vertices))
     names, piece = np.unique(part[elements[:, 0]], return_inverse=True)
     if len(names) > 1:
-        what = f"{len(names)} pieces that share no vertex"
-        out.append(
-            Finding(what, "bodies that are meant to be apart are fine; others need common nodes, merged or tied")
-        )
+        remedy = "bodies that are meant to be apart are fine; others need common nodes, merged or tied"
+        out.append(Finding(f"{len(names)} pieces that share no vertex", remedy))
     twice = coinciding_of_pieces(vertices, elements)
     if twice:
         what = f"{counted(twice, 'vertex coincides', 'vertices coincide')} with others of another piece"
@@ -167,12 +157,8 @@ def _connections(vertices: np.ndarray, elements: np.ndarray, size: float) -> lis
         out.append(Finding(what, "a crack that is meant is fine; else take mesh.merged()"))
     if len(names) > 1 and (touching := _touching(vertices, elements, piece, size)):
         what = f"{counted(touching, 'vertex lies', 'vertices lie')} on faces of another piece, without a node there"
-        out.append(
-            Finding(
-                what,
-                "mesh both parts with common nodes (in Gmsh: fragment), glue them by ds.Tie, or leave them to contact",
-            )
-        )
+        remedy = "mesh both parts with common nodes (in Gmsh: fragment), glue them by ds.Tie, or leave them to contact"
+        out.append(Finding(what, remedy))
     return out + hinges(elements, len(vertices))
 
 
@@ -225,33 +211,19 @@ def _touching(vertices: np.ndarray, elements: np.ndarray, piece: np.ndarray, siz
     for k in range(of.max() + 1):
         own, others = np.unique(faces[of == k]), np.nonzero(of != k)[0]
         low, high = vertices[own].min(0) - TOUCHING * size, vertices[own].max(0) + TOUCHING * size
-        near = others[
-            ((middles[others] + reach[others, None] >= low) & (middles[others] - reach[others, None] <= high)).all(1)
-        ]
+        middle, r = middles[others], reach[others, None]
+        near = others[((middle + r >= low) & (middle - r <= high)).all(1)]
         if not len(near):
             continue
         taken = cKDTree(vertices[np.unique(faces[near])])
         lists = cKDTree(middles[near]).query_ball_point(vertices[own], reach[near].max() + TOUCHING * size)
         alone = taken.query(vertices[own])[0] > TOUCHING * size
         for vertex, some, free in zip(own, lists, alone):
-            if free and some and _distances(vertices[vertex], vertices[faces[near[some]]]).min() <= TOUCHING * size:
-                count += 1
+            if free and some:
+                x, triangles = vertices[vertex], vertices[faces[near[some]]]
+                away = np.linalg.norm(geometry.nearest_on_triangles(x, triangles) - x, axis=1)
+                count += bool(away.min() <= TOUCHING * size)
     return count
-
-
-def _distances(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Distance [m] of a point to triangles, shape (k, 3, 3)."""
-    a, b, c = triangles.transpose(1, 0, 2)
-    n = np.cross(b - a, c - a)
-    area = np.maximum((n * n).sum(1), 1e-300)
-    weights = [(np.cross(q - p, x - p) * n).sum(1) / area for p, q in ((b, c), (c, a), (a, b))]
-    inside = np.all([w >= 0 for w in weights], axis=0)
-    plane = np.abs(((x - a) * n).sum(1)) / np.sqrt(area)
-    edges = []
-    for p, q in ((a, b), (b, c), (c, a)):
-        along = np.clip(((x - p) * (q - p)).sum(1) / np.maximum(((q - p) ** 2).sum(1), 1e-300), 0, 1)
-        edges.append(np.linalg.norm(x - p - along[:, None] * (q - p), axis=1))
-    return np.where(inside, plane, np.min(edges, axis=0))
 
 
 def _sets(vertex_sets: dict, tetrahedron_sets: dict, triangles: dict, count: int) -> list[Finding]:
@@ -270,17 +242,3 @@ def _sets(vertex_sets: dict, tetrahedron_sets: dict, triangles: dict, count: int
         what = f"{counted(none, 'tetrahedron is', 'tetrahedra are')} in no tetrahedron set"
         out.append(Finding(what, "materials by set need one set for each: name a set of the rest"))
     return out
-
-
-def _largest_face(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    x = vertices[corners]
-    areas = [np.linalg.norm(np.cross(x[:, b] - x[:, a], x[:, c] - x[:, a]), axis=1) / 2 for a, b, c in FACES]
-    return np.max(areas, axis=0)
-
-
-def _squared_edges(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    x = vertices[corners]
-    return sum(((x[:, a] - x[:, b]) ** 2).sum(1) for a in range(4) for b in range(a))
-
-
-FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))

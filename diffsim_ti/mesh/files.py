@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.mesh.filling import SURFACES, filled_file
+from diffsim_ti.mesh.filling import SURFACES, filled, read_surface
 from diffsim_ti.mesh.readers import abaqus, gmsh, medit, tetgen, vtk_legacy, vtk_xml
 from diffsim_ti.mesh.readers.file_mesh import FileMesh, parts_of
 from diffsim_ti.mesh.readers.vtk_cells import CELL_PREFIXES, VERTEX_PREFIX, groups_of_arrays
@@ -39,7 +39,7 @@ def read_mesh(path, size: float | None = None, cells: int | None = None) -> tupl
         raise ValueError(f"{path} is a folder: name a mesh file")
     if path.suffix.lower() in SURFACES:
         try:
-            return filled_file(path, size, cells), []
+            return filled(*read_surface(path), size=size, cells=cells), []
         except ValueError as error:
             raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     if size is not None or cells is not None:

@@ -54,17 +54,12 @@ def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarr
     return np.concatenate(points), np.concatenate(triangles), named if len(named) > 1 else {}
 
 
-def filled_file(path: Path, size: float | None = None, cells: int | None = None) -> tuple:
-    """`filled` of a file's surface, whose parts keep their names."""
-    return filled(*read_surface(path), size=size, cells=cells)
-
-
 def filled(points: np.ndarray, triangles: np.ndarray, parts: dict | None = None, size=None, cells=None) -> tuple:
     """(vertices, tetrahedra, vertex sets, tetrahedron sets, triangles by name) of the body within a surface.
 
     A closed surface keeps all points and triangles (cut into parts where size asks for it), and closed parts within others
-    bound cavities. One that is open or
-    meets itself is filled by fTetWild, which moves it by up to a thousandth of its size, with a UserWarning.
+    bound cavities. One that is open or meets itself is filled by fTetWild, which moves it by up to a thousandth of its size,
+    with a UserWarning.
     parts: name -> rows of triangles; these become sets, and what a part bounds alone a tetrahedron set of its name.
     size: edge length that tetrahedra reach at most, about [m]; default as large as their quality allows. cells: the same as
     a number of edges along the longest side.
@@ -73,6 +68,8 @@ def filled(points: np.ndarray, triangles: np.ndarray, parts: dict | None = None,
     Si 2015, TetGen, a Delaunay-Based Quality Tetrahedral Mesh Generator, doi:10.1145/2629697.
     Hu et al. 2020, Fast Tetrahedral Meshing in the Wild, doi:10.1145/3386569.3392385.
     """
+    from scipy.spatial import cKDTree
+
     points, triangles, rows = welded(points, triangles)
     size = size_of(points, size, cells)
     fault = fault_of(points, triangles)
@@ -87,12 +84,11 @@ def filled(points: np.ndarray, triangles: np.ndarray, parts: dict | None = None,
         try:
             vertices, tetrahedra = by_tetgen(points, triangles, size)
         except RuntimeError as error:
-            fault = (
-                f"TetGen cannot fill the surface ({' '.join(str(error).split())}): its triangles may meet each other"
-            )
+            said = " ".join(str(error).split())
+            fault = f"TetGen cannot fill the surface ({said}): its triangles may meet each other"
     if fault:
         return *by_ftetwild(points, triangles, size, fault, parts), {}, {}, {}
-    where = places(points, vertices)
+    where = cKDTree(vertices).query(points)[1]  # the vertex at each of the points
     region, walls = regions(tetrahedra, where[triangles])
     inside = are_inside(vertices, tetrahedra, region, points, triangles)
     sets = {name: np.isin(rows, members) for name, members in (parts or {}).items()}
@@ -260,13 +256,6 @@ def are_inside(vertices, tetrahedra, region, points, triangles) -> np.ndarray:
     return np.array(inside)
 
 
-def places(points: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """The index of the point that lies where each of the points does."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(among).query(points)[1]
-
-
 def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(points, triangles, rows of the triangles that stay): with one point for all that lie within 1e-9 of the size (an .stl
     has three for each triangle), and without triangles that have no area then."""
@@ -284,7 +273,7 @@ def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
 def fault_of(points: np.ndarray, triangles: np.ndarray) -> str | None:
     """What is wrong with a surface that is not closed, and where: each edge belongs to two triangles, or to four, six ...
     where parts touch."""
-    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     known, count = np.unique(edges, axis=0, return_counts=True)
     odd = known[count % 2 == 1]
     if len(triangles) >= 4 and not len(odd):

@@ -88,13 +88,6 @@ def triangle_normals_vjp(vertices: np.ndarray, triangles: np.ndarray, normals_ad
     return out
 
 
-def triangle_areas_vjp(vertices: np.ndarray, triangles: np.ndarray, areas_adj: np.ndarray) -> np.ndarray:
-    """Adjoints of vertices, shape (num_vertices, 3), for those of areas."""
-    normals = triangle_normals(vertices, triangles)
-    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return triangle_normals_vjp(vertices, triangles, areas_adj[:, None] * unit)
-
-
 def barycentric_in_plane(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Where a point of a plane lies in triangles with these corners, shape (k, 3, 2 or more), whose first two coordinates
     count: weights of the corners, shape (k, 3); of triangles without area they are not finite."""
@@ -108,15 +101,17 @@ def barycentric_in_plane(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def nearest_on_triangles(point: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The point nearest to `point` of each triangle, shape (k, 3): its foot where that lies inside, else on an edge."""
     edges = np.roll(triangles, -1, 1) - triangles  # edge a runs from corner a to the next
-    t = np.einsum("kai,kai->ka", point - triangles, edges) / np.einsum("kai,kai->ka", edges, edges)
+    squares = np.maximum(np.einsum("kai,kai->ka", edges, edges), 1e-300)  # of triangles that are points, too
+    t = np.einsum("kai,kai->ka", point - triangles, edges) / squares
     on_edges = triangles + np.clip(t, 0, 1)[:, :, None] * edges
     nearest = ((on_edges - point) ** 2).sum(2).argmin(1)
     out = on_edges[np.arange(len(triangles)), nearest]
     normal = np.cross(edges[:, 0], edges[:, 1])
-    height = np.einsum("ki,ki->k", point - triangles[:, 0], normal) / np.einsum("ki,ki->k", normal, normal)
+    squares = np.maximum(np.einsum("ki,ki->k", normal, normal), 1e-300)
+    height = np.einsum("ki,ki->k", point - triangles[:, 0], normal) / squares
     foot = point - height[:, None] * normal
     inward = np.cross(normal[:, None], edges)
-    inside = np.all(np.einsum("kai,kai->ka", foot[:, None] - triangles, inward) >= 0, 1)
+    inside = np.all(np.einsum("kai,kai->ka", foot[:, None] - triangles, inward) >= 0, 1) & normal.any(1)
     out[inside] = foot[inside]
     return out
 

@@ -213,10 +213,14 @@ def components(i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
     return connected_components(coo_matrix((np.ones(len(i), bool), (i, j)), (count, count)), directed=False)[1]
 
 
-def pieces(mesh) -> np.ndarray:
+def parts_of_vertices(elements: np.ndarray, num_vertices: int) -> np.ndarray:
     """For each vertex the number of the part that it belongs to; parts share no vertex, and an unused vertex is one."""
-    others = mesh.elements[:, 1:]
-    return components(np.repeat(mesh.elements[:, 0], others.shape[1]), others.ravel(), mesh.num_vertices)
+    return components(np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel(), num_vertices)
+
+
+def pieces(mesh) -> np.ndarray:
+    """`parts_of_vertices` of a mesh."""
+    return parts_of_vertices(mesh.elements, mesh.num_vertices)
 
 
 def sizes(sets: dict) -> str:
