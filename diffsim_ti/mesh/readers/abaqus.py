@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from diffsim_ti.mesh.geometry import rotation_matrix
-from diffsim_ti.mesh.readers.file_mesh import FileMesh
+from diffsim_ti.mesh.readers.file_mesh import FileMesh, beside
 
 TETRAHEDRON = re.compile(r"^[A-Z]*3D(4|10)(?!\d)")  # C3D4, C3D4H, DC3D4, C3D10M ...
 TRIANGLE = re.compile(r"^(?:S|STRI|CPS|CPE|CPEG|CAX|M3D|SFM3D|R3D|DS|SFMGAX|F3D)(3|6|65)(?!\d)")
@@ -57,7 +57,8 @@ def _blocks(path: Path, depth: int = 0):
             keyword, parameters = _keyword(head)
             block, lines, head = (keyword, parameters), [], ""
             if keyword == "INCLUDE":
-                yield from _blocks(_included(path, parameters), depth + 1)
+                name, remedy = parameters.get("INPUT", ""), "put it beside the deck"
+                yield from _blocks(beside(path, name, "*INCLUDE names", remedy), depth + 1)
                 block = None
         elif block:
             lines.append(line)
@@ -69,16 +70,6 @@ def _keyword(line: str) -> tuple[str, dict]:
     first, *rest = (part.strip() for part in line[1:].split(","))
     pairs = (part.partition("=") for part in rest if part)
     return first.upper(), {name.strip().upper(): value.strip().strip('"') for name, _, value in pairs}
-
-
-def _included(path: Path, parameters: dict) -> Path:
-    name = parameters.get("INPUT", "")
-    target, folder = (path.parent / name).resolve(), path.parent.resolve()
-    if not name or not target.is_relative_to(folder):
-        raise ValueError(f"*INCLUDE names {name!r}, outside of the deck's folder; put it beside the deck")
-    if not target.is_file():
-        raise ValueError(f"*INCLUDE names {name!r}, which is not there; put it beside the deck")
-    return target
 
 
 def _fields(line: str) -> list[str]:
@@ -167,9 +158,8 @@ class _Deck:
         if LINE.match(given) and given.startswith(("B32", "T3D3")):
             kind, count = "line3", 3
         if kind is None:
-            solid = re.match(r"^[A-Z]*3D(6|8|15|20|27)", given)
             self.other[given] = self.other.get(given, 0) + len(lines)
-            if solid:
+            if re.match(r"^[A-Z]*3D(6|8|15|20|27)", given):
                 raise ValueError(
                     f"elements of type {given} are no tetrahedra, and would be lost; mesh the body with C3D4 or C3D10 alone"
                 )
@@ -223,7 +213,7 @@ class _Deck:
 
     def mesh(self) -> FileMesh:
         out = FileMesh(np.zeros((0, 3)))
-        copies = [(name, part, R, t, own) for name, part, R, t, own in self.instances]
+        copies = list(self.instances)
         if copies and self.root.elements:
             raise ValueError("elements stand in the assembly beside instances of parts; put them into a part")
         if not copies:
@@ -286,23 +276,19 @@ class _Deck:
         if copies[0][1] is not self.root:
             self._put(out, self.root, "", "")
         if several:  # a name that parts have, and the assembly has not, stands for the sets of all
-            for sets, merge in ((out.groups, lambda parts: parts[0] + parts[1]), (out.point_sets, np.union1d)):
-                for key in [key for key in sets if "." in key]:
-                    plain = key.split(".", 1)[1]
-                    if plain.upper() not in {**self.root.node_sets, **self.root.element_sets, **self.root.surfaces}:
-                        if sets is out.groups:
-                            sets[plain] = sets.get(plain, []) + sets[key]
-                        else:
-                            sets[plain] = merge(sets.get(plain, np.zeros(0, np.int64)), sets[key])
+            known = {*self.root.node_sets, *self.root.element_sets, *self.root.surfaces}
+            for sets, merged in ((out.groups, lambda a, b: a + b), (out.point_sets, np.union1d)):
+                for key, plain in [(key, key.split(".", 1)[1]) for key in sets if "." in key]:
+                    if plain.upper() not in known:
+                        sets[plain] = merged(sets[plain], sets[key]) if plain in sets else sets[key]
 
     def _put(self, out: FileMesh, scope: Part, instance: str, prefix: str) -> None:
         for key in scope.node_sets:
-            rows = self._members(scope, scope.node_sets, key, instance, 0, ())
-            name = prefix + scope.spelled[key]
-            if not rows:
-                out.left_out.append(f"the set {name}, which is empty")
-            else:
+            rows, name = self._members(scope, scope.node_sets, key, instance, 0, ()), prefix + scope.spelled[key]
+            if rows:
                 out.point_sets[name] = np.unique(rows)
+            else:
+                out.left_out.append(f"the set {name}, which is empty")
         for key in scope.element_sets:
             rows = self._members(scope, scope.element_sets, key, instance, 1, ())
             self._put_elements(out, prefix + scope.spelled[key], rows)

@@ -1,6 +1,7 @@
 """What a file holds of a mesh, and what of it goes into a TetrahedralMesh."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -80,6 +81,17 @@ def parts_of(mesh: FileMesh, again: bool = False) -> tuple[tuple, list[str]]:
     _check_indices(mesh, tetrahedra)
     left_out += _left_over(mesh, tetrahedra, triangles)
     return (mesh.points, tetrahedra, _joined(vertex_sets), join, triangles), left_out
+
+
+def beside(path: Path, name: str, says: str, remedy: str, suffix: str = "") -> Path:
+    """The file that another one names, in its folder or below. Raises ValueError where it is not there."""
+    target, folder = (path.parent / name).resolve(), path.parent.resolve()
+    if not name or not target.is_relative_to(folder) or suffix and target.suffix.lower() != suffix:
+        kind = f"no {suffix} file within its folder" if suffix else "outside of its folder"
+        raise ValueError(f"{says} {name!r}, which is {kind}; {remedy}")
+    if not target.is_file():
+        raise ValueError(f"{says} {name!r}, which is not there; {remedy}")
+    return target
 
 
 def _joined(sets: dict) -> dict[str, np.ndarray]:

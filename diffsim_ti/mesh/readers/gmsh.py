@@ -12,11 +12,9 @@ from diffsim_ti.mesh.readers.file_mesh import FileMesh
 
 KINDS = {1: "line", 2: "triangle", 3: "quad", 4: "tetra", 5: "hexahedron", 6: "wedge", 7: "pyramid", 8: "line3"}
 KINDS |= {9: "triangle6", 11: "tetra10", 15: "vertex", 16: "quad8", 10: "quad9", 17: "hexahedron20"}
-NODES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 8: 3, 9: 6, 10: 9, 11: 10, 12: 27, 13: 18, 14: 14, 15: 1, 16: 8}
-NODES |= {17: 20, 18: 15, 19: 13, 20: 9, 21: 10, 22: 12, 23: 15, 24: 15, 25: 21, 26: 4, 27: 5, 28: 6, 29: 20, 30: 35}
-NODES |= {31: 56}
-TETRAHEDRA = {29: "tetra20", 30: "tetra35", 31: "tetra56"}
-CURVES = {26: "line4", 27: "line5", 28: "line6"}
+KINDS |= {26: "line4", 27: "line5", 28: "line6", 29: "tetra20", 30: "tetra35", 31: "tetra56"}
+NODES = (0, 2, 3, 4, 4, 8, 6, 5, 3, 6, 9, 10, 27, 18, 14, 1, 8, 20, 15, 13, 9, 10, 12, 15, 15, 21, 4, 5, 6, 20, 35, 56)
+DIMENSIONS = {15: 0} | dict.fromkeys((1, 8, 26, 27, 28), 1) | dict.fromkeys((2, 3, 9, 10, 16, *range(20, 26)), 2)
 TEN_NODES = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]  # Gmsh's edges in VTK's order
 REAL = np.dtype("f8")
 
@@ -51,6 +49,16 @@ class Words:
 
     def one(self, kind: str) -> int:
         return int(self.take(kind)[0])
+
+    def leading_number(self) -> int:
+        """A count, which stands as text before binary data, too."""
+        if self.is_text:
+            return self.one("i4")
+        line = self.data.find(b"\n", self.at)
+        count, self.at = int(self.data[self.at : line]), line + 1
+        if not 0 <= count <= len(self.data):
+            raise ValueError(f"a count of {count}")
+        return count
 
     @property
     def is_text(self) -> bool:
@@ -125,10 +133,6 @@ def _names(text: str) -> dict[tuple[int, int], str]:
     return out
 
 
-def _kind(number: int) -> str:
-    return KINDS.get(number) or TETRAHEDRA.get(number) or CURVES.get(number) or f"gmsh_{number}"
-
-
 class Cells:
     """Elements by their type, with all physical groups of each."""
 
@@ -156,20 +160,17 @@ class Cells:
             if unknown.any():
                 raise KeyError(int(nodes[unknown][0]))
             cells = order[at]
-            name = _kind(kind)
+            name = KINDS.get(kind, f"gmsh_{kind}")
             out.blocks.append((name, cells[:, TEN_NODES] if name == "tetra10" else cells))
-            first, dim = 0, _dimension(kind)
+            first, dim = 0, DIMENSIONS.get(kind, 3)
             for count, groups in self.groups[kind]:
                 rows = np.arange(first, first + count)
-                pairs = (
-                    [(int(g), rows) for g in groups]
-                    if isinstance(groups, (list, tuple))
-                    else [(int(g), rows[groups == g]) for g in np.unique(groups)]
-                )
-                for group, own in pairs:
-                    group = abs(group)  # negative: turned the other way
+                together = isinstance(groups, (list, tuple))
+                for g in groups if together else np.unique(groups):
+                    group = abs(int(g))  # negative: turned the other way
                     if group:
                         used.add((dim, group))
+                        own = rows if together else rows[groups == g]
                         out.group(names.get((dim, group)) or f"tag_{group}", block, own)
                 first += count
         empty = [name for key, name in names.items() if key not in used]
@@ -193,16 +194,8 @@ def _without_a_group_of_all(mesh: FileMesh) -> FileMesh:
     return mesh
 
 
-def _dimension(kind: int) -> int:
-    if kind == 15:
-        return 0
-    if kind in (1, 8, 26, 27, 28):
-        return 1
-    return 2 if kind in (2, 3, 9, 10, 16, 20, 21, 22, 23, 24, 25) else 3
-
-
 def _size(kind: int) -> int:
-    if kind not in NODES:
+    if not 0 < kind < len(NODES):
         raise ValueError(f"elements of type {kind} are not known")
     return NODES[kind]
 
@@ -239,7 +232,7 @@ def _rows_of_text(words: np.ndarray, count: int, cells: Cells, head: int, tags: 
 
 
 def _second(nodes: Words, elements: Words, names: dict, parametric: bool) -> FileMesh:
-    count = int(nodes.take("i4")[0]) if nodes.is_text else _leading_number(nodes)
+    count = nodes.leading_number()
     numbers, points = np.empty(count, np.int64), np.empty((count, 3))
     if nodes.is_text and not parametric:
         table = nodes.take("f8", 4 * count).reshape(count, 4)
@@ -251,12 +244,10 @@ def _second(nodes: Words, elements: Words, names: dict, parametric: bool) -> Fil
             if parametric:
                 dim = int(nodes.take("i4", 2)[0])
                 nodes.take("f8", {1: 1, 2: 2}.get(dim, 0))
-    cells = Cells()
+    cells, left = Cells(), elements.leading_number()
     if elements.is_text:
-        count = elements.one("i4")
-        _rows_of_text(elements.words[1:].astype(np.int64), count, cells, head=3, tags=lambda row: row[2])
+        _rows_of_text(elements.words[1:].astype(np.int64), left, cells, head=3, tags=lambda row: row[2])
         return cells.mesh(numbers, points, names)
-    left = _leading_number(elements)
     while left > 0:
         kind, count, num_tags = (int(n) for n in elements.take("i4", 3))
         if not 0 < count <= left:
@@ -267,21 +258,12 @@ def _second(nodes: Words, elements: Words, names: dict, parametric: bool) -> Fil
     return cells.mesh(numbers, points, names)
 
 
-def _leading_number(words: Words) -> int:
-    """A count that stands as text before binary data."""
-    line = words.data.find(b"\n", words.at)
-    count = int(words.data[words.at : line])
-    words.at = line + 1
-    if not 0 <= count <= len(words.data):
-        raise ValueError(f"a count of {count}")
-    return count
-
-
 def _fourth(nodes: Words, section: Callable, names: dict, is_newer: bool) -> FileMesh:
     """Format 4.0 (entities are named before dimensions, nodes one by one) or 4.1 (counts are of 8 bytes throughout)."""
-    groups = _entities(section("Entities"), is_newer) if section("Entities") else {}
-    if section("PartitionedEntities"):
-        groups |= _partitioned(section("PartitionedEntities"), is_newer)
+    groups = {}
+    for name in ("Entities", "PartitionedEntities"):
+        if words := section(name):
+            groups |= _entities(words, is_newer, name != "Entities")
     blocks, count = nodes.take("u8", 2)
     if is_newer:
         nodes.take("u8", 2)
@@ -316,28 +298,18 @@ def _fourth(nodes: Words, section: Callable, names: dict, is_newer: bool) -> Fil
     return cells.mesh(numbers.astype(np.int64), points, names)
 
 
-def _entities(words: Words, is_newer: bool) -> dict[tuple[int, int], list[int]]:
-    """(dimension, entity) -> its physical groups."""
+def _entities(words: Words, is_newer: bool, partitioned: bool) -> dict[tuple[int, int], list[int]]:
+    """(dimension, entity) -> its physical groups; partitioned: of the parts of entities in a partitioned file."""
     out = {}
+    if partitioned:
+        words.take("u8")
+        words.take("i4", 2 * words.one("u8"))
     for dim, count in enumerate(words.take("u8", 4)):
         for _ in range(int(count)):
             tag = words.one("i4")
-            words.take("f8", 3 if is_newer and dim == 0 else 6)
-            out[dim, tag] = words.take("i4", words.one("u8")).tolist()
-            if dim:
+            if partitioned:
+                words.take("i4", 2)
                 words.take("i4", words.one("u8"))
-    return out
-
-
-def _partitioned(words: Words, is_newer: bool) -> dict[tuple[int, int], list[int]]:
-    """The same of the parts of entities in a partitioned file."""
-    out = {}
-    words.take("u8")
-    words.take("i4", 2 * words.one("u8"))
-    for dim, count in enumerate(words.take("u8", 4)):
-        for _ in range(int(count)):
-            tag, _, _ = (int(n) for n in words.take("i4", 3))
-            words.take("i4", words.one("u8"))
             words.take("f8", 3 if is_newer and dim == 0 else 6)
             out[dim, tag] = words.take("i4", words.one("u8")).tolist()
             if dim:

@@ -47,7 +47,9 @@ def read(path: Path) -> FileMesh:
         width = CELLS[keyword][1] + 1 if keyword in CELLS else OTHERS.get(keyword, 1 if keyword in NAMED else None)
         if width is None:
             raise ValueError(f"keyword {keyword!r} is not known; export the mesh without it")
-        count = _count(words, at, keyword)
+        if at >= len(words) or not words[at].isdigit():
+            raise ValueError(f"{keyword} is not followed by a number of rows")
+        count = int(words[at])
         own = words[at + 1 : at + 1 + count * width]
         if len(own) < count * width:
             raise ValueError(f"it ends within {keyword}, which has {count} rows")
@@ -61,12 +63,6 @@ def read(path: Path) -> FileMesh:
     if "Vertices" not in tables:
         raise ValueError("Vertices are missing")
     return _mesh(tables)
-
-
-def _count(words: list, at: int, keyword: str) -> int:
-    if at >= len(words) or not words[at].isdigit():
-        raise ValueError(f"{keyword} is not followed by a number of rows")
-    return int(words[at])
 
 
 def _mesh(tables: dict) -> FileMesh:

@@ -15,9 +15,8 @@ TEN_NODES = [0, 1, 2, 3, 6, 7, 9, 5, 8, 4]
 
 def read(path: Path) -> FileMesh:
     """The mesh of an .ele file and the .node file beside it; region attributes become groups tag_<n>."""
-    nodes, first = _table(path.with_suffix(".node"), "points", lambda head: 1 + head[1] + head[2] + head[3])
-    cells, _ = _table(path.with_suffix(".ele"), "tetrahedra", lambda head: 1 + head[1] + head[2])
-    dim, size = first[1], _header(path.with_suffix(".ele"))[1]
+    nodes, dim = _table(path.with_suffix(".node"), "points", 4)
+    cells, size = _table(path.with_suffix(".ele"), "tetrahedra", 3)
     if dim != 3 or size not in (4, 10):
         raise ValueError(f"points of dimension {dim} and elements of {size} nodes; there may be 3, and 4 or 10")
     number = {int(n): k for k, n in enumerate(nodes[:, 0])}
@@ -40,26 +39,17 @@ def read(path: Path) -> FileMesh:
     return out
 
 
-def _lines(path: Path) -> list[list[str]]:
+def _table(path: Path, what: str, columns: int) -> tuple[np.ndarray, int]:
+    """(rows of numbers, the second number of the header); so many numbers of the header say how wide rows are."""
     if not path.is_file():
         raise ValueError(
             f"{path.name} is missing: a mesh of TetGen is an .ele file and the .node file of the same name"
         )
-    rows = (line.split(b"#")[0].split() for line in path.read_bytes().splitlines())
-    return [row for row in rows if row]
-
-
-def _header(path: Path) -> list[int]:
-    head = [int(word) for word in _lines(path)[0]]
-    return head + [0] * (4 - len(head))
-
-
-def _table(path: Path, what: str, width) -> tuple[np.ndarray, list[int]]:
-    lines = _lines(path)
-    if not lines:
+    head, *lines = [row for line in path.read_bytes().splitlines() if (row := line.split(b"#")[0].split())] or [[]]
+    if not head:
         raise ValueError(f"{path.name} is empty")
-    head = _header(path)
-    own = lines[1 : 1 + head[0]]
-    if len(own) < head[0] or any(len(row) < width(head) for row in own):
-        raise ValueError(f"{path.name} says {head[0]} {what} with {width(head)} numbers each, and has fewer")
-    return np.array([row[: width(head)] for row in own], float).reshape(head[0], -1), head
+    count, *sizes = [int(word) for word in head][:columns]
+    width, own = 1 + sum(sizes), lines[:count]
+    if len(own) < count or any(len(row) < width for row in own):
+        raise ValueError(f"{path.name} says {count} {what} with {width} numbers each, and has fewer")
+    return np.array([row[:width] for row in own], float).reshape(count, -1), [*sizes, 0][0]

@@ -34,12 +34,9 @@ def grid(points, nodes, offsets, types, point_arrays: dict, cell_arrays: dict) -
         rows = np.nonzero((types == kind) & (sizes == size) & keep)[0]
         if not len(rows):
             continue
-        name = (
-            LAGRANGE[kind].get(size, f"tetra{size}" if kind in (71, 78) else f"vtk_{kind}_{size}")
-            if kind in LAGRANGE
-            else None
-        )
-        name = name or KINDS.get(kind, f"vtk_{kind}")
+        name = KINDS.get(kind, f"vtk_{kind}")
+        if kind in LAGRANGE:
+            name = LAGRANGE[kind].get(size, f"tetra{size}" if kind in (71, 78) else f"vtk_{kind}_{size}")
         out.blocks.append((name, nodes[offsets[rows][:, None] + np.arange(size)].astype(np.int64)))
         rows_of.append(rows)
     for name, values in point_arrays.items():
@@ -58,13 +55,11 @@ def groups_of_arrays(mesh: FileMesh, arrays: dict[str, list], names: dict | None
     """
     grouping = {}
     for name, blocks in arrays.items():
-        own = False
-        for dim, prefix in CELL_PREFIXES.items():
-            if name.startswith(prefix):
-                own = True
-                for k, (kind, _) in enumerate(mesh.blocks):
-                    if DIMENSION.get(kind) == dim:
-                        mesh.group(name.removeprefix(prefix), k, np.nonzero(blocks[k])[0])
+        own = [(dim, prefix) for dim, prefix in CELL_PREFIXES.items() if name.startswith(prefix)]
+        for dim, prefix in own:
+            for k, (kind, _) in enumerate(mesh.blocks):
+                if DIMENSION.get(kind) == dim:
+                    mesh.group(name.removeprefix(prefix), k, np.nonzero(blocks[k])[0])
         if not own and (numbers := _numbers(mesh, name, blocks)) is not None:
             grouping[name] = numbers
     known = [name for name in grouping if name in TAGS]

@@ -23,15 +23,26 @@ class _File:
     def __init__(self, data: bytes):
         self.data, self.at, self.binary = data, 0, False
 
+    def _next(self) -> bytes | None:
+        """The next line; None at the end."""
+        if self.at >= len(self.data):
+            return None
+        end = self.data.find(b"\n", self.at)
+        end = len(self.data) if end < 0 else end
+        line, self.at = self.data[self.at : end], end + 1
+        return line
+
     def line(self) -> str | None:
         """The next line that is not empty; None at the end."""
-        while self.at < len(self.data):
-            end = self.data.find(b"\n", self.at)
-            end = len(self.data) if end < 0 else end
-            line, self.at = self.data[self.at : end].strip(), end + 1
-            if line:
-                return line.decode("utf-8", errors="replace")
+        while (line := self._next()) is not None:
+            if line.strip():
+                return line.strip().decode("utf-8", errors="replace")
         return None
+
+    def skip_metadata(self) -> None:
+        """Up to the empty line behind it."""
+        while (line := self._next()) is not None and line.strip():
+            pass
 
     def numbers(self, kind: str, count: int) -> np.ndarray:
         """The next numbers."""
@@ -50,17 +61,13 @@ class _File:
             if kind == "bit":
                 return np.unpackbits(np.frombuffer(raw, np.uint8))[:count]
             return np.frombuffer(raw, dtype.newbyteorder(">")).astype(dtype)
-        found, at = [], self.at
+        found = []
         while len(found) < count:
-            end = self.data.find(b"\n", at)
-            end = len(self.data) if end < 0 else end
-            if at >= len(self.data):
+            if (line := self._next()) is None:
                 raise ValueError("it ends within its numbers")
-            found += self.data[at:end].split()
-            at = end + 1
+            found += line.split()
         if len(found) > count:
             raise ValueError(f"a line has more numbers than the {count} that are announced")
-        self.at = at
         return np.array(found).astype("f8" if dtype.kind == "f" else "i8") if count else np.zeros(0, dtype)
 
 
@@ -93,7 +100,7 @@ def read(path: Path) -> FileMesh:
         elif word == "FIELD":
             _field(file, int(rest[1]), arrays[where] if where else {})
         elif word == "METADATA":
-            _skip_metadata(file)
+            file.skip_metadata()
         elif where:
             _attribute(file, word, rest, counts[where], arrays[where])
         else:
@@ -127,21 +134,11 @@ def _cells(file: _File, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     return listed[nodes], np.array(offsets)
 
 
-def _skip_metadata(file: _File) -> None:
-    """Up to the empty line behind it."""
-    while file.at < len(file.data):
-        end = file.data.find(b"\n", file.at)
-        end = len(file.data) if end < 0 else end
-        line, file.at = file.data[file.at : end].strip(), end + 1
-        if not line:
-            return
-
-
 def _field(file: _File, count: int, arrays: dict) -> None:
     for _ in range(count):
         line = file.line() or ""
         if line.upper() == "METADATA":
-            _skip_metadata(file)
+            file.skip_metadata()
             line = file.line() or ""
         name, width, rows, kind = line.split()
         if kind.lower() == "string":
@@ -173,10 +170,9 @@ def _attribute(file: _File, word: str, rest: list, count: int, arrays: dict) -> 
         if not (file.line() or "").upper().startswith("LOOKUP_TABLE"):
             file.at = before
         arrays[unquote(rest[0])] = _shaped(file.numbers(rest[1], width * count), width)
-    elif word == "LOOKUP_TABLE":
-        file.numbers("unsigned_char" if file.binary else "float", 4 * int(rest[1]))
-    elif word == "COLOR_SCALARS":
-        file.numbers("unsigned_char" if file.binary else "float", int(rest[1]) * count)
+    elif word in ("LOOKUP_TABLE", "COLOR_SCALARS"):
+        each = 4 if word == "LOOKUP_TABLE" else count
+        file.numbers("unsigned_char" if file.binary else "float", int(rest[1]) * each)
     elif word in ("TEXTURE_COORDINATES", "GLOBAL_IDS", "PEDIGREE_IDS", *widths):
         width = int(rest[1]) if word == "TEXTURE_COORDINATES" else widths.get(word, 1)
         arrays[unquote(rest[0])] = _shaped(file.numbers(rest[-1], width * count), width)

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from diffsim_ti.mesh.readers.file_mesh import FileMesh
+from diffsim_ti.mesh.readers.file_mesh import FileMesh, beside
 from diffsim_ti.mesh.readers.vtk_cells import grid
 
 TYPES = {f"{name}{8 * size}": f"{kind}{size}" for name, kind in (("Int", "i"), ("UInt", "u")) for size in (1, 2, 4, 8)}
@@ -32,21 +32,11 @@ def _pieces(path: Path) -> list[tuple]:
     kind = file.root.get("type")
     if kind == "PUnstructuredGrid":
         sources = [piece.get("Source", "") for piece in file.root.iter("Piece")]
-        return [piece for source in sources for piece in _pieces(_beside(path, source))]
+        near = [beside(path, source, "it names the piece", "put the pieces beside it", ".vtu") for source in sources]
+        return [piece for source in near for piece in _pieces(source)]
     if kind != "UnstructuredGrid":
         raise ValueError(f"it holds {kind or 'no grid'}; export an UnstructuredGrid of tetrahedra (.vtu)")
     return [file.piece(piece) for piece in file.root.iter("Piece")]
-
-
-def _beside(path: Path, name: str) -> Path:
-    target, folder = (path.parent / name).resolve(), path.parent.resolve()
-    if not name or not target.is_relative_to(folder) or target.suffix.lower() != ".vtu":
-        raise ValueError(
-            f"it names the piece {name!r}, which is no .vtu file within its folder; put the pieces beside it"
-        )
-    if not target.is_file():
-        raise ValueError(f"it names the piece {name!r}, which is not there; put the pieces beside it")
-    return target
 
 
 class _File:
@@ -75,7 +65,10 @@ class _File:
     def piece(self, piece) -> tuple:
         """The arrays of a piece."""
         count, num_cells = (int(piece.get(name, "0")) for name in ("NumberOfPoints", "NumberOfCells"))
-        points = self._only(piece, "Points").reshape(-1, 3).astype(np.float64)
+        places = self._part(piece, "Points")
+        if not places:
+            raise ValueError("a piece has no Points")
+        points = self.array(places[0]).reshape(-1, 3).astype(np.float64)
         cells = {array.get("Name"): self.array(array) for array in self._part(piece, "Cells")}
         if not {"connectivity", "offsets", "types"} <= set(cells):
             raise ValueError("a piece lacks connectivity, offsets or types of its cells")
@@ -94,12 +87,6 @@ class _File:
     def _part(self, piece, name: str) -> list:
         part = piece.find(name)
         return [] if part is None else [a for a in part if a.tag in ("DataArray", "Array")]
-
-    def _only(self, piece, name: str) -> np.ndarray:
-        arrays = self._part(piece, name)
-        if not arrays:
-            raise ValueError(f"a piece has no {name}")
-        return self.array(arrays[0])
 
     def array(self, array) -> np.ndarray:
         """The numbers of a DataArray, one row for each of its tuples."""
@@ -165,9 +152,10 @@ def _grid_of(pieces: list[tuple]) -> FileMesh:
     arrays = [
         {
             name: np.concatenate([np.asarray(piece[k][name]) for piece in pieces])
-            for name in piece_names(pieces, k, both)
+            for name in pieces[0][k]
+            if name in common
         }
-        for k in (4, 5)
+        for k, common in zip((4, 5), both)
     ]
     whole = grid(
         np.concatenate(points),
@@ -182,11 +170,6 @@ def _grid_of(pieces: list[tuple]) -> FileMesh:
     if len(pieces) > 1 and "GlobalNodeIds" in arrays[0]:
         return _merged(whole, arrays[0]["GlobalNodeIds"])
     return whole
-
-
-def piece_names(pieces: list, k: int, both: list) -> list[str]:
-    """Names of the arrays that all pieces have, in the order of the first."""
-    return [name for name in pieces[0][k] if name in both[k - 4]]
 
 
 def _merged(mesh: FileMesh, numbers: np.ndarray) -> FileMesh:
