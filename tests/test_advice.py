@@ -239,7 +239,7 @@ FOLLOWED = {
         lambda: stiff(dt=10.0),
         lambda: stiff(dt=10.0, substeps=int(advised(lambda: stiff(dt=10.0)))),
     ),
-    ("terms/of_tetrahedra.py", "names of sets"): (
+    ("terms/over_time.py", "names of sets"): (
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0], tetrahedra="left", per="set"),
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0, 1.0], tetrahedra=["left", "right"], per="set"),
     ),
@@ -334,7 +334,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("mechanics/surfaces/surface_pairs.py", "take a width below"): "test_self_contact.py",
     ("mechanics/surfaces/contact_stage.py", "take substeps of {} s"): "test_self_contact.py, battery_of_throws.py",
     ("diff_simulator.py", "a two-step method"): "test_torch_solvers.py",
-    ("identification/descent.py", "take smaller steps"): "names neither an argument nor a number",
+    ("identification/search.py", "take smaller steps"): "names neither an argument nor a number",
     ("inputs/inputs.py", "none of its inputs says that it is a place"): "test_far_from_origin.py",
     ("materials/patch_law.py", "does not say what its theta is"): "test_open_laws.py, with a law of one's own",
     ("mesh/checks.py", "in no tetrahedron"): "test_mesh.py",

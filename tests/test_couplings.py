@@ -5,7 +5,7 @@ import pytest
 from quadratic_meshes import ring, with_vertices
 
 import diffsim_ti as ds
-from diffsim_ti.inputs.remote import RemoteForces
+from diffsim_ti.inputs.loads import RemoteForces
 
 L, R, E, NU = 1.0, 0.05, 1e7, 0.3
 

@@ -9,8 +9,8 @@ from scipy.optimize import least_squares
 import diffsim_ti as ds
 from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
 from diffsim_ti.identification.picture import save_picture
-from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem
+from diffsim_ti.identification.unknowns import Priors
 
 identify = partial(ds.identify, check_mesh=False)  # data are of the mesh that is fitted
 MESH = ds.TetrahedralMesh.create_box([4, 2, 2], [0.6, 0.2, 0.2], pattern="five")
@@ -221,7 +221,7 @@ def test_regions_missing_samples_and_two_experiments(swing, dense, monkeypatch):
     other = body(terms=[ds.Gravity((0.0, 0.0, -9.8))])
     rng, data = np.random.default_rng(4), []
     if not dense:
-        monkeypatch.setattr("diffsim_ti.identification.levenberg_marquardt.DENSE", 1)
+        monkeypatch.setattr("diffsim_ti.identification.search.DENSE", 1)
     for rollout in (swing, other):
         x = rollout.forward(youngs_modulus=E[regions]).positions
         x = x + 1e-4 * rng.standard_normal(x.shape)

@@ -14,8 +14,7 @@ import diffsim_ti as ds
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.study import PROBLEMS, Problem, chart, charts, pareto_front, problem, problems, recommend
 from diffsim_ti.study.alternatives import stiff_sets
-from diffsim_ti.study.coarser import halved_grid
-from diffsim_ti.study.elements import ElementTrials
+from diffsim_ti.study.elements import ElementTrials, halved_grid
 from diffsim_ti.study.work_precision import Point, choose_substeps, make_rollout, reference, run
 
 EXPLICIT = [kind for kind in SOLVERS if kind.explicit]

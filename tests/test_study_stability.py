@@ -9,7 +9,7 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
 from diffsim_ti.solvers import SOLVERS
-from diffsim_ti.study import boundary, growth, map_picture, power_limit, stability_map
+from diffsim_ti.study import boundary, charts, growth, power_limit, stability_map
 from diffsim_ti.study.stability_axes import AXES, body
 from diffsim_ti.study.stability_map import OUTCOMES, judge
 
@@ -100,7 +100,7 @@ def test_outcomes_have_their_names():
 def test_maps_of_an_axis_share_a_picture_and_tables(tmp_path):
     short = replace(AXES["nu"], values=(0.0, 0.3))
     results = [stability_map(kind, short, shares=(0.5, 1.05), steps=20) for kind in EXPLICIT]
-    files = map_picture.write_maps(results, tmp_path, "nu")
+    files = charts.write_maps(results, tmp_path, "nu")
     assert [name.rsplit(".")[-1] for name in files] == ["png", "csv", "json"]
     assert len((tmp_path / "stability_nu.csv").read_text().splitlines()) == 9
     assert (tmp_path / "stability_nu.png").stat().st_size > 10_000

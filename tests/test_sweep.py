@@ -8,7 +8,7 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti.cli import main
-from diffsim_ti.cli.sweep import axis
+from diffsim_ti.cli.study import axis
 from diffsim_ti.study import Problem, Settings, chart, stability_map, sweep
 from diffsim_ti.study.executors import each, pool
 from diffsim_ti.study.stability_axes import AXES

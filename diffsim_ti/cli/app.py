@@ -21,7 +21,7 @@ from diffsim_ti.cli.config import write_options
 from diffsim_ti.cli.fit import fit
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.selftest import selftest
-from diffsim_ti.cli.sweep import sweep
+from diffsim_ti.cli.study import sweep
 from diffsim_ti.common import interrupts
 from diffsim_ti.common.progress import LOG
 from diffsim_ti.materials import StableNeoHookean

@@ -11,16 +11,24 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import shown
 from diffsim_ti.common.progress import progress as progress_bar
 from diffsim_ti.common.public import public
-from diffsim_ti.identification.descent import l_bfgs_b, torch_descent
-from diffsim_ti.identification.levenberg_marquardt import DENSE, levenberg_marquardt
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.mesh_check import mesh_check
 from diffsim_ti.identification.modal_test import ModalTest
-from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem, is_experiment
 from diffsim_ti.identification.result import Identification, Information, MeshCheck, described
-from diffsim_ti.identification.search import FAILURES, STOPPED, Ended, Search
-from diffsim_ti.identification.starts import around, further_starts
+from diffsim_ti.identification.search import (
+    DENSE,
+    FAILURES,
+    STOPPED,
+    Ended,
+    Search,
+    around,
+    further_starts,
+    l_bfgs_b,
+    levenberg_marquardt,
+    torch_descent,
+)
+from diffsim_ti.identification.unknowns import Priors
 from diffsim_ti.rollout import Rollout
 
 FAR, AT_MOST = 3.0, 4  # residuals over the noise beyond which further starts are tried, and how many

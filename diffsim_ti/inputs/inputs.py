@@ -14,8 +14,7 @@ from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.consistent_mass import ElementMasses
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, length_per_step, speed
-from diffsim_ti.inputs.posed_supports import PosedMotion
-from diffsim_ti.inputs.poses import PoseColumns
+from diffsim_ti.inputs.poses import PoseColumns, PosedMotion
 from diffsim_ti.inputs.rest_shape import RestShape, StressPoints
 from diffsim_ti.inputs.rigid_start import RigidDisplacement, RigidVelocity
 from diffsim_ti.inputs.surface_areas import SurfaceAreas

@@ -1,4 +1,4 @@
-"""Links of loads: from numbers over time, areas and volumes to what kernels read.
+"""Links of loads, growth, chambers and muscles: from numbers over time, areas and volumes to what kernels read.
 
 What is given over time comes as values at the beginning and at the end of each step, shape (2, rows, ...), between which a
 load goes linearly. One row serves all steps.
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
+from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.face_points import face_points
 
 
@@ -210,3 +211,157 @@ class PressureRows(_Together):
 
     def vjp(self, x, y_adj):
         return [self._pulled(part, y_adj[0][:, k, :2].T) for k, part in enumerate(x)]
+
+
+class RemoteForces(Link):
+    """f_i = a_i (F / A + omega x r_i),    J omega = M + (p - c) x F,    J = sum a_i (|r_i|^2 - r_i r_i^T),
+
+    shape (2, rows, k, 3), of (F, M) over time, (2, rows, 6), rest positions and areas a_i of k vertices, A = sum a_i, r_i
+    from their centre c. p: the point; None: c. For all of a, r and (F, M) both derivatives.
+    """
+
+    def __init__(self, load: str, areas: str, vertices: np.ndarray, point: np.ndarray | None, writes: str):
+        self.reads, self.writes = (load, "rest", areas), (writes,)
+        self.vertices, self.point = vertices, point
+
+    def _parts(self, load, X, a):
+        F, M = load[..., :3], load[..., 3:]
+        A = a.sum()
+        c = a @ X[self.vertices] / A
+        r, arm = X[self.vertices] - c, np.zeros(3) if self.point is None else self.point - c
+        J = (a * (r**2).sum(1)).sum() * np.eye(3) - (r.T * a) @ r
+        omega = np.linalg.solve(J, (M + np.cross(arm, F))[..., None])[..., 0]
+        return F, A, r, arm, J, omega, F[..., None, :] / A + np.cross(omega[..., None, :], r)
+
+    def value(self, load, X, a):
+        return (a[:, None] * self._parts(load, X, a)[-1],)
+
+    def jvp(self, x, dx):
+        (load, X, a), (dload, dX, da) = x, dx
+        F, A, r, arm, J, omega, per_area = self._parts(load, X, a)
+        dF, dM, dA = dload[..., :3], dload[..., 3:], da.sum()
+        dc = (da @ r + a @ dX[self.vertices]) / A
+        dr = dX[self.vertices] - dc
+        cross = (r.T * a) @ dr
+        dJ = (da * (r**2).sum(1) + 2 * a * (r * dr).sum(1)).sum() * np.eye(3) - (r.T * da) @ r - cross - cross.T
+        dT = dM + np.cross(arm, dF) - (0.0 if self.point is None else np.cross(dc, F))
+        domega = np.linalg.solve(J, (dT - omega @ dJ)[..., None])[..., 0]
+        change = dF[..., None, :] / A - F[..., None, :] * dA / A**2
+        change = change + np.cross(domega[..., None, :], r) + np.cross(omega[..., None, :], dr)
+        return (da[:, None] * per_area + a[:, None] * change,)
+
+    def vjp(self, x, y_adj):
+        load, X, a = x
+        F, A, r, arm, J, omega, per_area = self._parts(load, X, a)
+        w = y_adj[0]
+        aw = a[:, None] * w
+        t = np.linalg.solve(J, np.cross(r, aw).sum(-2)[..., None])[..., 0]  # adjoint of J omega
+        by_load = np.concatenate([aw.sum(-2) / A + np.cross(t, arm), t], -1)
+        by_a = (w * per_area).sum((0, 1, 3)) - (aw * F[..., None, :]).sum() / A**2
+        tr, wr, tw = t @ r.T, omega @ r.T, (t * omega).sum(-1)[..., None]
+        by_a += (tr * wr - tw * (r**2).sum(1)).sum((0, 1))
+        by_r = np.cross(aw, omega[..., None, :]).sum((0, 1)) - 2 * a[:, None] * r * tw.sum()
+        by_r += a[:, None] * ((wr[..., None] * t[..., None, :]) + tr[..., None] * omega[..., None, :]).sum((0, 1))
+        by_c = -by_r.sum(0) - (0.0 if self.point is None else np.cross(F, t).sum((0, 1)))
+        by_X = np.zeros_like(X)
+        by_X[self.vertices] = by_r + a[:, None] * by_c / A
+        return by_load, by_X, by_a + r @ by_c / A
+
+
+class GrowthRows(_Together):
+    """Sum of all growths in time, shape (rows, 2, m): as each step begins and ends, of each tetrahedron, or m = 1 where all
+    grow alike. Each part has shape (2, rows) or (2, rows, groups); chosen: its tetrahedra, None for all; group: which
+    number each of these has."""
+
+    def __init__(self, reads: Sequence[str], chosen: Sequence, group: Sequence, num_tetrahedra: int):
+        super().__init__(reads, "growths")
+        self.chosen, self.group = chosen, group
+        self.count = 1 if all(own is None for own in chosen) else num_tetrahedra
+
+    def value(self, *x):
+        rows = self.rows(x)
+        out = np.zeros((rows, 2, self.count))
+        for part, chosen, group in zip(x, self.chosen, self.group):
+            by_time = np.moveaxis(part[:, :rows], 0, 1)
+            spread = by_time[..., None] if part.ndim == 2 else by_time[..., group]
+            out[..., slice(None) if chosen is None else chosen] += spread
+        return (out,)
+
+    def vjp(self, x, y_adj):
+        out = []
+        for part, chosen, group in zip(x, self.chosen, self.group):
+            own = np.moveaxis(y_adj[0][..., slice(None) if chosen is None else chosen], 1, 0)
+            if part.ndim == 2:
+                out.append(self._pulled(part, own.sum(-1)))
+                continue
+            by_group = np.zeros((part.shape[2], *own.shape[:2]))
+            np.add.at(by_group, group, np.moveaxis(own, -1, 0))
+            out.append(self._pulled(part, np.moveaxis(by_group, 0, -1)))
+        return out
+
+
+class RestVolume(Link):
+    """Of rest positions the volume [m^3] of a chamber."""
+
+    reads = ("rest",)
+
+    def __init__(self, enclosure: Enclosure, writes: str):
+        self.enclosure, self.writes = enclosure, (writes,)
+
+    def value(self, X):
+        return (self.enclosure.volume(X),)
+
+    def jvp(self, x, dx):
+        return ((self.enclosure.gradient(x[0]) * dx[0]).sum(),)
+
+    def vjp(self, x, y_adj):
+        return (self.enclosure.gradient(x[0]) * y_adj[0],)
+
+
+class MuscleTension(Link):
+    """T = alpha s V / L0 [N] in time, shape (2, rows, points): alpha: activations in time as `InTime` has them, of all
+    together or of each group; s: stress [Pa], a number or one for each group; V: volume of each of the points `chosen` among
+    those of all tetrahedra; L0: length at rest of the segment there; group: that of each point."""
+
+    def __init__(self, activation: str, stress: str, segments: str, chosen, group, writes: str):
+        self.reads, self.writes = (activation, stress, segments, "volumes"), (writes,)
+        self.chosen, self.group = chosen, group
+
+    def _spread(self, of_groups):
+        """To points, along the last axis."""
+        return of_groups[..., self.group] if of_groups.shape[-1] > 1 else of_groups
+
+    def _parts(self, activation, stress, segments, volumes):
+        """(alpha, s, V, D, L0)"""
+        alpha = self._spread(activation.reshape(*activation.shape[:2], -1))
+        D = segments[0::2]
+        return alpha, self._spread(stress.reshape(-1)), volumes.ravel()[self.chosen], D, np.linalg.norm(D, axis=1)
+
+    def value(self, *x):
+        alpha, s, V, _, length = self._parts(*x)
+        return (alpha * (s * V / length),)
+
+    def jvp(self, x, dx):
+        alpha, s, V, D, length = self._parts(*x)
+        dalpha, ds, dV, dD, _ = self._parts(*dx)
+        dlength = (D * dD).sum(1) / length
+        return (dalpha * (s * V / length) + alpha * (ds * V + s * dV - s * V * dlength / length) / length,)
+
+    def vjp(self, x, y_adj):
+        alpha, s, V, D, length = self._parts(*x)
+        by = (y_adj[0] * alpha).sum((0, 1))
+        segments, volumes = np.zeros_like(x[2]), np.zeros(x[3].size)
+        segments[0::2] = (-by * s * V / length**3)[:, None] * D
+        np.add.at(volumes, self.chosen, by * s / length)
+        activation = self._gathered(y_adj[0] * (s * V / length), x[0])
+        return activation, self._gathered(by * V / length, x[1]), segments, volumes.reshape(x[3].shape)
+
+    def _gathered(self, by_points, given):
+        """Adjoint of what was spread, from that of points."""
+        lead = by_points.shape[:-1]
+        groups = given.size // int(np.prod(lead, dtype=int))
+        if groups == 1:
+            return by_points.sum(-1).reshape(given.shape)
+        out = np.zeros((groups, *lead))
+        np.add.at(out, self.group, np.moveaxis(by_points, -1, 0))
+        return np.moveaxis(out, 0, -1).reshape(given.shape)

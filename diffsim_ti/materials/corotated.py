@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from diffsim_ti.materials.calculus.strains import StrainLaw
 from diffsim_ti.materials.linear_elastic import LinearElasticLaw as Small
-from diffsim_ti.materials.two_moduli import TwoModuli
+from diffsim_ti.materials.material import TwoModuli
 
 
 @dataclass(frozen=True)

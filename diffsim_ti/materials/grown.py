@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.materials.around import Around
-from diffsim_ti.materials.calculus.green import PAIRS, of_six
-from diffsim_ti.materials.calculus.tensor import add_to_diagonal, cofactor, inner
+from diffsim_ti.materials.calculus.tensor import PAIRS, add_to_diagonal, cofactor, inner, of_six
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.runtime import let, traced

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.materials.around import Around
-from diffsim_ti.materials.calculus.green import green_strain, of_six
-from diffsim_ti.materials.calculus.tensor import inner
+from diffsim_ti.materials.calculus.tensor import green_strain, inner, of_six
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, PerTetrahedron
 from diffsim_ti.materials.sum_law import SumLaw

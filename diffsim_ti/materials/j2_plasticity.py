@@ -6,9 +6,8 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti.differentiation import exp, expm1, expm1_minus_x, log1p, maximum, sqrt
-from diffsim_ti.materials.calculus.green import SIX, of_six, six
 from diffsim_ti.materials.calculus.logarithmic_strain import exponential_less_one, logarithmic_strain
-from diffsim_ti.materials.calculus.tensor import Tensor, add_to_diagonal, inner, invariants
+from diffsim_ti.materials.calculus.tensor import SIX, Tensor, add_to_diagonal, inner, invariants, of_six, six
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.runtime import assign, each_lane, let, traced, variable

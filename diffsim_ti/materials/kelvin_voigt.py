@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diffsim_ti.materials.around import Around
-from diffsim_ti.materials.calculus.green import SIX, green_strain, green_strain_differential, hooke, six
+from diffsim_ti.materials.calculus.tensor import SIX, green_strain, green_strain_differential, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.materials.sum_law import SumLaw

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.materials.calculus.strains import StrainLaw
-from diffsim_ti.materials.two_moduli import TwoModuli
+from diffsim_ti.materials.material import TwoModuli
 
 
 @dataclass(frozen=True)

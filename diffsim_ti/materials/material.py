@@ -351,3 +351,19 @@ def _short(number) -> str:
         return f"array({value.size} values, {_short(value.min())} to {_short(value.max())})"
     digits, exponent = f"{value:.11e}".split("e")
     return min(f"{value:.12g}", f"{digits.rstrip('0').rstrip('.')}e{int(exponent)}", key=len)
+
+
+class TwoModuli(Material):
+    """A material of (E, nu) or of (mu, lam): see `Material`."""
+
+    def __init__(
+        self,
+        youngs_modulus: PerTetrahedron | None = None,
+        poissons_ratio: PerTetrahedron | None = None,
+        *,
+        E: PerTetrahedron | None = None,
+        nu: PerTetrahedron | None = None,
+        mu: PerTetrahedron | None = None,
+        lam: PerTetrahedron | None = None,
+    ):
+        super().__init__(youngs_modulus, poissons_ratio, E=E, nu=nu, mu=mu, lam=lam)

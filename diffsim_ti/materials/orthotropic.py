@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.materials.calculus.green import PAIRS, green_strain, six
+from diffsim_ti.materials.calculus.tensor import PAIRS, green_strain, six
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 

@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti.differentiation.functions import x_minus_log1p_value
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
-from diffsim_ti.materials.two_moduli import TwoModuli
+from diffsim_ti.materials.material import TwoModuli
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import taichi as ti
 
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
 from diffsim_ti.materials.calculus.tensor import add_to_diagonal, inner
-from diffsim_ti.materials.two_moduli import TwoModuli
+from diffsim_ti.materials.material import TwoModuli
 from diffsim_ti.runtime import let, traced
 
 

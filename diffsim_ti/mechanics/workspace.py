@@ -9,7 +9,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import Derived, Mass
-from diffsim_ti.mechanics.stress.law_frames import LawFrames
+from diffsim_ti.mechanics.stress.law_state import LawFrames
 from diffsim_ti.mechanics.surfaces.curved_pairs import pairs_of
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs
 from diffsim_ti.runtime import Kernel

@@ -1,7 +1,7 @@
-"""The determinant J of the map of a ten-node tetrahedron: its bounds and its mean, exactly.
+"""The map x(xi) = sum_a N_a(xi) X_a of a ten-node tetrahedron, straight edges or curved: its determinant and its inverse.
 
-x = sum_a N_a(xi) X_a is quadratic, dx/dxi linear, and J = det dx/dxi a cubic, whose Bernstein coefficients b bound it from
-below and above, with J = b at the four corners. Halving an element's edges makes the bounds as sharp as wanted.
+dx/dxi is linear, and J = det dx/dxi a cubic, whose Bernstein coefficients b bound it from below and above, with J = b at the
+four corners. Halving an element's edges makes the bounds as sharp as wanted.
 Johnen, Remacle, Geuzaine 2013, Geometrical validity of curvilinear finite elements, doi:10.1016/j.jcp.2012.08.051.
 """
 
@@ -9,7 +9,9 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from diffsim_ti.mesh.reference_element import QUADRATIC
+from diffsim_ti.mesh import reference_face
+from diffsim_ti.mesh.geometry import nearest_on_triangles
+from diffsim_ti.mesh.reference_element import MID_EDGES, QUADRATIC, barycentric
 
 HALVINGS = 5  # an element that is not known to be right then is within some per cent of being wrong
 _CORNERS = np.concatenate([np.zeros((1, 3)), np.eye(3)])
@@ -67,3 +69,101 @@ def not_above(nodes: np.ndarray, least: np.ndarray) -> np.ndarray:
         gradients = np.einsum("kab,ebij->ekaij", _EIGHTHS, gradients[unknown]).reshape(-1, 4, 3, 3)
         owner = np.repeat(owner[unknown], 8)
     return np.unique(np.concatenate([*wrong, owner]))
+
+
+ITERATIONS = 40
+ACCURACY = 1e-12  # of the size of an element
+
+
+def reach(nodes: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Radius of a ball about each centre that holds the element, shape (m,): by the control points of its edges.
+
+    An element lies in the convex hull of these (Bernstein functions are positive and sum to one).
+    """
+    return np.linalg.norm(_control_points(nodes) - centres[:, None], axis=2).max(1)
+
+
+def _control_points(nodes: np.ndarray) -> np.ndarray:
+    return np.concatenate([nodes[:, :4], 2 * nodes[:, 4:] - nodes[:, MID_EDGES].mean(2)], 1)
+
+
+def barycentric_in(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """L of a point in each element, shape (m, 4); NaN where it is far outside. nodes (m, 10, 3), points (m, 3).
+
+    It starts from the tetrahedron of the corners, then from the centroid and the corners, and halves steps that lead away.
+    """
+    D = np.moveaxis(nodes[:, 1:4] - nodes[:, :1], 1, 2)
+    hull = np.einsum("eij,eaj->eai", np.linalg.inv(D), _control_points(nodes) - nodes[:, :1])
+    first = np.linalg.solve(D, (points - nodes[:, 0])[..., None])[..., 0]
+    outside = (first < hull.min(1) - 1e-6).any(1) | (first > hull.max(1) + 1e-6).any(1)
+    out, left = np.full((len(nodes), 3), np.nan), np.nonzero(~outside)[0]
+    for start in (first, np.full(3, 0.25), *np.concatenate([np.zeros((1, 3)), np.eye(3)])):
+        xi, found = solved(nodes[left], points[left], np.broadcast_to(start, (len(nodes), 3))[left])
+        out[left[found]] = xi[found]
+        left = left[~found]
+        if not len(left):
+            break
+    return barycentric(out)
+
+
+def solved(nodes: np.ndarray, points: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(xi of a point in each element, also beyond it, where it was found), by Newton's method from xi, shape (m, 3)."""
+    size = np.ptp(nodes, axis=1).max(1)
+
+    def miss(xi):
+        return np.einsum("en,eni->ei", QUADRATIC.functions(xi), nodes) - points
+
+    xi, off = xi.copy(), miss(xi)
+    for _ in range(ITERATIONS):
+        norms = np.linalg.norm(off, axis=1)
+        found = norms <= ACCURACY * size
+        if found.all():
+            break
+        J = np.einsum("enj,eni->eij", QUADRATIC.derivatives(xi), nodes)
+        singular = np.abs(np.linalg.det(J)) < 1e-12 * size**3
+        J[singular] = size[singular, None, None] * np.eye(3)
+        step = -np.linalg.solve(J, off[..., None])[..., 0]
+        step[found] = 0.0
+        for _ in range(8):
+            tried = miss(xi + step)
+            away = np.linalg.norm(tried, axis=1) > norms
+            if not away.any():
+                break
+            step[away] /= 2
+        xi = xi + step
+        off = miss(xi)
+    return xi, np.linalg.norm(off, axis=1) <= 1e3 * ACCURACY * size
+
+
+def nearest_on_face(point: np.ndarray, nodes: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Coordinates (s, t) of the nearest point of a face of six nodes, shape (6, 3), from a start near to it.
+
+    Newton's method for |x(s, t) - point|^2 / 2 within the triangle; the step solves the quadratic model there: the nearest
+    point of the triangle in the metric of the second derivatives (those of Gauss and Newton where these are not positive).
+    """
+    corners = np.array([[0.0, 0], [1, 0], [0, 1]])
+    off = _place(s, nodes) - point
+    for _ in range(ITERATIONS):
+        T = nodes.T @ reference_face.derivatives(s[None])[0]
+        H = T.T @ T + np.einsum("aij,a->ij", reference_face.SECOND, nodes @ off)
+        if np.linalg.eigvalsh(H)[0] <= 1e-6 * np.trace(T.T @ T):
+            H = T.T @ T
+        C = np.linalg.cholesky(H)
+        model = np.pad((corners - s) @ C, ((0, 0), (0, 1)))
+        target = np.pad(-np.linalg.solve(C, T.T @ off), (0, 1))
+        step = np.linalg.solve(C.T, nearest_on_triangles(target, model[None])[0, :2])
+        for _ in range(20):
+            tried = _place(s + step, nodes) - point
+            if tried @ tried <= off @ off:
+                break
+            step = step / 2
+        if tried @ tried > off @ off:
+            return s
+        s, off = np.clip(s + step, 0, 1), tried
+        if np.abs(step).max() < ACCURACY:
+            break
+    return s
+
+
+def _place(s: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    return reference_face.functions(s[None])[0] @ nodes

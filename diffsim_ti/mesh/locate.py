@@ -7,7 +7,7 @@ import numpy as np
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.geometry import FACES, nearest_on_triangles
-from diffsim_ti.mesh.inverse_map import barycentric_in, nearest_on_face, reach
+from diffsim_ti.mesh.jacobian import barycentric_in, nearest_on_face, reach
 from diffsim_ti.mesh.reference_face import functions
 from diffsim_ti.mesh.sets import places_of_triangles
 from diffsim_ti.mesh.ten_nodes import FACE_NODES, QUARTERS

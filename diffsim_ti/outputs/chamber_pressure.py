@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.mechanics.chambers.laws import law_of
-from diffsim_ti.mechanics.chambers.pressures import rows_of
+from diffsim_ti.mechanics.chambers.pressures import law_of, rows_of
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.terms import Chamber
 

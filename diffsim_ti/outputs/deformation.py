@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.mesh.geometry import edge_matrices
-from diffsim_ti.mesh.inverse_map import barycentric_in, solved
+from diffsim_ti.mesh.jacobian import barycentric_in, solved
 from diffsim_ti.mesh.reference_element import QUADRATIC, barycentric
 
 

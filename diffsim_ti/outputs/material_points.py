@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.geometry import inverse_edges, shape_gradients
-from diffsim_ti.mesh.inverse_map import barycentric_in, solved
+from diffsim_ti.mesh.jacobian import barycentric_in, solved
 from diffsim_ti.outputs.output import Change, Output
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from diffsim_ti.scene.locking import LOCKING_RATIO, warn_if_locking
 from diffsim_ti.terms import Chamber, Drag, Gravity, Growth, Obstacle, SelfContact, Term, Tie
 from diffsim_ti.terms.glued import Glued
 from diffsim_ti.terms.mass_scaling import MassScaling
-from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
+from diffsim_ti.terms.over_time import Motion
 from diffsim_ti.terms.pose import Pose, sampled_path
 from diffsim_ti.terms.reduced import Reduced
 from diffsim_ti.terms.supports import Fixed, Supports

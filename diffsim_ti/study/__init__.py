@@ -3,11 +3,10 @@
 from diffsim_ti.study.growth import Growth, growth
 from diffsim_ti.study.problem import Problem
 from diffsim_ti.study.problems import PROBLEMS, problem
-from diffsim_ti.study.recommend import recommend
-from diffsim_ti.study.recommendation import Recommendation
 from diffsim_ti.study.stability_axes import power_limit
 from diffsim_ti.study.stability_map import StabilityMap, boundary, stability_map
 from diffsim_ti.study.sweep import Settings, Sweep, sweep
+from diffsim_ti.study.trials import Recommendation, recommend
 from diffsim_ti.study.work_precision import Chart, Point, chart, pareto_front
 
 __all__ = ["Chart", "Growth", "PROBLEMS", "Point", "Problem", "Recommendation", "Settings", "StabilityMap", "Sweep"]

@@ -1,24 +1,98 @@
-"""Trial runs of a scene by every solver and element, and what follows from them."""
+"""Advice: the cheapest solver, step, precision, element and checkpoints for a tolerance, from trial runs and theory."""
 
 import copy
 import time
 import warnings
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from typing_extensions import Unpack
 
+from diffsim_ti.common.public import public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
+from diffsim_ti.rollout.rollout import RolloutOptions
 from diffsim_ti.scene import Scene
 from diffsim_ti.scene.scene import LOCKING_RATIO
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
-from diffsim_ti.study.alternatives import alternatives
+from diffsim_ti.study.alternatives import Alternative, alternatives
 from diffsim_ti.study.elements import ElementTrial, ElementTrials, own_element
 from diffsim_ti.study.executors import each
 from diffsim_ti.study.problem import Problem, distance
-from diffsim_ti.study.recommendation import Option, Recommendation
 from diffsim_ti.terms import Drag
+
+
+@dataclass
+class Option:
+    """A way to run a scene, with what a trial run says of it."""
+
+    solver: type
+    precision: str
+    substep: float  # [s]
+    steps: int  # of the whole duration
+    error: float = np.nan  # over the whole duration, relative to the largest displacement
+    seconds: float = np.nan  # wall time of the whole duration, with its gradient if asked for
+    substeps: int = 0  # per frame of the trial
+
+    @property
+    def label(self) -> str:
+        return f"{self.solver.__name__}, {self.substep:.3g} s, {self.precision}"
+
+
+@dataclass(repr=False)
+class Recommendation:
+    """What to use: `solver`, `dt` [s], `steps`, `precision`, `memory` [MB] for the checkpoints, `element`; what to expect
+    of it: `seconds` of wall time, `megabytes` kept for gradients, `error` relative to the largest displacement.
+
+    `reasons`: three lines; `left_out`: what the scene does without, and why. `rollout(scene)` makes it, of the scene as it
+    is. `elements`: what its mesh makes wrong by each kind of element; `element`: the cheapest that keeps to the tolerance.
+    `alternatives`: mass scaling, stiff parts that move affinely and adaptive steps beside it, where these keep to the
+    tolerance.
+    """
+
+    option: Option
+    duration: float
+    gradients: bool
+    memory: float | None
+    megabytes: float
+    error: float
+    element: str
+    reasons: list[str]
+    left_out: list[str]
+    tried: list[Option] = field(repr=False, default_factory=list)
+    elements: list[ElementTrial] = field(repr=False, default_factory=list)
+    alternatives: list[Alternative] = field(repr=False, default_factory=list)
+
+    solver = property(lambda self: self.option.solver)
+    precision = property(lambda self: self.option.precision)
+    dt = property(lambda self: self.option.substep)
+    steps = property(lambda self: self.option.steps)
+    seconds = property(lambda self: self.option.seconds)
+
+    def rollout(self, scene: Scene, frames: int = 1, **options: Unpack[RolloutOptions]) -> Rollout:
+        """The recommended run of the scene, `frames` times saved; options are Rollout's."""
+        substeps = -(-self.steps // frames)
+        solver = self.solver(scene.replace(precision=self.precision), dt=self.duration / frames, substeps=substeps)
+        return Rollout(solver, frames, save_every=1, memory=self.memory, **options)
+
+    def __str__(self) -> str:
+        kept = f"{self.megabytes:.3g} MB" if self.gradients else "no states"
+        return "\n".join(
+            [
+                f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}, "
+                f"element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else ""),
+                f"expect: {self.seconds:.3g} s of wall time, {kept} kept, "
+                f"error {self.error:.2g} of the largest displacement",
+                *(f"- {line}" for line in self.reasons),
+                *([f"- elements: {'; '.join(map(str, self.elements))}, of the mesh alone"] if self.elements else []),
+                *(f"- beside it: {other}" for other in self.alternatives),
+                "left out: " + "; ".join(self.left_out),
+            ]
+        )
+
+    __repr__ = __str__
+
 
 SAFETY = 0.7  # of the tolerance: what a trial run must keep, for the error of the whole run is predicted
 SHARE = 0.8  # of the stable step at the start, which may fall on the way
@@ -337,3 +411,45 @@ def _apart(trials: Trials, kinds: list, first: int) -> tuple[list, list, list]:
         else:
             own.compare_elements()
     return own.tried, own.notes, own.elements
+
+
+@public
+def recommend(
+    scene: Scene,
+    duration: float,
+    tolerance: float = 1e-2,
+    memory: float | None = None,
+    gradients: bool = True,
+    budget: float = 20.0,
+    frames: int = 8,
+    elements: bool = True,
+    coarser: TetrahedralMesh | None = None,
+    executor: Executor | None = None,
+) -> Recommendation:
+    """The cheapest way to run `scene` for `duration` [s] with a relative error of motion below `tolerance`.
+
+    The error meant is that of steps and precision on the scene's own mesh: the largest distance of any vertex at any of
+    `frames` times over the largest displacement from the start. memory [MB]: most that gradients may keep.
+    gradients: whether runs will be differentiated, which is then timed as well.
+    budget [s]: wall time of the trials, compiling apart; if the reference of the whole duration would take more, trials
+    cover a first part and errors grow with time from there.
+    elements: whether linear tetrahedra, patches and ten nodes are compared too, by what the mesh itself makes wrong; the
+    advice's `element` is the cheapest that keeps to the tolerance. coarser: a linear mesh of the body with the same
+    named sets, to try ten nodes on; None: half the cells of a mesh that `create_box` made.
+    executor: any `concurrent.futures.Executor`, which takes a solver at a time, each with the budget, and the elements;
+    those near the best are timed again here.
+
+    Raises ValueError for a duration or tolerance that is no such thing, FloatingPointError if nothing meets the tolerance.
+    """
+    if not (duration > 0 and np.isfinite(duration)):
+        raise ValueError(f"duration must be > 0 [s], got {duration:g}")
+    if not 0 < tolerance < 1:
+        raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance:g}")
+    if memory is not None and not memory > 0:
+        raise ValueError(f"memory must be > 0 [MB], got {memory:g}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of trials with coarse steps, whose errors are measured
+        trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
+        trials.coarser = coarser
+        trials.run(elements, executor)
+    return trials.advice()

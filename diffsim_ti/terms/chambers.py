@@ -4,18 +4,26 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
+import taichi as ti
 
 from diffsim_ti.inputs import POSITIVE, Input, Link
-from diffsim_ti.inputs.chambers import RestVolume
-from diffsim_ti.inputs.loads import InTime
+from diffsim_ti.inputs.loads import InTime, RestVolume
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.mesh.ten_nodes import triangles_of
-from diffsim_ti.terms.gas_law import gas_law
 from diffsim_ti.terms.marks import pressing
 from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
 from diffsim_ti.terms.term import OnSurface, Term
+
+
+def gas_law(p0, outside, V0, n, V):
+    """p = p_0 (V_0 / V)^n - p_out and its derivatives by p_0, p_out, V_0, n and V, of plain numbers or in a kernel."""
+    log = ti.log(V0 / V)
+    grown = ti.exp(n * log)
+    absolute = p0 * grown
+    return absolute - outside, grown, -1, n * absolute / V0, absolute * log, -n * absolute / V
+
 
 ATMOSPHERE = 101325.0  # [Pa]
 

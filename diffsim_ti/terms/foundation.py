@@ -4,7 +4,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import Input, Link
-from diffsim_ti.inputs.foundation import FoundationStiffness
+from diffsim_ti.inputs.lines import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.lines import AT_LEAST_0

@@ -9,8 +9,7 @@ from diffsim_ti.inputs import Input, Link, Range
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.named_sets import SetOrIndices
-from diffsim_ti.terms.of_tetrahedra import OfTetrahedra
-from diffsim_ti.terms.over_time import OverTime
+from diffsim_ti.terms.over_time import OfTetrahedra, OverTime
 from diffsim_ti.terms.term import Term, nonempty
 
 

@@ -8,15 +8,13 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import numbers, present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.lines import LineRows, Segments
-from diffsim_ti.inputs.loads import InTime
-from diffsim_ti.inputs.muscles import MuscleTension
+from diffsim_ti.inputs.loads import InTime, MuscleTension
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.terms.lines import AT_LEAST_0, Cable
 from diffsim_ti.terms.marks import MOST, Lines, spread
-from diffsim_ti.terms.of_tetrahedra import OfTetrahedra
-from diffsim_ti.terms.over_time import OverTime
+from diffsim_ti.terms.over_time import OfTetrahedra, OverTime
 from diffsim_ti.terms.term import Term, nonempty
 
 

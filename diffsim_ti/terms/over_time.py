@@ -1,13 +1,14 @@
-"""An amount that is the same all the time, given for each step, or by a function or keyframes."""
+"""An amount or a motion that is the same all the time, given for each step, or by a function or keyframes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import TypeAliasType
 
-from diffsim_ti.common.checked import shape_of
+from diffsim_ti.common.checked import numbers, shape_of, shown
 from diffsim_ti.inputs import Input
+from diffsim_ti.mesh import TetrahedralMesh
 
 # what holds all the time, one for each step, a function of time [s], or keyframes (times [s], values)
 OverTime = TypeAliasType("OverTime", ArrayLike | Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike])
@@ -66,3 +67,73 @@ def rows_at(name: str, given: OverTime, times: ArrayLike, shape: tuple) -> np.nd
     if out.shape != (len(times), *shape) or not np.all(np.isfinite(out)):
         raise ValueError(f"{name}: must be finite and of shape {shape} at each time, got shape {out.shape[1:]}")
     return out
+
+
+# a function of time [s], or keyframes (times [s], displacements [m])
+Motion = TypeAliasType("Motion", Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike])
+
+
+def sampled(name: str, motion: Motion, times: ArrayLike, k: int) -> np.ndarray:
+    """A motion of k points at each time [s], shape (len(times), k, 3) [m].
+
+    motion: a function of time that returns 3 numbers or shape (k, 3), or keyframes (times, displacements).
+    """
+    if callable(motion):
+        out = np.array([np.broadcast_to(np.asarray(motion(float(t)), np.float64), (k, 3)) for t in times])
+    else:
+        if not isinstance(motion, tuple | list) or len(motion) != 2:
+            raise ValueError(f"{name}: a function of time, or keyframes (times, displacements), got {shown(motion)}")
+        at, to = (numbers(name, part) for part in motion)
+        to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
+        if np.any(np.diff(at) <= 0):
+            raise ValueError(f"{name}: keyframe times must increase")
+        out = np.stack([np.interp(times, at, column) for column in to.reshape(len(at), -1).T], -1).reshape(-1, k, 3)
+    if not np.all(np.isfinite(out)):
+        raise ValueError(f"{name}: displacements must be finite")
+    return out
+
+
+PER = ("all", "set", "tetrahedron")
+
+
+class OfTetrahedra(GivenOverTime):
+    """The part of a term that gives tetrahedra an amount over time; `tetrahedra` and `per` as the terms say."""
+
+    def _take(
+        self, argument: str, given: OverTime, plain: str, tetrahedra: str | Sequence[str] | ArrayLike | None, per: str
+    ) -> tuple[Input, tuple]:
+        """The input of the amount, and the shape of one row of it."""
+        kind = type(self).__name__
+        if per not in PER:
+            raise ValueError(f"{kind}: per must be one of {', '.join(map(repr, PER))}, got {per!r}")
+        if per == "set" and (isinstance(tetrahedra, str) or not all(isinstance(s, str) for s in tetrahedra or [0])):
+            raise ValueError(f'{kind}: per="set" takes tetrahedra=["left", "right"], names of sets, got {tetrahedra!r}')
+        shape = () if per == "all" else (len(tetrahedra),) if per == "set" else ("k",)
+        self.given, self.keyed, self.per, self.tetrahedra = given, is_keyed(given), per, tetrahedra
+        self.ndim, self._called = len(shape) + 1, f"{kind}: {argument}"
+        return amount(argument, given, shape, "-", plain), shape
+
+    def rows(self, times: ArrayLike) -> np.ndarray:
+        at = self.given(0.0) if callable(self.given) else np.asarray(self.given[1])[0]
+        return rows_at(self._called, self.given, times, np.shape(at))
+
+    def groups(self, mesh: TetrahedralMesh) -> tuple[np.ndarray, np.ndarray]:
+        """(tetrahedra, which number of a row each has)"""
+        if self.per == "set":
+            each = [mesh.tetrahedron_indices(own) for own in self.tetrahedra]
+            return np.concatenate(each), np.repeat(np.arange(len(each)), [len(own) for own in each])
+        every = np.arange(mesh.num_tetrahedra)
+        chosen = every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra)
+        return chosen, np.arange(len(chosen)) if self.per == "tetrahedron" else np.zeros(len(chosen), np.int64)
+
+    def sizes(self, mesh: TetrahedralMesh) -> dict[str, int]:
+        """How many tetrahedra "k" stands for."""
+        return {"k": len(self.groups(mesh)[0])}
+
+    def _shapes(self, chosen: np.ndarray) -> tuple[tuple, tuple]:
+        """(the shape that a row must have for these tetrahedra, the one that is given)"""
+        count = () if self.per == "all" else (len(self.tetrahedra) if self.per == "set" else len(chosen),)
+        if self.keyed:
+            return count, self.rows([0.0]).shape[1:]
+        value = self.described[0].value
+        return count, value.shape[value.ndim - len(count) :]

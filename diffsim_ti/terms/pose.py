@@ -9,7 +9,7 @@ from diffsim_ti.common import rotations
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.common.public import Public
 from diffsim_ti.inputs.poses import between, quaternions
-from diffsim_ti.terms.motion import Motion, sampled
+from diffsim_ti.terms.over_time import Motion, sampled
 
 
 @dataclass(frozen=True, eq=False)

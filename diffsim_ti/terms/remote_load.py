@@ -5,8 +5,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import Link
-from diffsim_ti.inputs.loads import VertexAreas
-from diffsim_ti.inputs.remote import RemoteForces
+from diffsim_ti.inputs.loads import RemoteForces, VertexAreas
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.loads import Load

@@ -8,11 +8,11 @@ from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.checked import numbers, shown
 from diffsim_ti.common.warn import warn
-from diffsim_ti.inputs.posed_supports import PosedSupport
+from diffsim_ti.inputs.poses import PosedSupport
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.sets import parts_of_joined
-from diffsim_ti.terms.motion import Motion, sampled
+from diffsim_ti.terms.over_time import Motion, sampled
 from diffsim_ti.terms.pose import Pose
 
 # a vertex set's name, several, indices or a mask: fixed wholly; or {name of a set: in which directions it is fixed}

@@ -21,9 +21,9 @@ from scipy.optimize import least_squares
 import diffsim_ti as ds
 from diffsim_ti.identification.fit import METHODS
 from diffsim_ti.identification.measurements import measurements
-from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem
 from diffsim_ti.identification.search import Search
+from diffsim_ti.identification.unknowns import Priors
 
 NOISE = 1e-4  # [m]
 NEAR = 1.0, 0.1  # standard errors off the least

@@ -18,7 +18,7 @@ import taichi as ti
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
 from diffsim_ti.runtime import Kernel, at, cross, let, traced
 from diffsim_ti.state.pass_table import pass_at
-from diffsim_ti.terms.gas_law import gas_law
+from diffsim_ti.terms.chambers import gas_law
 
 A = ti.template()
 CHAMBERS = dict.fromkeys(("triangles", "chamber", "begins", "anchor", "first_row"), "ints") | dict(

@@ -1,16 +1,25 @@
 """Gases and filled chambers, among a scene's interactions."""
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.mechanics.chambers.gas_force import GasForce
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
 from diffsim_ti.mechanics.chambers.pressures import ChamberPressure, rows_of
-from diffsim_ti.mechanics.interaction import add_at
+from diffsim_ti.mechanics.interaction import ItemForce, add_at
 from diffsim_ti.mechanics.pressure.interaction import Pressing
 from diffsim_ti.terms import FilledChamber, GasChamber
-from diffsim_ti.terms.gas_law import gas_law
+from diffsim_ti.terms.chambers import gas_law
+
+
+@dataclass(frozen=True)
+class GasForce(ItemForce):
+    """Corners of chambers, whose forces are written by launches of their own before each pass (gases.py)."""
+
+    per_step: bool
+    name, apart, reads_rest, asks_for_steps = "gases", True, True, True
+
 
 WORKS = "gases and filled chambers"
 

@@ -5,7 +5,7 @@ import numpy as np
 from diffsim_ti.inputs import ConsistentMass, Mass
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mechanics.interactions import host_forces
-from diffsim_ti.mechanics.stress.blocks import between_nodes, summed
+from diffsim_ti.mechanics.stress.projection import between_nodes, summed
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of, projectors_of
 from diffsim_ti.state.arrays import SceneArrays
 

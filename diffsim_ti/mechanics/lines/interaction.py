@@ -5,8 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.inputs.foundation import FoundationRows
-from diffsim_ti.inputs.lines import JoinedRows, JoinedSegments
+from diffsim_ti.inputs.lines import FoundationRows, JoinedRows, JoinedSegments
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.lines.foundations import FoundationForce, FoundationOnHost
 from diffsim_ti.mechanics.lines.line_force import LineForce

@@ -12,8 +12,13 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.materials.calculus.green import green_strain, green_strain_differential, six, six_adjoint
-from diffsim_ti.materials.calculus.tensor import add_to_diagonal
+from diffsim_ti.materials.calculus.tensor import (
+    add_to_diagonal,
+    green_strain,
+    green_strain_differential,
+    six,
+    six_adjoint,
+)
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import Kernel, kernels_of, traced
 from diffsim_ti.state.features import Features

@@ -1,6 +1,6 @@
 """Growth over time, among a scene's interactions."""
 
-from diffsim_ti.inputs.growing import GrowthRows
+from diffsim_ti.inputs.loads import GrowthRows
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.terms import Growth
 

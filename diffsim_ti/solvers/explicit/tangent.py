@@ -8,7 +8,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.stage import Passes
-from diffsim_ti.mechanics.stress.law_frames import LawFrames
+from diffsim_ti.mechanics.stress.law_state import LawFrames
 from diffsim_ti.mechanics.workspace import FrameArrays
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.explicit.stages import with_buffers

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import Up, upwards
 from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
-from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+from diffsim_ti.terms.over_time import Motion
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.mesh.face_points import bow
 from diffsim_ti.terms.described import chosen_width, place, positive
 from diffsim_ti.terms.gravity import Gravity
-from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
 from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.terms.obstacles.stiffness import approach, over_time, pressed_by, stiffness_of_impact
+from diffsim_ti.terms.over_time import Motion
 from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_path
 from diffsim_ti.terms.term import Term
 
