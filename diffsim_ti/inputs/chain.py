@@ -34,6 +34,13 @@ class Link(ABC):
         """Adjoints of x, f'(x)^T y_adj, each of its x's shape."""
 
 
+class LinearLink(Link):
+    """A link whose change is its value of the changes."""
+
+    def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
+        return self.value(*dx)
+
+
 class Chain:
     """Links one after the other, from some inputs on. What a link wrote is kept for as long as its arrays are the same.
 

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
+from functools import partial
+from operator import le, lt
 from typing import Literal
 
 import numpy as np
@@ -62,16 +64,9 @@ class Range:
     in_runs: bool = True
 
 
-def _positive(x: np.ndarray) -> np.ndarray:
-    return x > 0
-
-
-def _not_negative(x: np.ndarray) -> np.ndarray:
-    return x >= 0
-
-
-POSITIVE = Range("> 0", _positive)
-NOT_NEGATIVE = Range("one number >= 0", _not_negative, in_runs=False)  # differences about 0 step below it
+above_0, at_least_0 = partial(lt, 0), partial(le, 0)  # 0 < x and 0 <= x, which pickle
+POSITIVE = Range("> 0", above_0)
+NOT_NEGATIVE = Range("one number >= 0", at_least_0, in_runs=False)  # differences about 0 step below it
 
 
 @dataclass(frozen=True, eq=False)

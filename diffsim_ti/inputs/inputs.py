@@ -16,7 +16,7 @@ from diffsim_ti.inputs.consistent_mass import ElementMasses
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, length_per_step, speed
 from diffsim_ti.inputs.poses import PoseColumns, PosedMotion
 from diffsim_ti.inputs.rest_shape import RestShape, StressPoints
-from diffsim_ti.inputs.rigid_start import RigidDisplacement, RigidVelocity
+from diffsim_ti.inputs.rigid_start import Displacement, RigidVelocity
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 
 if TYPE_CHECKING:
@@ -136,9 +136,8 @@ class Inputs:
             value = self.values.get(name)
             shape = value.shape if value is not None else i.shapes[0]
             words = f"({', '.join(map(str, shape))})"
-            rows.append(
-                (name, words, i.unit or "-", f"{float(value):g}" if value is not None and value.size == 1 else "")
-            )
+            number = f"{float(value):g}" if value is not None and value.size == 1 else ""
+            rows.append((name, words, i.unit or "-", number))
         wide = [max(len(row[k]) for row in rows) for k in range(3)]
         return "\n".join("  ".join([*(x.ljust(n) for x, n in zip(row, wide)), row[3]]).rstrip() for row in rows)
 
@@ -193,9 +192,7 @@ class Inputs:
         """Of displacements and velocities, as the scene can have them."""
         scene, rigid = self.scene, self.scene.reduced.rigid
         free = lambda v: scene.reduced.of(scene.supports.free(v))  # noqa: E731
-        if rigid:
-            return RigidDisplacement(scene.reduced.of, rigid), RigidVelocity(free, rigid)
-        return links.Displacement(scene.reduced.of), links.FreeVelocity(free)
+        return Displacement(scene.reduced.of, rigid), RigidVelocity(free, rigid) if rigid else links.FreeVelocity(free)
 
     def _links(self, named: dict) -> list[Link]:
         """Those of the body, of its material, of the terms, and what joins the terms' numbers and paths."""

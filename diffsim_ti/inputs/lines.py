@@ -10,13 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Link
+from diffsim_ti.inputs.chain import LinearLink, Link
 from diffsim_ti.inputs.loads import _Together
 from diffsim_ti.mesh.face_points import face_points
 from diffsim_ti.mesh.paths import Paths
 
 
-class Segments(Link):
+class Segments(LinearLink):
     """Of rest positions, and of the places of anchors [m], shape (k, 3) or (3,) for one, the segments of paths."""
 
     def __init__(self, paths: Paths, num_vertices: int, anchors: str | None, writes: str):
@@ -30,9 +30,6 @@ class Segments(Link):
         out = np.zeros_like(points)
         out[starts] = points[starts + 1] - points[starts]
         return (out,)
-
-    def jvp(self, x, dx):
-        return self.value(*dx)
 
     def vjp(self, x, y_adj):
         by_points, starts = np.zeros((self.paths.num_points, 3)), self.paths.starts
@@ -115,22 +112,6 @@ class LineRows(Link):
             starts = self.paths.starts
             out[0][starts] = directions(x[0])[starts] * of_path[self.paths.path_of][:, None]
         return out
-
-
-class JoinedSegments(Link):
-    """Arrays one after the other."""
-
-    def __init__(self, reads: Sequence[str], writes: str):
-        self.reads, self.writes = tuple(reads), (writes,)
-
-    def value(self, *x):
-        return (np.concatenate(x),)
-
-    def jvp(self, x, dx):
-        return self.value(*dx)
-
-    def vjp(self, x, y_adj):
-        return np.split(y_adj[0], np.cumsum([len(part) for part in x])[:-1])
 
 
 class JoinedRows(_Together):
@@ -221,7 +202,7 @@ class FoundationStiffness(Link):
         return self.points.normals_vjp(X, n_adj), self._of_faces(by_c, c), self._of_faces(by_t, t)
 
 
-class FoundationRows(Link):
+class FoundationRows(LinearLink):
     """Rows of K_i of all foundations, shape (3 k, 3) for the k vertices that any of them holds."""
 
     def __init__(self, reads: Sequence[str], vertices: Sequence[np.ndarray], writes: str):
@@ -234,9 +215,6 @@ class FoundationRows(Link):
         for place, part in zip(self.places, x):
             out[place] += part
         return (out.reshape(-1, 3),)
-
-    def jvp(self, x, dx):
-        return self.value(*dx)
 
     def vjp(self, x, y_adj):
         whole = y_adj[0].reshape(-1, 3, 3)

@@ -4,30 +4,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Link
+from diffsim_ti.inputs.chain import LinearLink, Link
 from diffsim_ti.inputs.loads import VertexShares
 
 
-class Displacement(Link):
-    """u = of(x - X), `of` being a symmetric projection onto what the scene can do."""
-
-    reads, writes = ("initial_positions", "rest"), ("displacement",)
-
-    def __init__(self, of: Callable):
-        self.of = of
-
-    def value(self, x, X):
-        return (self.of(x - X),)
-
-    def jvp(self, x, dx):
-        return (self.of(dx[0] - dx[1]),)
-
-    def vjp(self, x, y_adj):
-        u_adj = self.of(y_adj[0])
-        return u_adj, -u_adj
-
-
-class FreeVelocity(Link):
+class FreeVelocity(LinearLink):
     """Velocities without what is held of them: free(v), a projection."""
 
     reads, writes = ("initial_velocities",), ("velocity",)
@@ -37,9 +18,6 @@ class FreeVelocity(Link):
 
     def value(self, v):
         return (self.free(v),)
-
-    def jvp(self, x, dx):
-        return self.value(dx[0])
 
     def vjp(self, x, y_adj):
         return self.value(y_adj[0])
@@ -109,20 +87,17 @@ class NearestPoint(Link):
         return along * n, s * q_adj + along * (p - self.near - 2 * s * n)
 
 
-class Joined(Link):
-    """The numbers of several inputs in one row."""
+class Joined(LinearLink):
+    """The numbers of several inputs in one row, or, with the `tail` of their shapes, rows of such a shape."""
 
-    def __init__(self, reads: Sequence[str], writes: str):
-        self.reads, self.writes = tuple(reads), (writes,)
+    def __init__(self, reads: Sequence[str], writes: str, tail: tuple = ()):
+        self.reads, self.writes, self.tail = tuple(reads), (writes,), tail
 
     def value(self, *x):
-        return (np.concatenate([part.ravel() for part in x]),)
-
-    def jvp(self, x, dx):
-        return self.value(*dx)
+        return (np.concatenate([part.reshape(-1, *self.tail) for part in x]),)
 
     def vjp(self, x, y_adj):
-        ends = np.cumsum([part.size for part in x])[:-1]
+        ends = np.cumsum([part.size for part in x])[:-1] // int(np.prod(self.tail))
         return [row.reshape(part.shape) for row, part in zip(np.split(y_adj[0], ends), x)]
 
 

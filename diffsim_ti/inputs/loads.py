@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Link
+from diffsim_ti.inputs.chain import LinearLink, Link
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.face_points import face_points
 
 
-class InTime(Link):
+class InTime(LinearLink):
     """At the beginning and at the end of each step, shape (2, rows, ...), of an array that is the same all the time or, with
     a leading axis of `ndim` in all, given for each step; `keyed`: for each step's ends instead, linear between."""
 
@@ -25,9 +25,6 @@ class InTime(Link):
             return (np.stack([x[:-1], x[1:]] if len(x) > 1 else [x, x]),)
         rows = x[None] if x.ndim < self.ndim else x
         return (np.stack([rows, rows]),)
-
-    def jvp(self, x, dx):
-        return self.value(dx[0])
 
     def vjp(self, x, y_adj):
         begin, end = y_adj[0]
@@ -151,7 +148,7 @@ class Spread(Link):
         return np.einsum("brki,k->bri", y_adj[0], x[1]), np.einsum("brki,bri->k", y_adj[0], x[0])
 
 
-class _Together(Link):
+class _Together(LinearLink):
     """Several loads in time, each of shape (2, rows, ...); those of one row hold in all steps."""
 
     def __init__(self, reads: Sequence[str], writes: str):
@@ -161,9 +158,6 @@ class _Together(Link):
     def rows(x) -> int:
         """The steps that all are given for, 1 if all are constant."""
         return min((part.shape[1] for part in x if part.shape[1] > 1), default=1)
-
-    def jvp(self, x, dx):
-        return self.value(*dx)
 
     @staticmethod
     def _pulled(part: np.ndarray, adjoint: np.ndarray) -> np.ndarray:

@@ -52,8 +52,9 @@ class Nearest:
         return self.D @ A_adj.T, self.y @ A_adj
 
 
-class RigidDisplacement(Link):
-    """u = of(x - X), of `bodies`, as `Reduced.rigid` has them, that of the nearest rigid motion."""
+class Displacement(Link):
+    """u = of(x - X), `of` being a symmetric projection onto what the scene can do; of `bodies`, as `Reduced.rigid` has them,
+    that of the nearest rigid motion."""
 
     reads, writes = ("initial_positions", "rest"), ("displacement",)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import PAIRS, add_to_diagonal, cofactor, inner, of_six
-from diffsim_ti.materials.law import Law
+from diffsim_ti.materials.law import Law, as_of
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.runtime import let, traced
 
@@ -17,13 +17,11 @@ class GrownLaw(Law):
 
     base: Law | None = None
 
+    lanes = as_of("base", "lanes")
+
     @property
     def coefficient_names(self):
         return ("growth", *self.base.coefficient_names)
-
-    @property
-    def lanes(self):
-        return self.base.lanes
 
     @traced
     def _parts(self, H, p):
@@ -78,13 +76,11 @@ class GrownByStrainLaw(Law):
 
     base: Law | None = None
 
+    lanes = as_of("base", "lanes")
+
     @property
     def coefficient_names(self):
         return (*(f"strain_{'xyz'[i]}{'xyz'[j]}" for i, j in PAIRS), *self.base.coefficient_names)
-
-    @property
-    def lanes(self):
-        return self.base.lanes
 
     @traced
     def _parts(self, H, p):

@@ -7,6 +7,7 @@ import numpy as np
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import SIX, green_strain, green_strain_differential, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
+from diffsim_ti.materials.law import as_of
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.materials.sum_law import SumLaw
 from diffsim_ti.runtime import traced
@@ -54,17 +55,8 @@ class KelvinVoigtLaw(SumLaw):
     def added(self) -> ViscousLaw:
         return ViscousLaw(self.precision, in_step=self.in_step)
 
-    @property
-    def state_names(self):
-        return self.base.state_names
-
-    @property
-    def initial_state(self):
-        return self.base.initial_state
-
-    @property
-    def plastic(self):
-        return self.base.plastic
+    state_names, initial_state = as_of("base", "state_names"), as_of("base", "initial_state")
+    plastic, reads, frozen_names = as_of("base", "plastic"), as_of("added", "reads"), as_of("added", "frozen_names")
 
     @property
     def stored(self):
@@ -73,14 +65,6 @@ class KelvinVoigtLaw(SumLaw):
     @property
     def dissipated(self):
         return self.base.dissipated and replace(self, base=self.base.dissipated)
-
-    @property
-    def reads(self):
-        return self.added.reads
-
-    @property
-    def frozen_names(self):
-        return self.added.frozen_names
 
     def in_steps(self):
         return replace(self, in_step=True)
@@ -123,21 +107,6 @@ class KelvinVoigtLaw(SumLaw):
         dP, by_base = self.base.stress_differential_and_products(x[0], W, p)
         (by_H, by_rate), by_own = self.added.stress_vjp_at(x, W, own)
         return [dP + by_H, by_rate], self._joined(x[0], by_own, by_base)
-
-    # ---- the state of the base ---------------------------------------------------------------------------------------
-
-    @traced
-    def next_state_at(self, H, q, h):
-        return self.base.next_state_at(H, q[2:], h)
-
-    @traced
-    def next_state_jvp(self, H, dH, q, dq, h):
-        return self.base.next_state_jvp(H, dH, q[2:], dq[2:], h)
-
-    @traced
-    def next_state_vjp(self, H, q, h, z_adj):
-        by_H, by_q = self.base.next_state_vjp(H, q[2:], h, z_adj)
-        return by_H, self._joined(H, by_q)
 
 
 class KelvinVoigt(Around):

@@ -9,6 +9,11 @@ from diffsim_ti.common.public import Public
 from diffsim_ti.runtime import number_type, traced
 
 
+def as_of(part: str, name: str) -> property:
+    """What a law around others has as one of them has it, its attribute `part`: a property, or a function of it."""
+    return property(lambda self: getattr(getattr(self, part), name))
+
+
 @dataclass(frozen=True)
 class Law(metaclass=Public):
     """A constitutive formula: Taichi functions of one displacement gradient H = grad u (F = I + H), a `Tensor`.

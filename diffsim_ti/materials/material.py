@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from typing_extensions import TypeAliasType
 
 from diffsim_ti.common.answers import answered
+from diffsim_ti.common.checked import shape_of
 from diffsim_ti.common.names import nearest
 from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
@@ -281,6 +282,15 @@ class Coefficients(Link):
 
     def vjp(self, x, y_adj):
         return tuple(self.material.coefficients_vjp(dict(zip(self.reads, x)), y_adj[0]).values())
+
+
+def number_of_terms(kind: str, each: str, **vectors) -> int:
+    """How many numbers two vectors have that need one for each of some terms; ValueError where they differ."""
+    firsts = {name: next(iter(x.values())) if isinstance(x, dict) and x else x for name, x in vectors.items()}
+    (a, b), names = (shape_of(name, x) for name, x in firsts.items()), " and ".join(vectors)
+    if not (a and b and a[-1] == b[-1] and a[-1]):
+        raise ValueError(f"{kind}: {names} need one number for each {each}, got shapes {a} and {b}")
+    return a[-1]
 
 
 def summed(adjoint: np.ndarray, value, shape: tuple = ()) -> np.ndarray:

@@ -39,8 +39,3 @@ def bulk_modulus(mu, lam):
 def pressure_wave_speed(mu, lam, density):
     """c_p = sqrt((lam + 2 mu) / rho) [m/s]."""
     return np.sqrt((lam + 2 * mu) / density)
-
-
-def shear_wave_speed(mu, density):
-    """c_s = sqrt(mu / rho) [m/s]."""
-    return np.sqrt(mu / density)

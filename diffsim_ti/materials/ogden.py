@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.common.checked import shape_of
 from diffsim_ti.differentiation import expm1_minus_x
 from diffsim_ti.materials.calculus.isochoric import isochoric
 from diffsim_ti.materials.calculus.stretches import sum_over_stretches
 from diffsim_ti.materials.calculus.tensor import invariants
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, PerTetrahedron, check_range, summed
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range, number_of_terms, summed
 
 
 @dataclass(frozen=True)
@@ -52,13 +51,7 @@ class Ogden(Material):
     units = {"exponents": "-"}
 
     def __init__(self, moduli: PerTetrahedron, exponents: PerTetrahedron, bulk_modulus: PerTetrahedron):
-        firsts = [next(iter(x.values())) if isinstance(x, dict) and x else x for x in (moduli, exponents)]
-        of_terms = [shape_of(name, x) for name, x in zip(("moduli", "exponents"), firsts)]
-        if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:
-            raise ValueError(
-                f"Ogden: moduli and exponents need one number for each term, got shapes {of_terms[0]} and {of_terms[1]}"
-            )
-        self.terms = of_terms[0][-1]
+        self.terms = number_of_terms("Ogden", "term", moduli=moduli, exponents=exponents)
         self.shapes = {"moduli": (self.terms,), "exponents": (self.terms,)}
         super().__init__(moduli=moduli, exponents=exponents, bulk_modulus=bulk_modulus)
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from diffsim_ti.materials.calculus.tensor import sum_of
-from diffsim_ti.materials.law import Law
+from diffsim_ti.materials.law import Law, as_of
 from diffsim_ti.runtime import let, traced
 
 
@@ -32,29 +32,15 @@ class PatchLaw(Law):
                 'write theta(H) and make lam its last coefficient, or take volume="tetrahedra"'
             )
 
-    @property
-    def coefficient_names(self) -> tuple:
-        return self.base.coefficient_names
-
-    @property
-    def state_names(self) -> tuple:
-        return self.base.state_names
-
-    @property
-    def initial_state(self) -> tuple:
-        return self.base.initial_state
-
-    @property
-    def plastic(self) -> bool:
-        return self.base.plastic
+    coefficient_names, state_names = as_of("base", "coefficient_names"), as_of("base", "state_names")
+    initial_state, plastic, lanes = as_of("base", "initial_state"), as_of("base", "plastic"), as_of("base", "lanes")
+    # of q = [*p, *z]: no pressure moves the state on
+    next_state_at, next_state_jvp = as_of("base", "next_state_at"), as_of("base", "next_state_jvp")
+    next_state_vjp = as_of("base", "next_state_vjp")
 
     @property
     def stored(self) -> "PatchLaw":
         return replace(self, base=self.base.stored)
-
-    @property
-    def lanes(self) -> bool:
-        return self.base.lanes
 
     @traced
     def split(self, p) -> tuple:
@@ -103,16 +89,3 @@ class PatchLaw(Law):
         P, (dP,), products = self.base.stress_and_vjp_at(x, W, q[:-1])
         G, turned = self.base.dilatation_gradient(*x), self.base.dilatation_gradient_differential(*x, W)
         return P + G * q[-1], [dP + turned * q[-1]], products
-
-    @traced
-    def next_state_at(self, H, q, h):
-        """q = [*p, *z]: no pressure moves the state on."""
-        return self.base.next_state_at(H, q, h)
-
-    @traced
-    def next_state_jvp(self, H, dH, q, dq, h):
-        return self.base.next_state_jvp(H, dH, q, dq, h)
-
-    @traced
-    def next_state_vjp(self, H, q, h, z_adj):
-        return self.base.next_state_vjp(H, q, h, z_adj)

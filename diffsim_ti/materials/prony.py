@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.common.checked import shape_of
 from diffsim_ti.differentiation import exp
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import SIX, green_strain, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range, number_of_terms
 from diffsim_ti.materials.sum_law import SumLaw
 
 
@@ -78,13 +77,7 @@ class Prony(Around):
     units = {"prony_shares": "-", "prony_times": "s"}
 
     def __init__(self, material: Material, shares: PerTetrahedron, times: PerTetrahedron):
-        firsts = [next(iter(x.values())) if isinstance(x, dict) and x else x for x in (shares, times)]
-        of_terms = [shape_of(name, x) for name, x in zip(("shares", "times"), firsts)]
-        if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:
-            raise ValueError(
-                f"Prony: shares and times need one number for each branch, got shapes {of_terms[0]} and {of_terms[1]}"
-            )
-        self.terms = of_terms[0][-1]
+        self.terms = number_of_terms("Prony", "branch", shares=shares, times=times)
         self.shapes = {"prony_shares": (self.terms,), "prony_times": (self.terms,)}
         self._surround(material, dict(prony_shares=shares, prony_times=times))
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from diffsim_ti.materials.calculus.tensor import sum_of
-from diffsim_ti.materials.law import Law
+from diffsim_ti.materials.law import Law, as_of
 from diffsim_ti.runtime import let, traced
 
 
@@ -25,34 +25,15 @@ class SumLaw(Law):
     def coefficient_names(self):
         return (*self.added.coefficient_names, *self.base.coefficient_names)
 
-    @property
-    def state_names(self):
-        return self.added.state_names
-
-    @property
-    def lanes(self):
-        return self.base.lanes
+    state_names, lanes = as_of("added", "state_names"), as_of("base", "lanes")
+    has_dilatation = as_of("base", "has_dilatation")
+    dilatation, dilatation_gradient = as_of("base", "dilatation"), as_of("base", "dilatation_gradient")
+    dilatation_gradient_differential = as_of("base", "dilatation_gradient_differential")
 
     @property
     def last_without_lam(self):
         factors = self.base.last_without_lam
         return (0,) * len(self.added.coefficient_names) + tuple(factors) if factors else ()
-
-    @property
-    def has_dilatation(self):
-        return self.base.has_dilatation
-
-    @traced
-    def dilatation(self, H):
-        return self.base.dilatation(H)
-
-    @traced
-    def dilatation_gradient(self, H):
-        return self.base.dilatation_gradient(H)
-
-    @traced
-    def dilatation_gradient_differential(self, H, dH):
-        return self.base.dilatation_gradient_differential(H, dH)
 
     @traced
     def _parts(self, q):
@@ -99,16 +80,25 @@ class SumLaw(Law):
         of_terms = [law.stress_differential_and_products(H, dH, p) for law, p in self._terms(q)]
         return sum_of(dP for dP, _ in of_terms), self._joined(H, *(products for _, products in of_terms))
 
+    @property
+    def _remembers(self) -> int:
+        """Which of both has the state: 0 what is added, 1 the base."""
+        return int(not self.added.state_names)
+
     @traced
     def next_state_at(self, H, q, h):
-        return self.added.next_state_at(H, self._parts(q)[0], h)
+        k = self._remembers
+        return (self.added, self.base)[k].next_state_at(H, self._parts(q)[k], h)
 
     @traced
     def next_state_jvp(self, H, dH, q, dq, h):
-        return self.added.next_state_jvp(H, dH, self._parts(q)[0], self._parts(dq)[0], h)
+        k = self._remembers
+        return (self.added, self.base)[k].next_state_jvp(H, dH, self._parts(q)[k], self._parts(dq)[k], h)
 
     @traced
     def next_state_vjp(self, H, q, h, z_adj):
-        by_H, by_added = self.added.next_state_vjp(H, self._parts(q)[0], h, z_adj)
-        zero = let(H[0, 0] * 0)
-        return by_H, self._joined(H, by_added, [zero] * len(self.base.coefficient_names))
+        k = self._remembers
+        by_H, by_own = (self.added, self.base)[k].next_state_vjp(H, self._parts(q)[k], h, z_adj)
+        return by_H, self._joined(
+            H, *((by_own,) if k else (by_own, [let(H[0, 0] * 0)] * len(self.base.coefficient_names)))
+        )

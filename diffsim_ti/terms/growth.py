@@ -1,5 +1,7 @@
 """Growth over time: what each tetrahedron's rest state has grown by, while a run goes on."""
 
+from functools import partial
+from operator import lt
 from typing import Literal
 
 import numpy as np
@@ -12,12 +14,7 @@ from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.over_time import OfTetrahedra, OverTime
 from diffsim_ti.terms.term import Term, nonempty
 
-
-def _beyond(x: np.ndarray) -> np.ndarray:
-    return x > -1
-
-
-BEYOND = Range("> -1, which leaves nothing of the body", _beyond)
+BEYOND = Range("> -1, which leaves nothing of the body", partial(lt, -1))
 
 
 class Growth(OfTetrahedra, Term):
@@ -53,7 +50,7 @@ class Growth(OfTetrahedra, Term):
         described, _ = self._take("growth", growth, "growth_over_time", tetrahedra, per)
         own = {name: getattr(described, name) for name in ("name", "value", "shapes", "unit", "plain", "label")}
         super().__init__(Input(**own, range=BEYOND), name=name)
-        if self.keyed and not np.all(_beyond(self.rows([0.0]))):
+        if self.keyed and not np.all(BEYOND.holds(self.rows([0.0]))):
             raise ValueError(f"Growth: growth must be {BEYOND.words}")
 
     @property

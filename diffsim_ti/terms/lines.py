@@ -9,7 +9,7 @@ from typing_extensions import TypeAliasType
 from diffsim_ti.common.checked import numbers, present
 from diffsim_ti.common.public import Public
 from diffsim_ti.inputs import Input, Link
-from diffsim_ti.inputs.description import Range, length
+from diffsim_ti.inputs.description import Range, at_least_0, length
 from diffsim_ti.inputs.lines import LineRows, Segments
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
@@ -18,12 +18,7 @@ from diffsim_ti.terms.marks import Lines, Points
 from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
 from diffsim_ti.terms.term import OnMesh, Term
 
-
-def _at_least_0(x):
-    return x >= 0
-
-
-AT_LEAST_0 = Range(">= 0", _at_least_0, in_runs=False)  # differences about 0 step below it
+AT_LEAST_0 = Range(">= 0", at_least_0, in_runs=False)  # differences about 0 step below it
 
 
 class Anchor(metaclass=Public):

@@ -5,16 +5,12 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.rows import indices
 from diffsim_ti.inputs import Input, Range
+from diffsim_ti.inputs.description import at_least_0
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.term import Term, nonempty
 
-
-def _not_negative(x: np.ndarray) -> np.ndarray:
-    return x >= 0
-
-
-AT_LEAST_0 = Range(">= 0", _not_negative)
+AT_LEAST_0 = Range(">= 0", at_least_0)
 
 
 class SurfaceDrag(Term):

@@ -5,7 +5,8 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.inputs.lines import FoundationRows, JoinedRows, JoinedSegments
+from diffsim_ti.inputs.lines import FoundationRows, JoinedRows
+from diffsim_ti.inputs.links import Joined
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.lines.foundations import FoundationForce, FoundationOnHost
 from diffsim_ti.mechanics.lines.line_force import LineForce
@@ -50,7 +51,7 @@ class SpringsAndCables(Interaction):
 
     def links(self, own):
         rows, segments = ([f"{own[t]} {part}" for t in self.terms] for part in ("rows", "segments"))
-        return [JoinedRows(rows, "lines"), JoinedSegments(segments, "line_segments")]
+        return [JoinedRows(rows, "lines"), Joined(segments, "line_segments", (3,))]
 
     @cached_property
     def topology(self):
