@@ -25,7 +25,7 @@ from quadratic_meshes import (
 from scipy.spatial import cKDTree
 
 from diffsim_ti.mesh import TetrahedralMesh, jacobian
-from diffsim_ti.mesh.description import lowest_jacobian
+from diffsim_ti.mesh.jacobian import lowest_jacobian
 from diffsim_ti.mesh.reference_element import QUADRATIC, quadrature
 from diffsim_ti.visual.colouring import to_vertices
 from diffsim_ti.visual.frame import Frame, Setting

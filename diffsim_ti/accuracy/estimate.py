@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 
 LARGE = 0.2  # of the number's change: beyond it an estimate to first order gives way to the solution that it is about
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
-PER_VERTEX = (
-    "positions",
-    "velocities",
-    "displacements",
-)  # outputs that count the vertices, of which a finer mesh has more
+PER_VERTEX = ("positions", "velocities", "displacements")  # outputs that count vertices, of which a finer mesh has more
 
 
 @dataclass(repr=False)

@@ -21,7 +21,6 @@ from diffsim_ti.cli.config import write_options
 from diffsim_ti.cli.fit import fit
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.selftest import selftest
-from diffsim_ti.cli.study import sweep
 from diffsim_ti.common import interrupts
 from diffsim_ti.common.progress import LOG
 from diffsim_ti.materials import StableNeoHookean
@@ -44,19 +43,8 @@ app = typer.Typer(
     "in one line on stderr; 130 interrupted.",
 )
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
-for command in (
-    study.chart,
-    study.stability,
-    study.growth,
-    study.recommend,
-    sweep,
-    view.render,
-    view.view,
-    identify,
-    fit,
-    check,
-    selftest,
-):
+measuring = study.chart, study.stability, study.growth, study.recommend, study.sweep, identify, fit, check, selftest
+for command in (*measuring, view.render, view.view):
     app.command()(command)
 
 

@@ -254,16 +254,10 @@ def forces_named(names: Sequence[str], scene: Scene) -> list[Output]:
 
 def works_on(scene: Scene, explicit: bool) -> list[str]:
     """What may do work on a body, or take energy from it, in words."""
-    rough = any(getattr(term, "has_friction", False) for term in scene.terms)
-    touched = explicit and any(term.acts_on_surface for term in scene.terms)
-    known = {
-        "friction": rough,
-        "contact damping": touched,
-        "drag": scene.term(Drag) is not None,
-        "viscosity": scene.law.viscous or bool(scene.law.state_names),
-        "motion of supports": scene.motion is not None,
-        "motion of obstacles": bool(scene.moving),
-    }
+    known = {"friction": any(getattr(term, "has_friction", False) for term in scene.terms)}
+    known["contact damping"] = explicit and any(term.acts_on_surface for term in scene.terms)
+    known |= {"drag": scene.term(Drag) is not None, "viscosity": scene.law.viscous or bool(scene.law.state_names)}
+    known |= {"motion of supports": scene.motion is not None, "motion of obstacles": bool(scene.moving)}
     found = [what for what, acts in known.items() if acts] + [x.works for x in scene.interactions if x.works]
     return list(dict.fromkeys(found))
 

@@ -11,28 +11,17 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import shown
 from diffsim_ti.common.progress import progress as progress_bar
 from diffsim_ti.common.public import public
+from diffsim_ti.identification import search as searching
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.mesh_check import mesh_check
 from diffsim_ti.identification.modal_test import ModalTest
 from diffsim_ti.identification.problem import Problem, is_experiment
 from diffsim_ti.identification.result import Identification, Information, MeshCheck, described
-from diffsim_ti.identification.search import (
-    DENSE,
-    FAILURES,
-    STOPPED,
-    Ended,
-    Search,
-    around,
-    further_starts,
-    l_bfgs_b,
-    levenberg_marquardt,
-    torch_descent,
-)
-from diffsim_ti.identification.unknowns import Priors
+from diffsim_ti.identification.search import DENSE, FAILURES, METHODS, STOPPED, Ended, Search
+from diffsim_ti.identification.unknowns import TIME_OFFSET, Priors
 from diffsim_ti.rollout import Rollout
 
 FAR, AT_MOST = 3.0, 4  # residuals over the noise beyond which further starts are tried, and how many
-METHODS = {"Levenberg-Marquardt": levenberg_marquardt, "L-BFGS-B": l_bfgs_b}
 
 
 @public
@@ -94,7 +83,7 @@ def identify(
     if not callable(method) and method not in METHODS:
         known = f"{', '.join(METHODS)} or a function that makes a torch optimiser"
         raise ValueError(f"identify: method must be {known}, got {shown(method)}")
-    go_on = partial(torch_descent, method) if callable(method) else METHODS[method]
+    go_on = partial(searching.torch_descent, method) if callable(method) else METHODS[method]
     several = not is_experiment(rollout)
     rollouts = list(rollout) if several else [rollout]
     noises = noise if several and isinstance(noise, list | tuple) else [noise] * len(rollouts)
@@ -103,7 +92,7 @@ def identify(
     if method != "Levenberg-Marquardt" or problem.size > DENSE:
         problem.check_gradients()
     priors = Priors(prior, problem.unknowns, rollouts[0].scene.mesh)
-    further = AT_MOST if starts is None else further_starts(problem, starts)
+    further = AT_MOST if starts is None else searching.further_starts(problem, starts)
     most, with_covariance = max_iterations, problem.size <= DENSE if covariance is None else covariance
     searches = []
 
@@ -125,7 +114,7 @@ def identify(
         more = search(lambda: Search(problem, priors, resume), show)
         first, why, _ = searches[0]
         if more and (starts is not None or (not why.startswith("stopped") and _is_far(first, FAR))):
-            for start in further if isinstance(further, list) else around(problem, priors, further):
+            for start in further if isinstance(further, list) else searching.around(problem, priors, further):
                 with suppress(*FAILURES):  # numbers that end its first run
                     more = search(lambda start=start: Search(problem, priors, None, start, len(searches)), show)
                 if not more or (starts is None and not _is_far(searches[-1][0], 1.0)):
@@ -162,20 +151,7 @@ def _result(searches: list[tuple[Search, str, bool]], best: int, with_covariance
         mesh = mesh_check(search, J, found, check_mesh)
         more = described(problem, t, found, 0.0 if mesh.shifts is None else mesh.shifts)
         settled = found.seen_share
-    return Identification(
-        problem.numbers(t),
-        problem.labels,
-        problem.all_numbers(t),
-        residual,
-        search.chi_square,
-        max(len(residual) - settled, 0.0),
-        simulations,
-        stopped,
-        converged,
-        search.report,
-        [{k: x for k, x in problem.inputs(e, t).items() if k != "time_offset"} for e in range(len(problem.rollouts))],
-        search.state,
-        starts,
-        mesh,
-        **more,
-    )
+    inputs = [{k: x for k, x in problem.inputs(e, t).items() if k != TIME_OFFSET} for e in range(len(problem.rollouts))]
+    numbers, degrees = (problem.numbers(t), problem.labels, problem.all_numbers(t)), max(len(residual) - settled, 0.0)
+    how = simulations, stopped, converged, search.report, inputs, search.state, starts, mesh
+    return Identification(*numbers, residual, search.chi_square, degrees, *how, **more)

@@ -244,6 +244,9 @@ def l_bfgs_b(search: Search, record: Callable, tolerance: float) -> tuple[str, b
     return f"L-BFGS-B finds no lower cost ({found.message})", False
 
 
+METHODS = {"Levenberg-Marquardt": levenberg_marquardt, "L-BFGS-B": l_bfgs_b}
+
+
 def torch_descent(make: Callable, search: Search, record: Callable, tolerance: float) -> tuple[str, bool]:
     """(why it stopped, whether it converged: the last iterations lowered the cost by less than tolerance^2 per unknown)"""
     import torch

@@ -198,13 +198,10 @@ class Inputs:
         """Those of the body, of its material, of the terms, and what joins the terms' numbers and paths."""
         mesh, scene, places = self.mesh, self.scene, {}
         shift = np.zeros(max(self.parameters.total, 1))
-        out = [
-            RestShape(mesh),
-            *self.start_links(),
-            links.LumpedMass(mesh, scene.mass_scaling.factors if scene.mass_scaling else None),
-            *([ElementMasses(mesh.elements)] if scene.consistent else []),
-            *scene.material.links(),
-        ]
+        factors = scene.mass_scaling.factors if scene.mass_scaling else None
+        out = [RestShape(mesh), *self.start_links(), links.LumpedMass(mesh, factors)]
+        out += [ElementMasses(mesh.elements)] if scene.consistent else []
+        out += scene.material.links()
         if any(term.acts_on_surface for term in scene.terms):
             out.append(SurfaceAreas(mesh))
         all_own = {term: f"parameters of term {k}" for k, term in enumerate(scene.ordered_terms)}

@@ -189,19 +189,9 @@ class J2Plasticity(Material):
         # coefficients are mu, these and the bulk modulus
         self.from_own = np.eye(len(own) + 2)[[0, *range(2, len(own) + 2), 1]]
         self.from_own[-1, 0] = 2 / 3
-        super().__init__(
-            youngs_modulus,
-            poissons_ratio,
-            yield_stress,
-            hardening=hardening,
-            saturation_stress=saturation_stress,
-            saturation_exponent=saturation_exponent,
-            kinematic_hardening=kinematic_hardening,
-            E=E,
-            nu=nu,
-            mu=mu,
-            lam=lam,
-        )
+        beyond = dict(saturation_stress=saturation_stress, saturation_exponent=saturation_exponent)
+        named = dict(hardening=hardening, kinematic_hardening=kinematic_hardening, E=E, nu=nu, mu=mu, lam=lam)
+        super().__init__(youngs_modulus, poissons_ratio, yield_stress, **beyond, **named)
 
     def check(self, values):
         super().check(values)

@@ -104,13 +104,8 @@ class Orthotropic(Material):
         """Three Young's moduli, Poisson's ratios 12, 23, 13 and shear moduli 23, 13, 12, and two directions."""
         a = np.asarray(x["direction_1"])
         if "E3" in x:
-            return (
-                [x[f"E{k}"] for k in (1, 2, 3)],
-                [x["nu12"], x["nu23"], x["nu13"]],
-                [x["G23"], x["G13"], x["G12"]],
-                a,
-                np.asarray(x["direction_2"]),
-            )
+            E, nu, G = ([x[n] for n in names.split()] for names in ("E1 E2 E3", "nu12 nu23 nu13", "G23 G13 G12"))
+            return E, nu, G, a, np.asarray(x["direction_2"])
         across = x["E2"] / (2 * (1 + x["nu23"]))
         aside = np.eye(3)[np.argmin(np.abs(a), -1)]  # any direction that is not along the axis
         return [x["E1"], x["E2"], x["E2"]], [x["nu12"], x["nu23"], x["nu12"]], [across, x["G12"], x["G12"]], a, aside
@@ -118,9 +113,8 @@ class Orthotropic(Material):
     def _stiffness(self, x: dict) -> np.ndarray:
         """C of (11, 22, 33, 23, 13, 12), shear strains doubled, in the material's directions; x may be complex."""
         E, nu, G, _, _ = self._expanded(x)
-        S = np.zeros(
-            (*np.broadcast_shapes(*(np.shape(one) for one in (*E, *nu, *G))), 6, 6), np.result_type(*E, *nu, *G)
-        )
+        shape = np.broadcast_shapes(*(np.shape(one) for one in (*E, *nu, *G)))
+        S = np.zeros((*shape, 6, 6), np.result_type(*E, *nu, *G))
         for k in range(3):
             S[..., k, k], S[..., k + 3, k + 3] = 1 / E[k], 1 / G[k]
         for (i, j), ratio in zip(((0, 1), (1, 2), (0, 2)), nu):

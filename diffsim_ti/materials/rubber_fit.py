@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -143,16 +144,9 @@ def fitted(law: str, count: int, curves: Sequence[Curve], top: float) -> np.ndar
     def spread(u):
         return np.array([np.exp(u[0]), least + np.exp(u[1])])
 
-    runs = [
-        least_squares(
-            lambda u: weighted_residuals(law, spread(u), curves),
-            [np.log(largest), np.log(f * least)],
-            bounds=([-30, -30], [40, 30]),
-            x_scale="jac",
-            max_nfev=200,
-        )
-        for f in (0.03, 0.3)
-    ]
+    how = dict(bounds=([-30, -30], [40, 30]), x_scale="jac", max_nfev=200)
+    starts = ([np.log(largest), np.log(f * least)] for f in (0.03, 0.3))
+    runs = [least_squares(lambda u: weighted_residuals(law, spread(u), curves), start, **how) for start in starts]
     return spread(min(runs, key=lambda run: run.cost).x)
 
 
@@ -169,13 +163,8 @@ def _fitted_ogden(terms: int, curves: Sequence[Curve], top: float, target: np.nd
     guess = next((p for p in guesses if is_stable("Ogden", p, top)), guesses[0])
     unit = np.maximum(np.abs(guess), 1e-9 * np.abs(guess[:terms]).max())
     most = np.array(terms * [np.inf] + terms * [12.0])
-    run = least_squares(
-        lambda u: weighted_residuals("Ogden", u * unit, curves),
-        guess / unit,
-        bounds=(-most / unit, most / unit),
-        x_scale="jac",
-        max_nfev=200,
-    )
+    how = dict(bounds=(-most / unit, most / unit), x_scale="jac", max_nfev=200)
+    run = least_squares(lambda u: weighted_residuals("Ogden", u * unit, curves), guess / unit, **how)
     return run.x * unit if is_stable("Ogden", run.x * unit, top) else guess
 
 
@@ -229,11 +218,9 @@ def interval_widths(law: str, p: np.ndarray, curves: Sequence[Curve]) -> np.ndar
     estimation, doi:10.1214/aos/1176347263.
     """
     step = 1e-6 * np.abs(p) + 1e-12
-    J = np.stack(
-        [(weighted_residuals(law, p + d, curves) - weighted_residuals(law, p - d, curves)) / 2 for d in np.diag(step)],
-        1,
-    )
-    r, block = weighted_residuals(law, p, curves), np.concatenate([c.blocks(HALVES) for c in curves])
+    r_of = partial(weighted_residuals, law, curves=curves)
+    J = np.stack([(r_of(p + d) - r_of(p - d)) / 2 for d in np.diag(step)], 1)
+    r, block = r_of(p), np.concatenate([c.blocks(HALVES) for c in curves])
     A = np.stack([J[block == b].T @ J[block == b] for b in range(HALVES)])
     g = np.stack([J[block == b].T @ r[block == b] for b in range(HALVES)])
     halves = [list(k) for k in combinations(range(HALVES), HALVES // 2)]
@@ -279,13 +266,6 @@ def fit_rubber(tests: TensileTest | Sequence[TensileTest]) -> dict:
         named(law, x) | {"shear_modulus": float(y)}
         for x, y in ((p, middle[-1]), (low[:-1], low[-1]), (high[:-1], high[-1]))
     )
-    return dict(
-        law=law,
-        numbers=named(law, p),
-        shear_modulus=numbers["shear_modulus"],
-        intervals={key: [lows[key], highs[key]] if np.all(np.isfinite(lows[key])) else None for key in numbers},
-        valid_to=float(top),
-        measured_to=float(end),
-        errors=errors,
-        kept=not missed,
-    )
+    intervals = {key: [lows[key], highs[key]] if np.all(np.isfinite(lows[key])) else None for key in numbers}
+    found = dict(law=law, numbers=named(law, p), shear_modulus=numbers["shear_modulus"], intervals=intervals)
+    return found | dict(valid_to=float(top), measured_to=float(end), errors=errors, kept=not missed)

@@ -17,15 +17,8 @@ from diffsim_ti.mesh.ten_nodes import MIRRORED
 
 KEEPS_SETS = (".msh", ".vtu", ".vtk")
 KEEPS_TEN_NODES = (*KEEPS_SETS, ".inp", ".xdmf")
-READERS: dict[str, Callable[[Path], FileMesh]] = {
-    ".inp": abaqus.read,
-    ".mesh": medit.read,
-    ".ele": tetgen.read,
-    ".node": tetgen.read,
-    ".vtk": vtk_legacy.read,
-    ".vtu": vtk_xml.read,
-    ".pvtu": vtk_xml.read,
-}
+READERS: dict[str, Callable[[Path], FileMesh]] = {".inp": abaqus.read, ".mesh": medit.read, ".vtk": vtk_legacy.read}
+READERS |= dict.fromkeys((".ele", ".node"), tetgen.read) | dict.fromkeys((".vtu", ".pvtu"), vtk_xml.read)
 NASTRAN = (".bdf", ".nas", ".fem")
 
 

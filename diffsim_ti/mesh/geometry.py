@@ -145,12 +145,7 @@ def curve_order(points: np.ndarray) -> np.ndarray:
     """Indices of points, shape (n, 3), in the order of Morton's curve through their bounding box."""
     lowest, size = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
     cells = ((points - lowest) * (2**20 / size)).astype(np.int64).clip(0, 2**20 - 1)
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
+    masks = 0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249
+    for shift, mask in zip((32, 16, 8, 4, 2), masks):
         cells = (cells | (cells << shift)) & mask
     return np.argsort(cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2), kind="stable")

@@ -26,13 +26,10 @@ class Paths:
         """From the (vertices, weights) of each point of each path; an anchor has none."""
         flat = [point for path in points for point in path]
         counts = np.array([len(vertices) for vertices, _ in flat], np.int64)
-        return cls(
-            np.concatenate([[0], np.cumsum([len(path) for path in points], dtype=np.int64)]),
-            np.concatenate([[0], np.cumsum(counts)]),
-            np.concatenate([np.zeros(0, np.int64), *(vertices for vertices, _ in flat)]).astype(np.int64),
-            np.concatenate([np.zeros(0), *(weights for _, weights in flat)]),
-            np.nonzero(counts == 0)[0],
-        )
+        firsts = [np.cumsum([0, *x], dtype=np.int64) for x in (map(len, points), counts)]
+        vertices = np.concatenate([np.zeros(0, np.int64), *(own for own, _ in flat)]).astype(np.int64)
+        weights = np.concatenate([np.zeros(0), *(own for _, own in flat)])
+        return cls(*firsts, vertices, weights, np.nonzero(counts == 0)[0])
 
     @classmethod
     def joined(cls, parts: Sequence["Paths"]) -> "Paths":

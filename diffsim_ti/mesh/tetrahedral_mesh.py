@@ -1,6 +1,7 @@
 """TetrahedralMesh: the rest shape of a soft body. Make, load, save, check, look at."""
 
 import copy
+import hashlib
 import math
 import warnings
 from collections.abc import Iterable, Mapping
@@ -15,25 +16,15 @@ from diffsim_ti.common.checked import instance, listed
 from diffsim_ti.common.origin import warn_of_rounding
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.common.warn import warn
-from diffsim_ti.mesh import checks, geometry
-from diffsim_ti.mesh.description import content_hash, describe
-from diffsim_ti.mesh.doctor import (
-    COINCIDING,
-    Findings,
-    coinciding,
-    coinciding_of_pieces,
-    counted,
-    findings,
-    hinges,
-    is_manifold,
-)
+from diffsim_ti.mesh import checks, doctor, geometry
 from diffsim_ti.mesh.elements import Elements
 from diffsim_ti.mesh.exchange import Exchange
 from diffsim_ti.mesh.grid import box
+from diffsim_ti.mesh.jacobian import lowest_jacobian
 from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
 from diffsim_ti.mesh.seed_names import SeedNames
-from diffsim_ti.mesh.sets import checked_sets, frozen, join, pieces, rows_on_surface
+from diffsim_ti.mesh.sets import checked_sets, frozen, join, pieces, rows_on_surface, sizes
 from diffsim_ti.mesh.ten_nodes import edges_of
 
 CONNECTIVITY = (  # what stays when vertices move
@@ -91,14 +82,14 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
         self._surface_sets = checked_sets(on_surface, len(self._surface_triangles), "surface")
         checks.warn_of_orphans(self.unused_vertices)
         checks.warn_of_slivers(self)
-        if twice := coinciding_of_pieces(self.vertices, self.elements):
+        if twice := doctor.coinciding_of_pieces(self.vertices, self.elements):
             warn(
-                f"{counted(twice, 'vertex coincides', 'vertices coincide')} with others of another piece "
+                f"{doctor.counted(twice, 'vertex coincides', 'vertices coincide')} with others of another piece "
                 f"({self.num_pieces} pieces): if these are one body, take mesh.merged(); where they are meant to touch, "
                 "TetrahedralMesh.joined says so"
             )
-        if not is_manifold(self.surface_faces[:, :3]):
-            for hinge in hinges(self.elements, self.num_vertices):
+        if not doctor.is_manifold(self.surface_faces[:, :3]):
+            for hinge in doctor.hinges(self.elements, self.num_vertices):
                 warn(str(hinge))
         warn_of_rounding("vertices", given, self, "give them in float64")
 
@@ -286,10 +277,10 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
         faces have the same nodes become one body. Sets are kept. ValueError where a tetrahedron would lose a vertex."""
         size = float(np.ptp(self.bounding_box, 0).max())
         if tolerance is None:
-            tolerance = COINCIDING * size
+            tolerance = doctor.COINCIDING * size
         if not (np.isfinite(tolerance) and tolerance > 0):
             raise ValueError(f"tolerance must be a length above 0 [m], got {tolerance!r}")
-        first = coinciding(self.vertices, tolerance)
+        first = doctor.coinciding(self.vertices, tolerance)
         kept, place = np.unique(first, return_inverse=True)
         triangles = {name: place[self.surface_triangles[rows]] for name, rows in self.surface_sets.items()}
         sets = {name: np.unique(place[rows]) for name, rows in self.vertex_sets.items()}
@@ -324,17 +315,41 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
 
     # Describing
 
-    def check(self) -> Findings:
+    def check(self) -> doctor.Findings:
         """What may be wrong with it, with a remedy for each: nodes that coincide, faces that touch without common nodes,
         hinges, slivers and what they cost, vertices in no tetrahedron, sets that are empty or overlap, lengths that look
         like millimetres, and float32 far from the origin. `print(mesh.check())` lists them; the command
         `diffsim-ti check body.msh` does so of files, those that are refused too."""
         sets = {name: self.surface_triangles[rows] for name, rows in self.surface_sets.items()}
-        return findings((self.vertices, self.elements, self.vertex_sets, self.tetrahedron_sets, sets))
+        return doctor.findings((self.vertices, self.elements, self.vertex_sets, self.tetrahedron_sets, sets))
 
     def describe(self) -> str:
         """Counts, size, edge lengths, worst tetrahedron, sets; a few lines."""
-        return describe(self)
+        low, high = self.bounding_box
+        edges = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)
+        worst, thin, orphans = int(np.argmin(self.quality)), int(np.argmin(self.altitudes.min(1))), self.unused_vertices
+        unused, pieces = f" ({len(orphans)} unused)" if len(orphans) else "", doctor.counted(self.num_pieces, "piece")
+        start, end = (", ".join(f"{value:.6g}" for value in corner) for corner in (low, high))
+        lines = [
+            f"TetrahedralMesh: {self.num_vertices} vertices{unused}, {self.num_tetrahedra} tetrahedra, {pieces}",
+            f"surface: {len(self.surface_triangles)} triangles, {len(self.surface_vertices)} vertices",
+            f"size: {' x '.join(f'{d:.6g}' for d in high - low)} m, from ({start}) to ({end})",
+            f"volume: {self.volume:.6g} m^3",
+            f"edges: {edges.min():.4g} to {edges.max():.4g} m, mean {edges.mean():.4g} m",
+            f"worst quality: {self.quality[worst]:.3g} in tetrahedron {worst}; mean {self.quality.mean():.3g} of 1",
+            f"smallest altitude: {self.altitudes[thin].min():.4g} m in tetrahedron {thin}",
+            f"vertex sets: {sizes(self.vertex_sets)}",
+            f"tetrahedron sets: {sizes(self.tetrahedron_sets)}",
+            f"surface sets: {sizes(self.surface_sets)}",
+        ]
+        if self.order == 2:
+            text, more = f"{len(self.corners)} corners, {len(self.middles)} mid-edge vertices", ", straight edges"
+            if self.curved.any():
+                J = lowest_jacobian(self)
+                bound = f"lowest bound of J over its mean {J.min():.3g} in tetrahedron {int(np.argmin(J))}"
+                more = f"; {self.curved.sum()} are curved, {bound}"
+            lines.insert(4, f"ten-node tetrahedra: {text}{more}")
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         size = " x ".join(f"{d:.4g}" for d in np.ptp(self.bounding_box, 0))
@@ -343,7 +358,10 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
     @cached_property
     def content_hash(self) -> str:
         """SHA-256 of vertices and tetrahedra, 64 hexadecimal digits; sets do not count. The same on every machine."""
-        return content_hash(self)
+        digest = hashlib.sha256(np.array([self.num_vertices, self.num_tetrahedra], "<i8").tobytes())
+        digest.update(self.vertices.astype("<f8").tobytes())
+        digest.update(self.elements.astype("<i8").tobytes())
+        return digest.hexdigest()
 
     def _changed(self, **parts) -> "TetrahedralMesh":
         new = copy.copy(self)

@@ -361,28 +361,19 @@ class Scene(MadeAgain):
     def describe(self) -> str:
         """What is simulated, in a few lines."""
         mass, terms = self.inputs.derive(self.inputs.values).mass.sum(), ", ".join(map(repr, self.terms)) or "none"
-        chosen = [
-            f"chosen from weight and speed: stiffness per area {float(t.values[PER_AREA]):.4g} N/m^3 of {type(t).__name__}"
-            for t in self.terms
-            if isinstance(t, Obstacle) and t.chooses_stiffness
-        ]
-        by_pairs = [type(t).__name__ for t in self.terms if t.primitives is not None]
-        return "\n".join(
-            [
-                f"{self.mesh!r}",
-                f"{self.material!r}" + (", volume averaged over patches" if self.volume == "patches" else ""),
-                f"mass {mass:.6g} kg, precision {self.precision}",
-                f"terms: {terms}",
-                *([str(self.mass_scaling)] if self.mass_scaling else []),
-                f"fixed vertices: {len(self.fixed)}"
-                + (f", in some directions {len(self.supports.partly_fixed)}" if len(self.supports.partly_fixed) else "")
-                + (", moving" if self.motion is not None else ""),
-                *([f"moving by few numbers: {self.reduced.describe()}"] if self.reduced else []),
-                *chosen,
-                *([f"by pairs, also between vertices: {', '.join(by_pairs)}"] if by_pairs else []),
-                "inputs: " + ", ".join(f"{name}{i.in_brackets}" for name, i in self.inputs.described.items()),
-            ]
-        )
+        patches, partly = ", volume averaged over patches" * (self.volume == "patches"), len(self.supports.partly_fixed)
+        lines = [f"{self.mesh!r}", f"{self.material!r}{patches}", f"mass {mass:.6g} kg, precision {self.precision}"]
+        lines += [f"terms: {terms}", *([str(self.mass_scaling)] if self.mass_scaling else [])]
+        fixed = f"fixed vertices: {len(self.fixed)}" + (f", in some directions {partly}" if partly else "")
+        lines.append(fixed + (", moving" if self.motion is not None else ""))
+        lines += [f"moving by few numbers: {self.reduced.describe()}"] if self.reduced else []
+        for t in (t for t in self.terms if isinstance(t, Obstacle) and t.chooses_stiffness):
+            said = f"stiffness per area {float(t.values[PER_AREA]):.4g} N/m^3 of {type(t).__name__}"
+            lines.append(f"chosen from weight and speed: {said}")
+        by_pairs = ", ".join(type(t).__name__ for t in self.terms if t.primitives is not None)
+        lines += [f"by pairs, also between vertices: {by_pairs}"] if by_pairs else []
+        inputs = ", ".join(f"{name}{i.in_brackets}" for name, i in self.inputs.described.items())
+        return "\n".join([*lines, f"inputs: {inputs}"])
 
     def __repr__(self) -> str:
         return f"Scene({self.mesh!r}, {self.material!r}, terms=[{', '.join(map(repr, self.terms))}])"

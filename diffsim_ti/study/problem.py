@@ -13,12 +13,8 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 
 # kinds of element: name -> what `Problem.scene` takes: arguments of Scene, and the order of the mesh
-ELEMENTS = {
-    "linear": {},
-    "patches": {"volume": "patches"},
-    "quadratic": {"order": 2},
-    "quadratic, mean dilatation": {"order": 2, "volume": "patches"},
-}
+ELEMENTS = {"linear": {}, "patches": {"volume": "patches"}, "quadratic": {"order": 2}}
+ELEMENTS["quadratic, mean dilatation"] = {"order": 2, "volume": "patches"}
 VARIANTS = ELEMENTS | {"mass scaling": {"mass_scaling": 0.01}}  # of a chart: linear tetrahedra, their mass scaled
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -25,20 +26,10 @@ def oscillator() -> Problem:
         how = dict(initial_positions=mesh.vertices + reach * np.eye(4, 3, -3), precision=precision) | element
         return Scene(mesh, StableNeoHookean(E, 0.0), density, fixed=[0, 1, 2], **how)
 
-    times = np.linspace(0, time, 17)
-    return Problem(
-        "oscillator",
-        "One tetrahedron in shear, closed form",
-        "error of motion",
-        scene,
-        time,
-        lambda frames, _: frames.displacements[:, 3, 0],
-        exact=reach * np.cos(omega * times),
-        scale=reach,
-        cells=(1,),
-        patterns=("one tetrahedron",),
-        levels=9,
-    )
+    said = "oscillator", "One tetrahedron in shear, closed form", "error of motion"
+    exact, mesh = reach * np.cos(omega * np.linspace(0, time, 17)), dict(cells=(1,), patterns=("one tetrahedron",))
+    apex = lambda frames, _: frames.displacements[:, 3, 0]  # noqa: E731
+    return Problem(*said, scene, time, apex, exact=exact, scale=reach, levels=9, **mesh)
 
 
 def lame_mode(X: np.ndarray, a: float = 1.0) -> np.ndarray:
@@ -87,17 +78,9 @@ def lame(nu: float = 0.3) -> Problem:
         q = np.tensordot(frames.displacements.astype(float), lame_share(frames.inputs["rest_positions"]), 2)
         return fit_oscillation(frames.times, q / LAME["reach"], omega)
 
-    return Problem(
-        "lame",
-        f"Lamé mode of a free cube, nu = {nu:g}, closed form",
-        "error of frequency and decay",
-        lambda *args, **more: lame_scene(nu, *args, **more),
-        2 * np.pi / omega,
-        frequency,
-        exact=np.array([omega, 0.0]),
-        cells=(4, 8, 12, 16, 24),
-        elements=("linear", "quadratic"),
-    )
+    said = "lame", f"Lamé mode of a free cube, nu = {nu:g}, closed form", "error of frequency and decay"
+    of, exact, meshes = partial(lame_scene, nu), np.array([omega, 0.0]), dict(cells=(4, 8, 12, 16, 24))
+    return Problem(*said, of, 2 * np.pi / omega, frequency, exact=exact, elements=("linear", "quadratic"), **meshes)
 
 
 def lame_gradient(nu: float = 0.3) -> Problem:
@@ -111,21 +94,11 @@ def lame_gradient(nu: float = 0.3) -> Problem:
     t = np.linspace(0, time, frames + 1)
     window = np.sin(omega * t) * np.sin(np.pi * t / time) ** 2
     exact = -LAME["reach"] * omega / 2 * (window * t * np.sin(omega * t)).sum()
-    loss = FrameLoss(lame_share_by_mass, window, 0 * t, 0 * t)
-    return Problem(
-        "lame-gradient",
-        f"Gradient by E of the Lamé mode, nu = {nu:g}, closed form",
-        "error of the derivative",
-        lambda *args, **more: lame_scene(nu, *args, **more),
-        time,
-        lambda _, gradients: LAME["E"] * np.atleast_1d(gradients["youngs_modulus"]),
-        frames=frames,
-        exact=np.array([exact]),
-        adjoint=loss,
-        inputs=("youngs_modulus",),
-        cells=(4, 8, 12, 16, 24),
-        patterns=("five",),
-    )
+    said = "lame-gradient", f"Gradient by E of the Lamé mode, nu = {nu:g}, closed form", "error of the derivative"
+    of, meshes = partial(lame_scene, nu), dict(cells=(4, 8, 12, 16, 24), patterns=("five",))
+    loss = dict(adjoint=FrameLoss(lame_share_by_mass, window, 0 * t, 0 * t), inputs=("youngs_modulus",))
+    by_E = lambda _, gradients: LAME["E"] * np.atleast_1d(gradients["youngs_modulus"])  # noqa: E731
+    return Problem(*said, of, time, by_E, frames=frames, exact=np.array([exact]), **loss, **meshes)
 
 
 def fit_oscillation(times: np.ndarray, q: np.ndarray, guess: float) -> np.ndarray:
@@ -161,18 +134,9 @@ def tip(frames: Frames, _: object | None = None) -> np.ndarray:
 
 def beam() -> Problem:
     """Large motion of the clamped beam that is let go straight: the path of its end over half a swing."""
-    return Problem(
-        "beam",
-        "Clamped beam let go under its own weight, nu = 0.3",
-        "error of motion, over its reach",
-        lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more),
-        0.5,
-        tip,
-        frames=10,
-        cells=(1, 2, 3, 4, 6, 8),
-        elements=("linear", "patches", "quadratic"),
-        reference_cells=(2, 3, 4),
-    )
+    said = "beam", "Clamped beam let go under its own weight, nu = 0.3", "error of motion, over its reach"
+    meshes = dict(cells=(1, 2, 3, 4, 6, 8), elements=("linear", "patches", "quadratic"), reference_cells=(2, 3, 4))
+    return Problem(*said, partial(beam_scene, SmithNeoHookean), 0.5, tip, frames=10, **meshes)
 
 
 def sag(nu: float = 0.3) -> Problem:
@@ -183,22 +147,13 @@ def sag(nu: float = 0.3) -> Problem:
     E, load, L, H = 1e6, 1000 * 9.81 * 0.04, 1.0, 0.2
     shear = 10 * (1 + nu) / (12 + 11 * nu) * E / (2 * (1 + nu)) * H**2
     drop = load * L**4 / (8 * E * H**4 / 12) + load * L**2 / (2 * shear)
-    return Problem(
-        "sag",
-        f"Clamped beam at rest, small strains, nu = {nu:g}, beam theory",
-        "error of the end's drop",
-        lambda *args, **more: beam_scene(LinearElastic, *args, nu=nu, **more),
-        1.0,
-        lambda frames, _: tip(frames)[-1:, 1],
-        frames=1,
-        exact=np.array([-drop]),
-        cells=(1, 2, 4, 6, 8),
-        elements=("linear", "patches", "quadratic"),
-        static=True,
-    )
+    said = "sag", f"Clamped beam at rest, small strains, nu = {nu:g}, beam theory", "error of the end's drop"
+    of, meshes = partial(beam_scene, LinearElastic, nu=nu), dict(elements=("linear", "patches", "quadratic"))
+    how = meshes | dict(exact=np.array([-drop]), cells=(1, 2, 4, 6, 8), frames=1, static=True)
+    return Problem(*said, of, 1.0, lambda frames, _: tip(frames)[-1:, 1], **how)
 
 
-def bounce_scene(precision: str, speed: float, **element) -> Scene:
+def bounce_scene(speed: float, cells: int, pattern: str, precision: str, **element) -> Scene:
     """A mass of 1 kg that meets a floor at `speed` [m/s] from 5 mm above the barrier: stiffness 1e4 N/m, width 0.01 m.
 
     It is the apex of a tetrahedron too soft to be felt (1e-6 Pa), hanging from three fixed vertices.
@@ -226,7 +181,7 @@ def time_in_contact(speed: float, energy: Callable[[float], float] = barrier_ene
 
 
 BOUNCE_TIME = 0.03  # [s]
-ONE_MASS = dict(cells=(1,), patterns=("one mass",), largest_step=2e-3, levels=9)
+ONE_MASS = dict(cells=(1,), patterns=("one mass",), largest_step=2e-3, levels=9, frames=1)
 
 
 def bounce_height(speed: float, energy: Callable[[float], float] = barrier_energy) -> float:
@@ -236,36 +191,22 @@ def bounce_height(speed: float, energy: Callable[[float], float] = barrier_energ
 
 def bounce(speed: float = 2.0) -> Problem:
     """Bounce on the barrier, by energy: the height after it, in widths of the barrier."""
-    return Problem(
-        "bounce",
-        f"A mass meets a floor at {speed:g} m/s, by energy",
-        "error of height, in barrier widths",
-        lambda cells, pattern, precision, **more: bounce_scene(precision, speed, **more),
-        BOUNCE_TIME,
-        lambda frames, _: frames.inputs["rest_positions"][3, 1] + frames.displacements[-1:, 3, 1].astype(float),
-        frames=1,
-        exact=np.array([bounce_height(speed)]),
-        scale=0.01,
-        **ONE_MASS,
-    )
+    said = "bounce", f"A mass meets a floor at {speed:g} m/s, by energy", "error of height, in barrier widths"
+
+    def height(frames, _):
+        return frames.inputs["rest_positions"][3, 1] + frames.displacements[-1:, 3, 1].astype(float)
+
+    how = ONE_MASS | dict(exact=np.array([bounce_height(speed)]), scale=0.01)
+    return Problem(*said, partial(bounce_scene, speed), BOUNCE_TIME, height, **how)
 
 
 def bounce_gradient(speed: float = 2.0) -> Problem:
     """How the height after the bounce depends on that before: d x / d x0 = -1 exactly."""
     height = lambda mesh: np.eye(4, 3, -3)[:, [1, 0, 2]]  # noqa: E731, of the apex
-    return Problem(
-        "bounce-gradient",
-        f"Gradient through a bounce at {speed:g} m/s, by energy",
-        "error of the derivative",
-        lambda cells, pattern, precision, **more: bounce_scene(precision, speed, **more),
-        BOUNCE_TIME,
-        lambda _, gradients: gradients["initial_positions"][3, 1:2],
-        frames=1,
-        exact=np.array([-1.0]),
-        adjoint=FrameLoss.end(height, 1),
-        inputs=("initial_positions",),
-        **ONE_MASS,
-    )
+    by_height = lambda _, gradients: gradients["initial_positions"][3, 1:2]  # noqa: E731
+    said = "bounce-gradient", f"Gradient through a bounce at {speed:g} m/s, by energy", "error of the derivative"
+    how = ONE_MASS | dict(exact=np.array([-1.0]), adjoint=FrameLoss.end(height, 1), inputs=("initial_positions",))
+    return Problem(*said, partial(bounce_scene, speed), BOUNCE_TIME, by_height, **how)
 
 
 def identify() -> Problem:
@@ -282,19 +223,10 @@ def identify() -> Problem:
         return weights
 
     loss = FrameLoss(drop, 0 * times, np.full(11, 2 / 11), -4.3 * times**2)
-    return Problem(
-        "identify",
-        "Gradient by E of a beam's watched motion, per mesh",
-        "error of d loss / d E",
-        lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more),
-        0.25,
-        lambda _, gradients: np.atleast_1d(gradients["youngs_modulus"]),
-        frames=10,
-        adjoint=loss,
-        inputs=("youngs_modulus",),
-        cells=(2, 4),
-        patterns=("five",),
-    )
+    said = "identify", "Gradient by E of a beam's watched motion, per mesh", "error of d loss / d E"
+    how = dict(frames=10, adjoint=loss, inputs=("youngs_modulus",), cells=(2, 4), patterns=("five",))
+    by_E = lambda _, gradients: np.atleast_1d(gradients["youngs_modulus"])  # noqa: E731
+    return Problem(*said, partial(beam_scene, SmithNeoHookean), 0.25, by_E, **how)
 
 
 MAKERS = (oscillator, lame, lame_gradient, beam, sag, bounce, bounce_gradient, identify)

@@ -77,19 +77,16 @@ class Recommendation:
         return Rollout(solver, frames, save_every=1, memory=self.memory, **options)
 
     def __str__(self) -> str:
+        how = f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}"
         kept = f"{self.megabytes:.3g} MB" if self.gradients else "no states"
-        return "\n".join(
-            [
-                f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}, "
-                f"element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else ""),
-                f"expect: {self.seconds:.3g} s of wall time, {kept} kept, "
-                f"error {self.error:.2g} of the largest displacement",
-                *(f"- {line}" for line in self.reasons),
-                *([f"- elements: {'; '.join(map(str, self.elements))}, of the mesh alone"] if self.elements else []),
-                *(f"- beside it: {other}" for other in self.alternatives),
-                "left out: " + "; ".join(self.left_out),
-            ]
+        lines = [f"{how}, element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else "")]
+        lines.append(
+            f"expect: {self.seconds:.3g} s of wall time, {kept} kept, error {self.error:.2g} of the largest displacement"
         )
+        lines += [f"- {line}" for line in self.reasons]
+        lines += [f"- elements: {'; '.join(map(str, self.elements))}, of the mesh alone"] if self.elements else []
+        lines += [f"- beside it: {other}" for other in self.alternatives]
+        return "\n".join([*lines, "left out: " + "; ".join(self.left_out)])
 
     __repr__ = __str__
 
@@ -325,20 +322,10 @@ class Trials:
         k = -(-best.steps // self.frames)
         solver = best.solver(self.scene.replace(precision=best.precision), dt=self.duration / self.frames, substeps=k)
         plan = Rollout(solver, self.frames, memory=self.memory)
-        return Recommendation(
-            best,
-            self.duration,
-            self.gradients,
-            self.memory,
-            plan.memory if self.gradients else 0.0,
-            max(best.error, self.own_error),
-            self._element(),
-            self._reasons(best, plan),
-            self._left_out(best),
-            self.tried,
-            self.elements,
-            others,
-        )
+        asked, megabytes = (self.duration, self.gradients, self.memory), plan.memory if self.gradients else 0.0
+        said = self._element(), self._reasons(best, plan), self._left_out(best)
+        error = max(best.error, self.own_error)
+        return Recommendation(best, *asked, megabytes, error, *said, self.tried, self.elements, others)
 
     def _element(self) -> str:
         """The cheapest kind that keeps to the tolerance, or the one that is nearest; the scene's own if none was tried."""

@@ -165,10 +165,8 @@ class ChamberKernels(StepNumbers):
         for t in range(plan.num_triangles):
             now = pass_at(table, plan.pass_ - plan.window)
             p = self.law_at(chambers.chamber[t], now, scene, chambers)[0]
-            factor, normals = (
-                self.sixth() * p * chambers.push[t],
-                self.normals(self.places(t, at, scene, chambers, plan)),
-            )
+            factor = self.sixth() * p * chambers.push[t]
+            normals = self.normals(self.places(t, at, scene, chambers, plan))
             for a in ti.static(range(3)):
                 out.corner[plan.first + 3 * t + a] = factor * normals[a]
 
@@ -180,13 +178,8 @@ class ChamberKernels(StepNumbers):
             now, c = pass_at(table, plan.pass_ - plan.window), chambers.chamber[t]
             p, by_p0, by_outside, by_V0, by_n, slope = self.law_at(c, now, scene, chambers)
             dp0, d_outside, dV0, dn = self.numbers(c, now, tangent.follower, chambers)
-            dp = (
-                by_p0 * dp0
-                + by_outside * d_outside
-                + by_V0 * dV0
-                + by_n * dn
-                + slope * self.whole(c, chambers.by_pressure)
-            )
+            dp = by_p0 * dp0 + by_outside * d_outside + by_V0 * dV0 + by_n * dn
+            dp = dp + slope * self.whole(c, chambers.by_pressure)
             y, factor = self.places(t, at, scene, chambers, plan), self.sixth() * chambers.push[t]
             normals, changes = self.normals(y), self.normals_jvp(y, self.changes(t, tangent, chambers))
             for a in ti.static(range(3)):
@@ -201,10 +194,8 @@ class ChamberKernels(StepNumbers):
             p, by_p0, by_outside, by_V0, by_n, slope = self.law_at(c, now, scene, chambers)
             by_pressure = self.whole(c, chambers.by_pressure)  # the adjoint of p
             y = self.places(t, at, scene, chambers, plan)
-            by_V, by_n_a = (
-                self.sixth() * chambers.weight[t] * (by_pressure * slope),
-                self.sixth() * chambers.push[t] * p,
-            )
+            by_V = self.sixth() * chambers.weight[t] * (by_pressure * slope)
+            by_n_a = self.sixth() * chambers.push[t] * p
             swept, turned = self.swept(y), self.normals_vjp(y, self.pulls(t, adjoint, chambers))
             for a in ti.static(range(3)):
                 by = by_V * swept[a] + by_n_a * turned[a]

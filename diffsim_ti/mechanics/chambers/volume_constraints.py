@@ -204,14 +204,11 @@ class VolumeConstraints(Stage):
         V = [enclosure.volume(self.rest + u) for enclosure in self.enclosures]
         wanted = self.targets(given, j)
         k = int(np.argmax(np.abs(V / wanted - 1)))
-        return self.ws.dated(
-            VolumeLost(
-                f"FilledChamber: no pressure leads in one substep from the volume {V[k]:.6g} m^3 to {wanted[k]:.6g} m^3; "
-                "let it change over time by keyframes, take smaller steps, or an implicit solver"
-            ),
-            j,
-            num_passes,
+        lost = VolumeLost(
+            f"FilledChamber: no pressure leads in one substep from the volume {V[k]:.6g} m^3 to {wanted[k]:.6g} m^3; "
+            "let it change over time by keyframes, take smaller steps, or an implicit solver"
         )
+        return self.ws.dated(lost, j, num_passes)
 
     def alone(self, history, slot: int):
         """A recorded pass to a slot without the stage; then the record is what it was."""

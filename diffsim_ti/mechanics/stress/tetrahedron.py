@@ -101,17 +101,9 @@ class Tetrahedron(Growing):
     @cached_property
     def types(self) -> SimpleNamespace:
         """Types of kernels' arguments."""
-        vector = self.items.vector
-        return SimpleNamespace(
-            fp=self.fp,
-            vector=vector,
-            blocks=ti.types.ndarray(ti.types.vector(LANES, self.fp), 1),
-            scalars=ti.types.ndarray(self.fp, 1),
-            scalars2=ti.types.ndarray(self.fp, 2),
-            vectors=ti.types.ndarray(vector, 1),
-            vectors2=ti.types.ndarray(vector, 2),
-            ints=ti.types.ndarray(ti.i32, 1),
-        )
+        fp, vector, lanes, array = self.fp, self.items.vector, ti.types.vector(LANES, self.fp), ti.types.ndarray
+        one = dict(blocks=array(lanes, 1), scalars=array(fp, 1), vectors=array(vector, 1), ints=array(ti.i32, 1))
+        return SimpleNamespace(fp=fp, vector=vector, scalars2=array(fp, 2), vectors2=array(vector, 2), **one)
 
     # what kernels that write numbers of their own need of the items
     numbers = property(lambda self: self.items.numbers)

@@ -149,21 +149,13 @@ def _grid_of(pieces: list[tuple]) -> FileMesh:
     firsts = np.cumsum([0, *(len(p) for p in points)])
     starts = np.cumsum([0, *(len(n) for n in nodes)])
     both = [set.intersection(*(set(piece[k]) for piece in pieces)) for k in (4, 5)]
-    arrays = [
-        {
-            name: np.concatenate([np.asarray(piece[k][name]) for piece in pieces])
-            for name in pieces[0][k]
-            if name in common
-        }
-        for k, common in zip((4, 5), both)
-    ]
-    whole = grid(
-        np.concatenate(points),
-        np.concatenate([n + first for n, first in zip(nodes, firsts)]),
-        np.concatenate([[0], *(o[1:] + start for o, start in zip(offsets, starts))]),
-        np.concatenate(types),
-        *arrays,
-    )
+    arrays = []
+    for k, common in zip((4, 5), both):
+        names = [name for name in pieces[0][k] if name in common]
+        arrays.append({name: np.concatenate([np.asarray(piece[k][name]) for piece in pieces]) for name in names})
+    nodes = np.concatenate([n + first for n, first in zip(nodes, firsts)])
+    offsets = np.concatenate([[0], *(o[1:] + start for o, start in zip(offsets, starts))])
+    whole = grid(np.concatenate(points), nodes, offsets, np.concatenate(types), *arrays)
     lost = sorted({name for piece in pieces for k in (4, 5) for name in piece[k]} - both[0] - both[1])
     if lost:
         whole.left_out.append(f"arrays that not all pieces have: {', '.join(lost)}")
