@@ -12,6 +12,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from typer import Option
 
 from diffsim_ti import runtime
 from diffsim_ti.cli import options as opt
@@ -50,9 +51,9 @@ for command in (*measuring, view.render, view.view):
 
 @app.callback()
 def everywhere(
-    traceback: Annotated[bool, typer.Option("--traceback", help="show the traceback of an error")] = False,
+    traceback: Annotated[bool, Option("--traceback", help="show the traceback of an error")] = False,
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=opt.say_version, help="say the version, and stop")
+        bool, Option("--version", is_eager=True, callback=opt.say_version, help="say the version, and stop")
     ] = False,
 ) -> None:
     """Soft bodies on tetrahedra, simulated with Taichi."""
@@ -124,7 +125,7 @@ def simulate(
     mesh: opt.MeshFile,
     output: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             "--output",
             "-o",
             help="folder for a series and a picture of the end (default output/simulate), or a file by its suffix: "
@@ -140,31 +141,27 @@ def simulate(
     size: opt.Size = None,
     up: opt.UpAxis = opt.Up.y,
     fix_orientation: opt.FixOrientation = False,
-    duration: Annotated[float, typer.Option(help="simulated time [s]")] = 1.0,
-    fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
-    dt: Annotated[
-        float | None, typer.Option(help="substep [s], taken as it is; default: follows the stable step")
-    ] = None,
-    solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler or bdf2")] = "verlet",
-    gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
-    drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
-    velocity: Annotated[tuple[float, float, float], typer.Option(help="at the start [m/s]")] = (0.0, 0.0, 0.0),
+    duration: Annotated[float, Option(help="simulated time [s]")] = 1.0,
+    fps: Annotated[float, Option(help="frames per second")] = 30.0,
+    dt: Annotated[float | None, Option(help="substep [s], taken as it is; default: follows the stable step")] = None,
+    solver: Annotated[str, Option(help="verlet, semi-implicit, implicit-euler or bdf2")] = "verlet",
+    gravity: Annotated[float, Option(help="along y [m/s^2]")] = -9.81,
+    drag: Annotated[float, Option(help="rate at which velocities fall [1/s]")] = 0.0,
+    velocity: Annotated[tuple[float, float, float], Option(help="at the start [m/s]")] = (0.0, 0.0, 0.0),
     fixed: opt.Fixed = None,
-    ground: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
-    height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a tenth of the size")] = None,
+    ground: Annotated[bool, Option(help="a floor at y = 0, the body above it")] = True,
+    height: Annotated[float | None, Option(help="of the lowest point [m]; default a tenth of the size")] = None,
     ground_stiffness_per_area: Annotated[
-        float | None, typer.Option(help="[N/m^3]; default from the impact's pressure")
+        float | None, Option(help="[N/m^3]; default from the impact's pressure")
     ] = None,
-    ground_stiffness: Annotated[
-        float | None, typer.Option(help="of each vertex [N/m], instead of that per area")
-    ] = None,
-    ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
-    ground_friction: Annotated[float, typer.Option(help="Coulomb's coefficient of the floor")] = 0.0,
-    azimuth: Annotated[float, typer.Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
+    ground_stiffness: Annotated[float | None, Option(help="of each vertex [N/m], instead of that per area")] = None,
+    ground_width: Annotated[float | None, Option(help="[m]; default 1 % of the size")] = None,
+    ground_friction: Annotated[float, Option(help="Coulomb's coefficient of the floor")] = 0.0,
+    azimuth: Annotated[float, Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
     arrows: opt.Arrows = None,
     accuracy: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--accuracy",
             help="also say what mesh, steps, solver and rounding cost the height of the centre of mass at the end, and draw "
             "the share of each tetrahedron; of implicit solvers; without --dt by steps as long as the last ones",
@@ -218,7 +215,7 @@ def info(
     material: opt.MaterialName = "StableNeoHookean",
     size: opt.Size = None,
     fix_orientation: opt.FixOrientation = False,
-    tight: Annotated[bool, typer.Option("--tight", help="also the tight limit, by Lanczos")] = False,
+    tight: Annotated[bool, Option("--tight", help="also the tight limit, by Lanczos")] = False,
 ) -> None:
     """Say what is in a mesh file: sizes, quality, groups, and the stable explicit step for given moduli."""
     body = opt.load_body(mesh, size, opt.Up.y, fix_orientation)
@@ -241,11 +238,11 @@ def check_gradients(
     order: opt.Order = 1,
     size: opt.Size = None,
     up: opt.UpAxis = opt.Up.y,
-    steps: Annotated[int, typer.Option(help="length of the rollout")] = 50,
-    dt: Annotated[float | None, typer.Option(help="[s]; default half the stable step")] = None,
-    solver: Annotated[str, typer.Option(help="semi-implicit or verlet")] = "semi-implicit",
+    steps: Annotated[int, Option(help="length of the rollout")] = 50,
+    dt: Annotated[float | None, Option(help="[s]; default half the stable step")] = None,
+    solver: Annotated[str, Option(help="semi-implicit or verlet")] = "semi-implicit",
     fixed: opt.Fixed = None,
-    drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.5,
+    drag: Annotated[float, Option(help="rate at which velocities fall [1/s]")] = 0.5,
     backend: opt.Backend = "cpu",
     precision: opt.Precision = "f64",
 ) -> None:
@@ -273,7 +270,7 @@ def check_gradients(
 def demo(
     output: opt.Folder = Path("output/demo"),
     backend: opt.Backend = "cpu",
-    quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
+    quick: Annotated[bool, Option("--quick", hidden=True)] = False,
 ) -> None:
     """Drop a twisted jelly column, write pictures and a series, and take the gradient of its fall by Young's modulus."""
     from diffsim_ti.picture import save_picture

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from diffsim_ti.cli import options as opt
 from diffsim_ti.mesh import TetrahedralMesh
@@ -14,9 +15,7 @@ from diffsim_ti.mesh.files import read_mesh
 
 def check(
     mesh: opt.MeshFile,
-    mend: Annotated[
-        Path | None, typer.Option(help="write the mesh there without what can be mended in one way only")
-    ] = None,
+    mend: Annotated[Path | None, Option(help="write the mesh there without what can be mended in one way only")] = None,
 ) -> None:
     """Say what may be wrong with a mesh file, with a remedy for each; exit code 1 if there is anything."""
     parts, left_out = read_mesh(mesh)

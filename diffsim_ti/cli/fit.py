@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from diffsim_ti.materials.measured import Library
 from diffsim_ti.materials.rubber_fit import fit_rubber
@@ -24,21 +25,17 @@ PUBLISHED = {  # words of headers, and what of them is said of the source
 def fit(
     tests: Annotated[
         list[Path],
-        typer.Argument(
+        Argument(
             help="CSV of a tensile test with a line of titles, such as stretch;stress [MPa]; several, or a "
             "folder, make a library"
         ),
     ],
-    equibiaxial: Annotated[list[Path] | None, typer.Option(help="of the same material, in equibiaxial tension")] = None,
-    planar: Annotated[
-        list[Path] | None, typer.Option(help="of the same material, in planar tension (pure shear)")
-    ] = None,
-    name: Annotated[str | None, typer.Option(help="of the material; default from the file's name")] = None,
-    density: Annotated[
-        float | None, typer.Option(help="[kg/m^3]; default what a header says, else that of silicone")
-    ] = None,
-    source: Annotated[str, typer.Option(help="who published the data, and under which licence")] = "",
-    output: Annotated[Path, typer.Option("--output", "-o", help="library to write")] = Path("output/fit.json"),
+    equibiaxial: Annotated[list[Path] | None, Option(help="of the same material, in equibiaxial tension")] = None,
+    planar: Annotated[list[Path] | None, Option(help="of the same material, in planar tension (pure shear)")] = None,
+    name: Annotated[str | None, Option(help="of the material; default from the file's name")] = None,
+    density: Annotated[float | None, Option(help="[kg/m^3]; default what a header says, else that of silicone")] = None,
+    source: Annotated[str, Option(help="who published the data, and under which licence")] = "",
+    output: Annotated[Path, Option("--output", "-o", help="library to write")] = Path("output/fit.json"),
 ) -> None:
     """Find the law, its numbers with 95 % intervals and where it is valid, from tensile tests; write them as a library.
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
+from typer import Argument, Option
 
 import diffsim_ti as ds
 from diffsim_ti.cli.options import Density, MaterialName, MeshFile, Size, Up, fixed_vertices, load_body, make_material
@@ -63,33 +63,30 @@ def identify(
     mesh: MeshFile,
     data: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             help="CSV with columns time, marker, x, y, z [s, m], all markers at time 0; or displacement, force [m, N], in "
             "equilibrium, without the weight"
         ),
     ],
-    unknown: Annotated[list[str], typer.Option(help="input=guess, such as youngs_modulus=1e5; may be repeated")],
-    noise: Annotated[float, typer.Option(help="standard deviation of a coordinate [m], or of a force [N]")],
+    unknown: Annotated[list[str], Option(help="input=guess, such as youngs_modulus=1e5; may be repeated")],
+    noise: Annotated[float, Option(help="standard deviation of a coordinate [m], or of a force [N]")],
     material: MaterialName = "StableNeoHookean",
-    youngs_modulus: Annotated[float, typer.Option("--youngs-modulus", "-E", help="where it is known [Pa]")] = 1e5,
-    poissons_ratio: Annotated[float, typer.Option("--poissons-ratio", "--nu", help="where it is known [-]")] = 0.4,
+    youngs_modulus: Annotated[float, Option("--youngs-modulus", "-E", help="where it is known [Pa]")] = 1e5,
+    poissons_ratio: Annotated[float, Option("--poissons-ratio", "--nu", help="where it is known [-]")] = 0.4,
     density: Density = 1000.0,
     size: Size = None,
-    gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
-    drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]; a guess if unknown")] = 0.0,
-    fixed: Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix")] = None,
-    pull: Annotated[
-        str | None, typer.Option(help="of a force curve: vertex set, or xmin .. zmax, that is moved")
-    ] = None,
-    along: Annotated[Up, typer.Option(help="of a force curve: where the displacement and the force point")] = Up.y,
+    gravity: Annotated[float, Option(help="along y [m/s^2]")] = -9.81,
+    drag: Annotated[float, Option(help="rate at which velocities fall [1/s]; a guess if unknown")] = 0.0,
+    fixed: Annotated[list[str] | None, Option(help="vertex set, or xmin .. zmax, to fix")] = None,
+    pull: Annotated[str | None, Option(help="of a force curve: vertex set, or xmin .. zmax, that is moved")] = None,
+    along: Annotated[Up, Option(help="of a force curve: where the displacement and the force point")] = Up.y,
     starts: Annotated[
-        int | None, typer.Option(help="how many searches; default more than one where the first explains nothing")
+        int | None, Option(help="how many searches; default more than one where the first explains nothing")
     ] = None,
     check_mesh: Annotated[
-        bool | None,
-        typer.Option("--check-mesh/--no-check-mesh", help="fit again by ten-node tetrahedra; default if cheap"),
+        bool | None, Option("--check-mesh/--no-check-mesh", help="fit again by ten-node tetrahedra; default if cheap")
     ] = None,
-    output: Annotated[Path, typer.Option("--output", "-o", help="picture")] = Path("output/identify.png"),
+    output: Annotated[Path, Option("--output", "-o", help="picture")] = Path("output/identify.png"),
 ) -> None:
     """Find numbers of a body, with 95 % intervals, from tracks of markers on it or a force curve; draw data and fit."""
     from diffsim_ti.identification.picture import save_picture

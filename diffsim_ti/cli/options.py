@@ -12,6 +12,7 @@ import taichi
 import torch
 import typer
 from numpy.typing import ArrayLike
+from typer import Argument, Option
 
 import diffsim_ti
 from diffsim_ti.cli.config import read_options
@@ -30,39 +31,37 @@ from diffsim_ti.writers.adaptive_run import ForwardRun
 Up = Enum("Up", {name: name for name in ("x", "y", "z", "-x", "-y", "-z")}, type=str)
 SIDES = {f"{axis}{end}": (d, end) for d, axis in enumerate("xyz") for end in ("min", "max")}
 
-MeshFile = Annotated[Path, typer.Argument(metavar="MESH", help="tetrahedra, in any format that meshio reads")]
-Size = Annotated[float | None, typer.Option(help="scale the longest side of the bounding box to this [m]")]
-UpAxis = Annotated[Up, typer.Option(help="axis of the file that points up; the body is turned to have y up")]
-FixOrientation = Annotated[bool, typer.Option("--fix-orientation", help="turn inside-out tetrahedra")]
-MaterialName = Annotated[str, typer.Option(help="the law, by class name; capitals do not matter")]
-Youngs = Annotated[float, typer.Option("--youngs-modulus", "-E", help="Young's modulus [Pa]")]
-Poisson = Annotated[float, typer.Option("--poissons-ratio", "--nu", help="Poisson's ratio [-]")]
-Density = Annotated[float, typer.Option(help="[kg/m^3]")]
+MeshFile = Annotated[Path, Argument(metavar="MESH", help="tetrahedra, in any format that meshio reads")]
+Size = Annotated[float | None, Option(help="scale the longest side of the bounding box to this [m]")]
+UpAxis = Annotated[Up, Option(help="axis of the file that points up; the body is turned to have y up")]
+FixOrientation = Annotated[bool, Option("--fix-orientation", help="turn inside-out tetrahedra")]
+MaterialName = Annotated[str, Option(help="the law, by class name; capitals do not matter")]
+Youngs = Annotated[float, Option("--youngs-modulus", "-E", help="Young's modulus [Pa]")]
+Poisson = Annotated[float, Option("--poissons-ratio", "--nu", help="Poisson's ratio [-]")]
+Density = Annotated[float, Option(help="[kg/m^3]")]
 Arrows = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         help="forces to draw as arrows and to write: reaction (of supports), contact, friction (its part); of a saved "
         "series those that it contains; may be repeated"
     ),
 ]
-Volume = Annotated[
-    str, typer.Option(help="where a change of volume is resisted: tetrahedra, or patches (near nu = 0.5)")
-]
-Order = Annotated[int, typer.Option(help="1: linear tetrahedra; 2: ten-node ones of the same mesh, which bend right")]
-Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
-Precision = Annotated[str, typer.Option(help="f32 or f64")]
-Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
+Volume = Annotated[str, Option(help="where a change of volume is resisted: tetrahedra, or patches (near nu = 0.5)")]
+Order = Annotated[int, Option(help="1: linear tetrahedra; 2: ten-node ones of the same mesh, which bend right")]
+Backend = Annotated[str, Option(help="cpu, cuda or vulkan")]
+Precision = Annotated[str, Option(help="f32 or f64")]
+Threads = Annotated[int | None, Option(help="CPU threads, default all")]
 SUFFIXES = f"{', '.join(WRITERS)} (run_%04d.png: every frame, run.png: the end)"
-Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")]
+Fixed = Annotated[list[str] | None, Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")]
 Config = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         is_eager=True, callback=read_options, help="TOML file of options (--write-config); those typed beside it win"
     ),
 ]
-WriteConfig = Annotated[Path | None, typer.Option(help="write all options to this TOML file, and stop")]
-Workers = Annotated[int, typer.Option(help="processes that share the work")]
-Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is written")]
+WriteConfig = Annotated[Path | None, Option(help="write all options to this TOML file, and stop")]
+Workers = Annotated[int, Option(help="processes that share the work")]
+Folder = Annotated[Path, Option("--output", "-o", help="folder for what is written")]
 
 
 def say_version(asked: bool) -> None:

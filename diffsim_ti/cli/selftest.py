@@ -10,6 +10,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from typer import Option
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
@@ -135,8 +136,8 @@ def _versions() -> str:
 
 def selftest(
     backend: opt.Backend = "cpu",
-    precision: Annotated[str | None, typer.Option(help="f32 or f64; default f64, on Vulkan f32")] = None,
-    numbers: Annotated[bool, typer.Option("--numbers", hidden=True)] = False,
+    precision: Annotated[str | None, Option(help="f32 or f64; default f64, on Vulkan f32")] = None,
+    numbers: Annotated[bool, Option("--numbers", hidden=True)] = False,
 ) -> None:
     """Run ten scenes with gradients and compare them with stored numbers, time two pieces of work, and print a report
     that can be pasted into an issue. Exit code 1 if a number or a ratio of times is not as stored."""

@@ -9,36 +9,35 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from typer import Argument, Option
 
 from diffsim_ti import runtime
 from diffsim_ti.cli import options as opt
 from diffsim_ti.common.progress import progress
 from diffsim_ti.solvers import SOLVERS, StaticSolver
 
-Quick = Annotated[bool, typer.Option("--quick", help="small meshes, few steps: seconds instead of minutes")]
+Quick = Annotated[bool, Option("--quick", help="small meshes, few steps: seconds instead of minutes")]
 
 
 def chart(
     problem: Annotated[
         str,
-        typer.Argument(
+        Argument(
             help="oscillator, lame, lame-gradient, beam, sag, bounce, bounce-gradient, "
             "identify; a mesh; or a Python file that defines scene, which is run"
         ),
     ],
     output: opt.Folder = Path("output/chart"),
     quick: Quick = False,
-    duration: Annotated[float, typer.Option(help="of a scene of one's own [s]")] = 0.2,
-    gradient: Annotated[
-        str | None, typer.Option(help="of a scene of one's own: chart the gradient by this input")
-    ] = None,
+    duration: Annotated[float, Option(help="of a scene of one's own [s]")] = 0.2,
+    gradient: Annotated[str | None, Option(help="of a scene of one's own: chart the gradient by this input")] = None,
     material: opt.MaterialName = "StableNeoHookean",
     youngs_modulus: opt.Youngs = 1e5,
     poissons_ratio: opt.Poisson = 0.4,
     density: opt.Density = 1000.0,
     fixed: opt.Fixed = None,
-    limit: Annotated[float, typer.Option(help="leave out runs expected to take longer than this [s]")] = 1.0,
-    repeats: Annotated[int, typer.Option(help="timed rounds, of which the best counts")] = 3,
+    limit: Annotated[float, Option(help="leave out runs expected to take longer than this [s]")] = 1.0,
+    repeats: Annotated[int, Option(help="timed rounds, of which the best counts")] = 3,
     workers: opt.Workers = 1,
     backend: opt.Backend = "cpu",
 ) -> None:
@@ -76,9 +75,9 @@ def chart(
 
 def stability(
     axis: Annotated[
-        str, typer.Argument(help="stiffness, nu, impact, quality, compression, viscosity, activation, friction, or all")
+        str, Argument(help="stiffness, nu, impact, quality, compression, viscosity, activation, friction, or all")
     ] = "all",
-    solver: Annotated[list[str] | None, typer.Option(help="class name; may be repeated; default all")] = None,
+    solver: Annotated[list[str] | None, Option(help="class name; may be repeated; default all")] = None,
     output: opt.Folder = Path("output/stability"),
     quick: Quick = False,
     workers: opt.Workers = 1,
@@ -125,10 +124,8 @@ def stability(
 
 
 def growth(
-    scene: Annotated[
-        str, typer.Argument(help="all built-in scenes, a mesh, or a Python file that defines scene")
-    ] = "all",
-    duration: Annotated[float, typer.Option(help="simulated time [s]")] = 3.0,
+    scene: Annotated[str, Argument(help="all built-in scenes, a mesh, or a Python file that defines scene")] = "all",
+    duration: Annotated[float, Option(help="simulated time [s]")] = 3.0,
     output: opt.Folder = Path("output/growth"),
     quick: Quick = False,
     precision: opt.Precision = "f32",
@@ -158,20 +155,20 @@ def growth(
 
 
 def recommend(
-    scene: Annotated[Path, typer.Argument(help="a mesh, or a Python file that defines scene, which is run")],
-    duration: Annotated[float, typer.Option(help="simulated time [s]")] = 0.2,
-    tolerance: Annotated[float, typer.Option(help="of the motion, over the largest displacement")] = 1e-2,
-    memory: Annotated[float | None, typer.Option(help="most that gradients may keep [MB]")] = None,
-    gradients: Annotated[bool, typer.Option(help="whether the run will be differentiated")] = True,
-    budget: Annotated[float, typer.Option(help="wall time for trial runs [s]")] = 20.0,
-    quick: Annotated[bool, typer.Option("--quick", help="the same as --budget 4")] = False,
+    scene: Annotated[Path, Argument(help="a mesh, or a Python file that defines scene, which is run")],
+    duration: Annotated[float, Option(help="simulated time [s]")] = 0.2,
+    tolerance: Annotated[float, Option(help="of the motion, over the largest displacement")] = 1e-2,
+    memory: Annotated[float | None, Option(help="most that gradients may keep [MB]")] = None,
+    gradients: Annotated[bool, Option(help="whether the run will be differentiated")] = True,
+    budget: Annotated[float, Option(help="wall time for trial runs [s]")] = 20.0,
+    quick: Annotated[bool, Option("--quick", help="the same as --budget 4")] = False,
     workers: opt.Workers = 1,
     material: opt.MaterialName = "StableNeoHookean",
     youngs_modulus: opt.Youngs = 1e5,
     poissons_ratio: opt.Poisson = 0.4,
     density: opt.Density = 1000.0,
     fixed: opt.Fixed = None,
-    coarser: Annotated[Path | None, typer.Option(help="a coarser mesh of the body, to try ten nodes on")] = None,
+    coarser: Annotated[Path | None, Option(help="a coarser mesh of the body, to try ten nodes on")] = None,
     backend: opt.Backend = "cpu",
 ) -> None:
     """Name the cheapest solver, step, precision and checkpoints for a tolerance, from short trial runs."""
@@ -251,14 +248,12 @@ def axis(text: str) -> tuple[str, list[float]]:
 
 
 def sweep(
-    scene: Annotated[Path, typer.Argument(help="a mesh, or a Python file that defines scene or rollout, which is run")],
-    over: Annotated[
-        list[str], typer.Option(help="E=1e4..1e6:20:log, speed=0..2:5 or nu=0.3,0.4; more than one: a grid")
-    ],
+    scene: Annotated[Path, Argument(help="a mesh, or a Python file that defines scene or rollout, which is run")],
+    over: Annotated[list[str], Option(help="E=1e4..1e6:20:log, speed=0..2:5 or nu=0.3,0.4; more than one: a grid")],
     output: opt.Folder = Path("output/sweep"),
-    duration: Annotated[float, typer.Option(help="of a scene [s]")] = 0.2,
-    frames: Annotated[int, typer.Option(help="of a scene")] = 20,
-    solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler, bdf2 or static")] = "verlet",
+    duration: Annotated[float, Option(help="of a scene [s]")] = 0.2,
+    frames: Annotated[int, Option(help="of a scene")] = 20,
+    solver: Annotated[str, Option(help="verlet, semi-implicit, implicit-euler, bdf2 or static")] = "verlet",
     workers: opt.Workers = 1,
     precision: opt.Precision = "f32",
     material: opt.MaterialName = "StableNeoHookean",

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from diffsim_ti import runtime
 from diffsim_ti.cli import options as opt
@@ -13,23 +13,21 @@ from diffsim_ti.writers.adaptive_run import ForwardRun
 
 
 def render(
-    series: Annotated[Path, typer.Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
-    output: Annotated[Path, typer.Option("--output", "-o", help=f"file, by its suffix: {opt.SUFFIXES}")] = Path(
+    series: Annotated[Path, Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
+    output: Annotated[Path, Option("--output", "-o", help=f"file, by its suffix: {opt.SUFFIXES}")] = Path(
         "output/film.mp4"
     ),
-    colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
-    fps: Annotated[float, typer.Option(help="frames per second of the film")] = 30.0,
-    size: Annotated[tuple[int, int], typer.Option(help="width and height [pixels]")] = (640, 480),
-    ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]; default the run's own")] = None,
-    azimuth: Annotated[float, typer.Option(help="of the eye, about y [degrees]")] = 32.0,
-    elevation: Annotated[float, typer.Option(help="of the eye, above the floor [degrees]")] = 14.0,
-    wireframe: Annotated[bool, typer.Option("--wireframe", help="draw the edges of the triangles")] = False,
-    backend: Annotated[str, typer.Option(help="vulkan, software, or auto: Vulkan where there is a driver")] = "auto",
+    colour: Annotated[str, Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
+    fps: Annotated[float, Option(help="frames per second of the film")] = 30.0,
+    size: Annotated[tuple[int, int], Option(help="width and height [pixels]")] = (640, 480),
+    ground: Annotated[float | None, Option(help="height of a floor to draw [m]; default the run's own")] = None,
+    azimuth: Annotated[float, Option(help="of the eye, about y [degrees]")] = 32.0,
+    elevation: Annotated[float, Option(help="of the eye, above the floor [degrees]")] = 14.0,
+    wireframe: Annotated[bool, Option("--wireframe", help="draw the edges of the triangles")] = False,
+    backend: Annotated[str, Option(help="vulkan, software, or auto: Vulkan where there is a driver")] = "auto",
     arrows: Annotated[
         list[str] | None,
-        typer.Option(
-            help="vectors at vertices that the series contains, such as forces, to draw as arrows; may be repeated"
-        ),
+        Option(help="vectors at vertices that the series contains, such as forces, to draw as arrows; may be repeated"),
     ] = None,
 ) -> None:
     """Draw a saved series as a film, coloured by a field, without a display."""
@@ -42,10 +40,10 @@ def render(
 
 def view(
     source: Annotated[
-        Path, typer.Argument(help="the .pvd of a run, or a mesh, which is then simulated", exists=True, dir_okay=False)
+        Path, Argument(help="the .pvd of a run, or a mesh, which is then simulated", exists=True, dir_okay=False)
     ],
-    colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
-    ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]; default the run's own")] = None,
+    colour: Annotated[str, Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
+    ground: Annotated[float | None, Option(help="height of a floor to draw [m]; default the run's own")] = None,
     material: opt.MaterialName = "StableNeoHookean",
     youngs_modulus: opt.Youngs = 1e5,
     poissons_ratio: opt.Poisson = 0.4,
@@ -53,16 +51,16 @@ def view(
     size: opt.Size = None,
     up: opt.UpAxis = opt.Up.y,
     fix_orientation: opt.FixOrientation = False,
-    fps: Annotated[float, typer.Option(help="of a live run: frames per simulated second")] = 60.0,
-    solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler or bdf2")] = "verlet",
-    gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
-    drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
+    fps: Annotated[float, Option(help="of a live run: frames per simulated second")] = 60.0,
+    solver: Annotated[str, Option(help="verlet, semi-implicit, implicit-euler or bdf2")] = "verlet",
+    gravity: Annotated[float, Option(help="along y [m/s^2]")] = -9.81,
+    drag: Annotated[float, Option(help="rate at which velocities fall [1/s]")] = 0.0,
     fixed: opt.Fixed = None,
-    floor: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
-    friction: Annotated[float, typer.Option(help="Coulomb's coefficient of the floor")] = 0.0,
+    floor: Annotated[bool, Option(help="a floor at y = 0, the body above it")] = True,
+    friction: Annotated[float, Option(help="Coulomb's coefficient of the floor")] = 0.0,
     arrows: opt.Arrows = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help=f"file that the key S writes, by its suffix: {opt.SUFFIXES}")
+        Path | None, Option("--output", "-o", help=f"file that the key S writes, by its suffix: {opt.SUFFIXES}")
     ] = None,
 ) -> None:
     """Look at a saved series in a window, or at a mesh as it falls: play, step, scrub, turn, colour by a field, pull."""

@@ -80,9 +80,8 @@ class Recommendation:
         how = f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}"
         kept = f"{self.megabytes:.3g} MB" if self.gradients else "no states"
         lines = [f"{how}, element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else "")]
-        lines.append(
-            f"expect: {self.seconds:.3g} s of wall time, {kept} kept, error {self.error:.2g} of the largest displacement"
-        )
+        error = f"error {self.error:.2g} of the largest displacement"
+        lines.append(f"expect: {self.seconds:.3g} s of wall time, {kept} kept, {error}")
         lines += [f"- {line}" for line in self.reasons]
         lines += [f"- elements: {'; '.join(map(str, self.elements))}, of the mesh alone"] if self.elements else []
         lines += [f"- beside it: {other}" for other in self.alternatives]
