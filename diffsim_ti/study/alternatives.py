@@ -37,7 +37,7 @@ def alternatives(trials, best) -> tuple[list[Alternative], list[str]]:
     """(what keeps to the tolerance, why the others are left out), of the advised option `best` of `Trials`."""
     found, notes = [], []
     longer, scene = trials.duration / trials.span, trials.scene.replace(precision=best.precision)
-    base = _rollout(trials, best, scene, best.substeps)
+    base = trials.rollout(best.solver, best.precision, best.substeps, scene, **_unchecked(best))
     tried = [lambda how=how: how for how in _scaled(trials, best, scene, notes)]
     tried += _affine(trials, best, notes)
     tried += [lambda share=share: _adaptive(trials, best, scene, share) for share in TOLERANCES]
@@ -73,7 +73,9 @@ def _scaled(trials, best, scene, notes):
         if gain < GAIN:
             notes.append(f"mass_scaling={share:g}: steps only {gain:.2g} times as long, the mesh has no slivers")
             continue
-        yield f"mass_scaling={share:g}", _rollout(trials, best, heavier, int(np.ceil(best.substeps / gain))), 0.0
+        substeps = int(np.ceil(best.substeps / gain))
+        rollout = trials.rollout(best.solver, best.precision, substeps, heavier, **_unchecked(best))
+        yield f"mass_scaling={share:g}", rollout, 0.0
 
 
 def stiff_sets(scene) -> list[str]:
@@ -115,7 +117,7 @@ def _affine_run(trials, scene, option) -> Rollout:
     if option.solver.explicit:
         substeps = int(np.ceil(substeps * trials.stable / stable_dt(scene).dt))
     for _ in range(4):
-        rollout = _rollout(trials, option, scene, substeps)
+        rollout = trials.rollout(option.solver, option.precision, substeps, scene, **_unchecked(option))
         error = _error(trials, rollout)
         if error <= trials.tolerance:
             break
@@ -134,11 +136,6 @@ def _adaptive(trials, best, scene, share):
     search = time.perf_counter() - begin
     how = f"adaptive_steps(solver, steps={trials.frames}, tolerance={tolerance:g})"
     return how, Rollout(solver, steps, save_every=1, memory=trials.memory), search
-
-
-def _rollout(trials, option, scene, substeps: int) -> Rollout:
-    solver = option.solver(scene, dt=trials.span / trials.frames, substeps=substeps, **_unchecked(option))
-    return Rollout(solver, trials.frames, save_every=1, memory=trials.memory)
 
 
 def _error(trials, rollout: Rollout) -> float:

@@ -35,9 +35,21 @@ def new_figure(width: float = 9.2, height: float = 5.4) -> "tuple[Figure, Axes]"
 
     figure = Figure(figsize=(width, height), dpi=130, layout="constrained")
     axes = figure.add_subplot()
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def panels_of(count: int, width: float, height: float, dpi: int) -> "tuple[Figure, list[Axes]]":
+    """(figure, so many panels), three a row; what is left over of the last row is empty."""
+    from matplotlib.figure import Figure
+
+    columns = min(3, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * rows), dpi=dpi, layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for axes in panels[count:]:
+        axes.axis("off")
+    return figure, panels
 
 
 def draw_chart(chart: "Chart", path: str | Path, peers: dict | None = None) -> None:
@@ -145,15 +157,8 @@ LEGEND = ("accurate: energy keeps to 1 %", "bounded", LOSES, "raises, refuses or
 def draw_maps(results: list, path: str | Path) -> None:
     """A panel per solver: a cell per run, dt against the maps' quantity, with the theoretical limit and where
     boundedness ends; three panels a row, the legend in the last place."""
-    from matplotlib.figure import Figure
-
-    columns = min(3, len(results) + 1)
-    rows = -(-(len(results) + 1) // columns)
-    figure = Figure(figsize=(4.9 * columns, 4.6 * rows), dpi=110, layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False)
-    panels = [axes for row in grid for axes in row]
-    explicit = [r for r in results if r.explicit]
-    if len(explicit) == 2 and len(results) > 2 and columns == 3:  # explicit solvers above, implicit ones below
+    figure, panels = panels_of(len(results) + 1, 4.9, 4.6, 110)
+    if len([r for r in results if r.explicit]) == 2 and len(results) > 2:  # explicit solvers above, implicit ones below
         panels = [panels[0], panels[1], *panels[3:], panels[2]]
     for result, axes in zip(results, panels):
         draw_panel(result, axes)
@@ -219,18 +224,10 @@ def is_log(values) -> bool:
 def draw_sweep(sweep: Sweep, path: str | Path) -> None:
     """A panel for each result: over one number a line, over two a map, over more lines over the last one; refused points are
     crosses at the foot of the panel, or white."""
-    from matplotlib.figure import Figure
-
-    names = sweep.results
-    columns = min(3, len(names))
-    rows = -(-len(names) // columns)
-    figure = Figure(figsize=(4.8 * columns, 3.9 * rows), dpi=120, layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, name in zip(grid, names):
+    figure, panels = panels_of(len(sweep.results), 4.8, 3.9, 120)
+    for axes, name in zip(panels, sweep.results):
         (_map if len(sweep.over) == 2 and min(map(len, sweep.over.values())) > 1 else _lines)(axes, sweep, name)
         axes.set_title(name, loc="left", fontsize=10)
-    for axes in grid[len(names) :]:
-        axes.axis("off")
     save(figure, path)
 
 
@@ -247,8 +244,7 @@ def _lines(axes: "Axes", sweep: Sweep, name: str) -> None:
     axes.set_xscale("log" if is_log(x) else "linear")
     axes.set_yscale("log" if is_log(values[np.isfinite(values)]) else "linear")
     axes.grid(color="0.9")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _map(axes: "Axes", sweep: Sweep, name: str) -> None:

@@ -163,21 +163,22 @@ class Trials:
         """Wall time of a substep of velocity Verlet [s], the cost of starting a run taken off."""
         times = []
         for substeps in (40, 400):
-            rollout = self._rollout(VelocityVerletSolver, "f64", substeps, frames=1, span=0.1 * substeps * self.stable)
+            rollout = self.rollout(VelocityVerletSolver, "f64", substeps, frames=1, span=0.1 * substeps * self.stable)
             rollout.forward()
             begin = time.perf_counter()
             rollout.forward()
             times.append(time.perf_counter() - begin)
         return max((times[1] - times[0]) / 360, 0.1 * times[1] / 400)
 
-    def _rollout(self, kind, precision, substeps, frames=None, span=None) -> Rollout:
-        frames, span = frames or self.frames, span or self.span
-        solver = kind(self.scene.replace(precision=precision), dt=span / frames, substeps=substeps)
+    def rollout(self, kind, precision, substeps, scene=None, frames=None, span=None, **how) -> Rollout:
+        """Of the scene in that precision, or of another one."""
+        frames, span, scene = frames or self.frames, span or self.span, scene or self.scene.replace(precision=precision)
+        solver = kind(scene, dt=span / frames, substeps=substeps, **how)
         return Rollout(solver, frames, save_every=1, memory=self.memory)
 
     def _motion(self, kind, precision, substeps, timed: bool = False):
         """(displacements from the start at the frames, wall time [s], `timed`, with the gradient if one is wanted)."""
-        rollout = self._rollout(kind, precision, substeps)
+        rollout = self.rollout(kind, precision, substeps)
         frames = rollout.forward()
         moved = frames.displacements.astype(np.float64) - frames.displacements[0]
         if not timed:
@@ -203,7 +204,7 @@ class Trials:
         best = self._best()
         good = [o for o in self.tried if o.error <= SAFETY * self.tolerance]
         near = [o for o in good if o.seconds < max(12 * best.seconds, 1e-3 * self.budget)]
-        rollouts = [self._rollout(o.solver, o.precision, o.substeps) for o in near]
+        rollouts = [self.rollout(o.solver, o.precision, o.substeps) for o in near]
         times, longer = [[] for _ in near], self.duration / self.span
         for _ in range(rounds):
             for k, (option, rollout) in enumerate(zip(near, rollouts)):
@@ -349,13 +350,12 @@ class Trials:
         limit = f"its step is {share:.2g} {of} {self.stable:.3g} s"
         kept = plan.checkpoints
         again = "each step runs once more in the reverse sweep" if kept.num_segments > 1 else "all steps are kept"
+        accuracy = f"error {best.error:.2g} against a converged run (itself good to {self.own_error:.1g})"
+        memory = f"{plan.memory:.3g} MB in {kept.num_segments} segments, {again}"
         return [
-            f"accuracy: error {best.error:.2g} against a converged run (itself good to {self.own_error:.1g}), order "
-            f"{best.solver.order}; {limit}",
+            f"accuracy: {accuracy}, order {best.solver.order}; {limit}",
             f"time: {beaten or 'no other solver met the tolerance'}",
-            f"memory: {plan.memory:.3g} MB in {kept.num_segments} segments, {again}"
-            if self.gradients
-            else "memory: without gradients no state is kept",
+            f"memory: {memory if self.gradients else 'without gradients no state is kept'}",
         ]
 
     def _left_out(self, best) -> list[str]:

@@ -9,7 +9,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.lines import AT_LEAST_0
 from diffsim_ti.terms.marks import MOST, Points, spread
-from diffsim_ti.terms.term import OnMesh, OnSurface, Term
+from diffsim_ti.terms.term import OnMesh, OnSurface, Term, nonempty
 
 
 class ElasticFoundation(OnSurface, OnMesh, Term):
@@ -50,9 +50,7 @@ class ElasticFoundation(OnSurface, OnMesh, Term):
         return {"k": len(self.faces(mesh))}
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        count, kind = len(self.faces(mesh)), "triangles" if mesh.order == 1 else "faces"
-        if count == 0:
-            raise ValueError("ElasticFoundation acts on nothing: the set is empty; name a set that has members")
+        count, kind = len(nonempty(self, self.faces(mesh))), "triangles" if mesh.order == 1 else "faces"
         for i in self.described:
             if i.value.ndim and len(i.value) != count:
                 given = f"{i.name} has {len(i.value)} numbers"

@@ -63,9 +63,6 @@ class Traction(OnSurface, Load):
         super().__init__("traction", traction, "N/m^2", "traction", name)
         self.surface = surface
 
-    def check(self, mesh: TetrahedralMesh) -> None:
-        nonempty(self, self.faces(mesh))
-
     def drawn(self, moment):
         vertices = self.indices(moment.mesh)
         label = f"{self.name or 'traction'} [N/m^2]"
@@ -151,13 +148,6 @@ class Pressure(OnSurface, Load):
     def __init__(self, pressure: OverTime, surface: SetOrIndices | None = None, name: str | None = None):
         super().__init__("pressure", pressure, "Pa", "pressure", name)
         self.surface = surface
-
-    def check(self, mesh: TetrahedralMesh) -> None:
-        nonempty(self, self.faces(mesh))
-
-    def rows_in_time(self, own: str) -> list[str]:
-        """Names of the rows of its numbers, of which `own` is the beginning."""
-        return [f"{own} in time"]
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         return [self.in_time(names, own)]

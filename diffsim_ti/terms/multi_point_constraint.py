@@ -56,12 +56,9 @@ class MultiPointConstraint(GivenOverTime, Term):
             raise ValueError(
                 f"MultiPointConstraint: coefficients must have shape (k, 3), not all zero, got shape {c.shape}"
             )
-        super().__init__(
-            amount("value", value, (), "m", "constraint_value"),
-            Input("coefficients", c, (c.shape,), "-", plain="constraint_coefficients", label="coefficients"),
-            Input("stiffness", stiffness, ((),), "N/m", POSITIVE, plain="constraint_stiffness", label="stiffness"),
-            name=name,
-        )
+        c = Input("coefficients", c, (c.shape,), "-", plain="constraint_coefficients", label="coefficients")
+        k = Input("stiffness", stiffness, ((),), "N/m", POSITIVE, plain="constraint_stiffness", label="stiffness")
+        super().__init__(amount("value", value, (), "m", "constraint_value"), c, k, name=name)
         self._give(value)
 
     @classmethod
@@ -103,10 +100,6 @@ class MultiPointConstraint(GivenOverTime, Term):
         k, given = len(self.indices(mesh)), len(self.described[1].value)
         if k != given:
             raise ValueError(f"MultiPointConstraint: coefficients of {given} vertices for {k}; give a row for each")
-
-    def rows_in_time(self, own: str) -> list[str]:
-        """Names of the rows of its numbers, of which `own` is the beginning."""
-        return [f"{own} in time"]
 
     def links(self, names: dict[str, str], own: str) -> Sequence[Link]:
         in_time = InTime(names[self.plain], f"{own} in time", 1, self.keyed)

@@ -100,9 +100,7 @@ class Muscle(OfTetrahedra, Cable):
         mesh, paths, segments = self.mesh, self.paths(self.mesh), f"{own} segments"
         group = np.repeat(self.groups(mesh)[1], mesh.reference.num_points)
         activation, tension = f"{own} activation in time", f"{own} tension in time"
-        return [
-            Segments(paths, mesh.num_vertices, None, segments),
-            InTime(names["activation"], activation, self.ndim, self.keyed),
-            MuscleTension(activation, names["muscle_stress"], segments, self._points(mesh), group, tension),
-            LineRows(paths, segments, f"{own} rows", tension=tension),
-        ]
+        pull = MuscleTension(activation, names["muscle_stress"], segments, self._points(mesh), group, tension)
+        in_time = InTime(names["activation"], activation, self.ndim, self.keyed)
+        rows = LineRows(paths, segments, f"{own} rows", tension=tension)
+        return [Segments(paths, mesh.num_vertices, None, segments), in_time, pull, rows]

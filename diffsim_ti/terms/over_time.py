@@ -33,6 +33,10 @@ class GivenOverTime:
         """The amount at each time [s], where it is keyed."""
         return rows_at(f"{type(self).__name__}: {self.plain}", self.given, times, self.shape)
 
+    def rows_in_time(self, own: str) -> list[str]:
+        """Names of the rows of its numbers, of which `own` is the beginning."""
+        return [f"{own} in time"]
+
 
 def is_keyed(given: OverTime) -> bool:
     """Whether a load is given by a function or by keyframes, and so changes within steps."""
@@ -44,6 +48,14 @@ def amount(argument: str, given: OverTime, shape: tuple, unit: str, plain: str) 
     if is_keyed(given):
         return Input(argument, None, (("steps + 1", *shape),), unit, plain=plain)
     return Input(argument, given, (shape, ("steps", *shape)), unit, plain=plain, label=argument)
+
+
+def between_keyframes(name: str, at: np.ndarray, values: np.ndarray, times: ArrayLike) -> np.ndarray:
+    """Values of keyframes at times `at`, linear between; ValueError unless these increase."""
+    if np.any(np.diff(at) <= 0):
+        raise ValueError(f"{name}: keyframe times must increase, got {at.tolist()}")
+    columns = values.reshape(len(at), -1).T
+    return np.stack([np.interp(times, at, column) for column in columns], -1).reshape(len(times), *values.shape[1:])
 
 
 def rows_at(name: str, given: OverTime, times: ArrayLike, shape: tuple) -> np.ndarray:
@@ -60,10 +72,7 @@ def rows_at(name: str, given: OverTime, times: ArrayLike, shape: tuple) -> np.nd
                 f"{name}: keyframes (times, values) need values of shape {(len(at), *shape)} for {len(at)} times, got "
                 f"{to.shape}; what is given for each step is an array, not a tuple"
             )
-        if np.any(np.diff(at) <= 0):
-            raise ValueError(f"{name}: keyframe times must increase, got {at.tolist()}")
-        columns = to.reshape(len(at), -1).T
-        out = np.stack([np.interp(times, at, column) for column in columns], -1).reshape(len(times), *shape)
+        out = between_keyframes(name, at, to, times)
     if out.shape != (len(times), *shape) or not np.all(np.isfinite(out)):
         raise ValueError(f"{name}: must be finite and of shape {shape} at each time, got shape {out.shape[1:]}")
     return out
@@ -85,9 +94,7 @@ def sampled(name: str, motion: Motion, times: ArrayLike, k: int) -> np.ndarray:
             raise ValueError(f"{name}: a function of time, or keyframes (times, displacements), got {shown(motion)}")
         at, to = (numbers(name, part) for part in motion)
         to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
-        if np.any(np.diff(at) <= 0):
-            raise ValueError(f"{name}: keyframe times must increase")
-        out = np.stack([np.interp(times, at, column) for column in to.reshape(len(at), -1).T], -1).reshape(-1, k, 3)
+        out = between_keyframes(name, at, to, times)
     if not np.all(np.isfinite(out)):
         raise ValueError(f"{name}: displacements must be finite")
     return out

@@ -6,12 +6,11 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import Link
 from diffsim_ti.inputs.loads import RemoteForces, VertexAreas
-from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.loads import Load
 from diffsim_ti.terms.marks import arrows
 from diffsim_ti.terms.over_time import OverTime
-from diffsim_ti.terms.term import OnSurface, nonempty
+from diffsim_ti.terms.term import OnSurface
 
 
 class RemoteLoad(OnSurface, Load):
@@ -52,9 +51,6 @@ class RemoteLoad(OnSurface, Load):
         self.surface, self.point = surface, None if point is None else numbers("RemoteLoad: point [m]", point)
         if point is not None and (self.point.shape != (3,) or not np.all(np.isfinite(self.point))):
             raise ValueError(f"RemoteLoad: point must be 3 finite numbers [m], got {point!r}")
-
-    def check(self, mesh: TetrahedralMesh) -> None:
-        nonempty(self, self.faces(mesh))
 
     def drawn(self, moment):
         vertices, load = self.indices(moment.mesh), moment.values[self.plain]

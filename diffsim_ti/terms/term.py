@@ -160,6 +160,9 @@ class OnMesh:
 class OnSurface:
     """The part of a term that acts on a `surface` of the body; None: all of it."""
 
+    def check(self, mesh: TetrahedralMesh) -> None:
+        nonempty(self, self.faces(mesh))
+
     def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Where it acts, as vertex indices, normals out of the body, shape (k, 3) or (k, 6)."""
         return mesh.faces_of(self.surface)

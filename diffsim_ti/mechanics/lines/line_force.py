@@ -71,30 +71,27 @@ class LineForce(ItemForce):
 
     @ti.func
     def forces(self, k, now: A, scene: A, state: A, s, plan: A):
-        if ti.static(self.fibres):
-            if k < self.num_single(plan):
-                self.line.forces(k, now, scene, state, s, self.first(plan))
-            else:
-                self.fibre.forces(self.first_fibre(k, plan), now, scene, state, s, self.first(plan))
-        else:
+        if ti.static(not self.fibres):
             self.line.forces(k, now, scene, state, s, self.first(plan))
+        elif k < self.num_single(plan):
+            self.line.forces(k, now, scene, state, s, self.first(plan))
+        else:
+            self.fibre.forces(self.first_fibre(k, plan), now, scene, state, s, self.first(plan))
 
     @ti.func
     def forces_jvp(self, k, now: A, scene: A, state: A, s, tangent: A, plan: A):
-        if ti.static(self.fibres):
-            if k < self.num_single(plan):
-                self.line.forces_jvp(k, now, scene, state, s, tangent, self.first(plan))
-            else:
-                self.fibre.forces_jvp(self.first_fibre(k, plan), now, scene, state, s, tangent, self.first(plan))
-        else:
+        if ti.static(not self.fibres):
             self.line.forces_jvp(k, now, scene, state, s, tangent, self.first(plan))
+        elif k < self.num_single(plan):
+            self.line.forces_jvp(k, now, scene, state, s, tangent, self.first(plan))
+        else:
+            self.fibre.forces_jvp(self.first_fibre(k, plan), now, scene, state, s, tangent, self.first(plan))
 
     @ti.func
     def forces_vjp(self, k, now: A, scene: A, state: A, s, adjoint: A, plan: A):
-        if ti.static(self.fibres):
-            if k < self.num_single(plan):
-                self.line.forces_vjp(k, now, scene, state, s, adjoint, self.first(plan))
-            else:
-                self.fibre.forces_vjp(self.first_fibre(k, plan), now, scene, state, s, adjoint, self.first(plan))
-        else:
+        if ti.static(not self.fibres):
             self.line.forces_vjp(k, now, scene, state, s, adjoint, self.first(plan))
+        elif k < self.num_single(plan):
+            self.line.forces_vjp(k, now, scene, state, s, adjoint, self.first(plan))
+        else:
+            self.fibre.forces_vjp(self.first_fibre(k, plan), now, scene, state, s, adjoint, self.first(plan))
