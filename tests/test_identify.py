@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 
 import diffsim_ti as ds
 from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
-from diffsim_ti.identification.picture import save_picture
 from diffsim_ti.identification.problem import Problem
+from diffsim_ti.identification.result import save_picture
 from diffsim_ti.identification.unknowns import Priors
 
 identify = partial(ds.identify, check_mesh=False)  # data are of the mesh that is fitted

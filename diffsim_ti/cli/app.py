@@ -18,7 +18,6 @@ from diffsim_ti import runtime
 from diffsim_ti.cli import options as opt
 from diffsim_ti.cli import study, view
 from diffsim_ti.cli.check import check
-from diffsim_ti.cli.config import write_options
 from diffsim_ti.cli.fit import fit
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.selftest import selftest
@@ -176,7 +175,7 @@ def simulate(
     """Simulate a body, by default its fall onto a floor; write a series and a picture of the end, or films, arrays ..."""
     begin = time.perf_counter()
     if write_config:
-        return write_options(context, write_config)
+        return opt.write_options(context, write_config)
     opt.check_length(duration, fps, dt)
     view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end", arrows=tuple(arrows or ()))
     asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]

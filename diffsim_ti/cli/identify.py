@@ -89,7 +89,7 @@ def identify(
     output: Annotated[Path, Option("--output", "-o", help="picture")] = Path("output/identify.png"),
 ) -> None:
     """Find numbers of a body, with 95 % intervals, from tracks of markers on it or a force curve; draw data and fit."""
-    from diffsim_ti.identification.picture import save_picture
+    from diffsim_ti.identification.result import save_picture
 
     guesses, body = numbers_of(unknown), load_body(mesh, size)
     law = make_material(

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.differentiation import expm1_minus_x
-from diffsim_ti.materials.calculus.isochoric import isochoric
 from diffsim_ti.materials.calculus.stretches import sum_over_stretches
-from diffsim_ti.materials.calculus.tensor import invariants
+from diffsim_ti.materials.calculus.tensor import invariants, isochoric
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range, number_of_terms, summed
 

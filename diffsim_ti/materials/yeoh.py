@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.materials.calculus.isochoric import isochoric
-from diffsim_ti.materials.calculus.tensor import invariants
+from diffsim_ti.materials.calculus.tensor import invariants, isochoric
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 

@@ -11,8 +11,7 @@ from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.collision_surface import cuts_of
 from diffsim_ti.mesh.face_points import bow
-from diffsim_ti.terms.described import chosen_width, positive
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import Term, chosen_width, positive
 
 
 class SelfContact(Term):

@@ -6,6 +6,7 @@ A kernel works on one tetrahedron with scalars, or on eight at a time with lanes
 
 import taichi as ti
 
+from diffsim_ti.differentiation import Number, expm1_minus_x, log1p, x_minus_log1p
 from diffsim_ti.runtime import at, let, traced
 
 
@@ -180,3 +181,12 @@ def of_six(numbers) -> Tensor:
 def six_adjoint(numbers, half) -> Tensor:
     """The adjoint, symmetric, of a symmetric tensor for those of its six numbers."""
     return of_six([x if i == j else let(half * x) for x, (i, j) in zip(numbers, PAIRS)])
+
+
+def isochoric(H: Tensor) -> tuple[Number, Number, Number]:
+    """(J^(-2/3) I_C - 3, J - 1, log J) of F = I + H, with all digits near rest; J > 0."""
+    _, j, s = invariants(H)  # s = I_C - 3 - 2 j
+    log = log1p(j)
+    more = expm1_minus_x(log * (-2 / 3))  # J^(-2/3) = 1 - 2/3 log J + more
+    # all parts are of second order in H: nothing cancels
+    return s + 2 * x_minus_log1p(j) + 3 * more + (more - log * (2 / 3)) * (s + 2 * j), j, log

@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
 from diffsim_ti.runtime import traced
-from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
 from diffsim_ti.terms.obstacles.primitives import BALL, CAPSULE
+from diffsim_ti.terms.term import extent, place
 
 
 def radial(g, r):

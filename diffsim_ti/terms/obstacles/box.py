@@ -10,11 +10,11 @@ from typing_extensions import Unpack
 from diffsim_ti.common.checked import numbers, shape_of
 from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.runtime import traced
-from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.ball import check_axis, radial
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions
 from diffsim_ti.terms.obstacles.primitives import BOX, PrismPrimitives
+from diffsim_ti.terms.term import extent, place
 
 
 @traced

@@ -11,9 +11,9 @@ from diffsim_ti.common.origin import far_part
 from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import NearestPoint
 from diffsim_ti.runtime import traced
-from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce, ObstacleOptions
+from diffsim_ti.terms.term import place
 
 
 @dataclass(frozen=True)

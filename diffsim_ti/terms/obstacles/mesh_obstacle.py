@@ -14,7 +14,6 @@ from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import at, let, traced
-from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
 from diffsim_ti.terms.obstacles.primitives import Primitives
@@ -22,6 +21,7 @@ from diffsim_ti.terms.obstacles.surface_distance import SurfaceDistance
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
 from diffsim_ti.terms.obstacles.turning import rotation_matrix
+from diffsim_ti.terms.term import place
 
 
 class MeshObstacle(Obstacle):
