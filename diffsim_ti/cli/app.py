@@ -117,20 +117,19 @@ def _lines_on_stderr() -> Iterator[None]:
 
 # ---- commands ---------------------------------------------------------------------------------------------------------
 
+OUTPUT = "folder for a series and a picture of the end (default output/simulate), or a file by its suffix: "
+OUTPUT += f"{opt.SUFFIXES}; may be repeated"
+ACCURACY = (
+    "also say what mesh, steps, solver and rounding cost the height of the centre of mass at the end, and draw the "
+)
+ACCURACY += "share of each tetrahedron; of implicit solvers; without --dt by steps as long as the last ones"
+
 
 @app.command()
 def simulate(
     context: typer.Context,
     mesh: opt.MeshFile,
-    output: Annotated[
-        list[Path] | None,
-        Option(
-            "--output",
-            "-o",
-            help="folder for a series and a picture of the end (default output/simulate), or a file by its suffix: "
-            f"{opt.SUFFIXES}; may be repeated",
-        ),
-    ] = None,
+    output: Annotated[list[Path] | None, Option("--output", "-o", help=OUTPUT)] = None,
     material: opt.MaterialName = "StableNeoHookean",
     youngs_modulus: opt.Youngs = 1e5,
     poissons_ratio: opt.Poisson = 0.4,
@@ -158,14 +157,7 @@ def simulate(
     ground_friction: Annotated[float, Option(help="Coulomb's coefficient of the floor")] = 0.0,
     azimuth: Annotated[float, Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
     arrows: opt.Arrows = None,
-    accuracy: Annotated[
-        bool,
-        Option(
-            "--accuracy",
-            help="also say what mesh, steps, solver and rounding cost the height of the centre of mass at the end, and draw "
-            "the share of each tetrahedron; of implicit solvers; without --dt by steps as long as the last ones",
-        ),
-    ] = False,
+    accuracy: Annotated[bool, Option("--accuracy", help=ACCURACY)] = False,
     backend: opt.Backend = "cpu",
     precision: opt.Precision = "f32",
     threads: opt.Threads = None,

@@ -20,16 +20,13 @@ PUBLISHED = {  # words of headers, and what of them is said of the source
     "strain calculation": "strain {}",
     "material supplier": "rubber of {}",
 }
+TESTS = (
+    "CSV of a tensile test with a line of titles, such as stretch;stress [MPa]; several, or a folder, make a library"
+)
 
 
 def fit(
-    tests: Annotated[
-        list[Path],
-        Argument(
-            help="CSV of a tensile test with a line of titles, such as stretch;stress [MPa]; several, or a "
-            "folder, make a library"
-        ),
-    ],
+    tests: Annotated[list[Path], Argument(help=TESTS)],
     equibiaxial: Annotated[list[Path] | None, Option(help="of the same material, in equibiaxial tension")] = None,
     planar: Annotated[list[Path] | None, Option(help="of the same material, in planar tension (pure shear)")] = None,
     name: Annotated[str | None, Option(help="of the material; default from the file's name")] = None,
@@ -45,9 +42,7 @@ def fit(
     files = sorted(file for file in found if file in tests or file.suffix.lower() == ".csv")
     if not files:
         raise ValueError(f"{', '.join(map(str, tests))}: there is no CSV file")
-    others = [
-        (file, kind) for kind, given in (("equibiaxial", equibiaxial), ("planar", planar)) for file in given or []
-    ]
+    others = [(file, "equibiaxial") for file in equibiaxial or []] + [(file, "planar") for file in planar or []]
     if len(files) > 1 and (others or name or density):
         raise ValueError("--equibiaxial, --planar, --name and --density are of one material: give one file")
     entries, failed = {}, []
@@ -89,9 +84,8 @@ def title(stem: str) -> str:
 def _about(tests: list[TensileTest], source: str) -> dict:
     header = tests[0].header
     parts = [form.format(header[key].strip()) for key, form in PUBLISHED.items() if header.get(key, "").strip()]
-    out = dict(
-        source="; ".join([*parts, *([source] if source else [])]), said=[text for test in tests for text in test.said]
-    )
+    parts += [source] if source else []
+    out = dict(source="; ".join(parts), said=[text for test in tests for text in test.said])
     for unit, factor in (("g/cm", 1e3), ("g/cc", 1e3), ("kg/m", 1.0)):
         known = of_header(header, "density", unit)
         if known and factor * known > 100:

@@ -59,15 +59,13 @@ def numbers_of(unknown: list[str]) -> dict[str, float]:
     return guesses
 
 
+DATA = "CSV with columns time, marker, x, y, z [s, m], all markers at time 0; or "
+DATA += "displacement, force [m, N], in equilibrium, without the weight"
+
+
 def identify(
     mesh: MeshFile,
-    data: Annotated[
-        Path,
-        Argument(
-            help="CSV with columns time, marker, x, y, z [s, m], all markers at time 0; or displacement, force [m, N], in "
-            "equilibrium, without the weight"
-        ),
-    ],
+    data: Annotated[Path, Argument(help=DATA)],
     unknown: Annotated[list[str], Option(help="input=guess, such as youngs_modulus=1e5; may be repeated")],
     noise: Annotated[float, Option(help="standard deviation of a coordinate [m], or of a force [N]")],
     material: MaterialName = "StableNeoHookean",

@@ -102,13 +102,11 @@ MaterialName = Annotated[str, Option(help="the law, by class name; capitals do n
 Youngs = Annotated[float, Option("--youngs-modulus", "-E", help="Young's modulus [Pa]")]
 Poisson = Annotated[float, Option("--poissons-ratio", "--nu", help="Poisson's ratio [-]")]
 Density = Annotated[float, Option(help="[kg/m^3]")]
-Arrows = Annotated[
-    list[str] | None,
-    Option(
-        help="forces to draw as arrows and to write: reaction (of supports), contact, friction (its part); of a saved "
-        "series those that it contains; may be repeated"
-    ),
-]
+ARROWS = (
+    "forces to draw as arrows and to write: reaction (of supports), contact, friction (its part); of a saved series "
+)
+ARROWS += "those that it contains; may be repeated"
+Arrows = Annotated[list[str] | None, Option(help=ARROWS)]
 Volume = Annotated[str, Option(help="where a change of volume is resisted: tetrahedra, or patches (near nu = 0.5)")]
 Order = Annotated[int, Option(help="1: linear tetrahedra; 2: ten-node ones of the same mesh, which bend right")]
 Backend = Annotated[str, Option(help="cpu, cuda or vulkan")]
@@ -116,12 +114,8 @@ Precision = Annotated[str, Option(help="f32 or f64")]
 Threads = Annotated[int | None, Option(help="CPU threads, default all")]
 SUFFIXES = f"{', '.join(WRITERS)} (run_%04d.png: every frame, run.png: the end)"
 Fixed = Annotated[list[str] | None, Option(help="vertex set, or xmin .. zmax, to fix; may be repeated")]
-Config = Annotated[
-    Path | None,
-    Option(
-        is_eager=True, callback=read_options, help="TOML file of options (--write-config); those typed beside it win"
-    ),
-]
+CONFIG = "TOML file of options (--write-config); those typed beside it win"
+Config = Annotated[Path | None, Option(is_eager=True, callback=read_options, help=CONFIG)]
 WriteConfig = Annotated[Path | None, Option(help="write all options to this TOML file, and stop")]
 Workers = Annotated[int, Option(help="processes that share the work")]
 Folder = Annotated[Path, Option("--output", "-o", help="folder for what is written")]

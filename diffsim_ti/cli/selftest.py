@@ -60,21 +60,14 @@ def _scenes() -> dict[str, tuple]:
     # so that the way to it does not count
     solved = dict(tolerance=1e-10) if runtime.check_precision(None) == "f64" else {}
     by_E, by_speed = "youngs_modulus", "initial_velocities"
+    by_pull, by_c10 = f"{by_E} traction", f"c10 {by_speed}"
     return {
         "beam, velocity Verlet": (lambda: verlet(_scene(soft, **held), 2e-3), 20, "youngs_modulus gravity"),
         "throw, friction": (lambda: euler(_scene(soft, floor, **thrown), 1e-3), 30, "poissons_ratio friction"),
         "two bodies meet": (lambda: backward(_scene(soft, touch, **meeting), 2e-3, **solved), 10, f"{by_E} {by_speed}"),
         "cable, viscous body": (lambda: euler(_scene(viscous, cable, **held), 1e-3), 20, "density cable_tension"),
-        "traction, backward Euler": (
-            lambda: backward(_scene(soft, pull, **held), 0.02, **solved),
-            4,
-            f"{by_E} traction",
-        ),
-        "rubber on a floor, BDF2": (
-            lambda: bdf2(_scene(rubber, floor, **thrown), 0.01, **solved),
-            5,
-            f"c10 {by_speed}",
-        ),
+        "traction, backward Euler": (lambda: backward(_scene(soft, pull, **held), 0.02, **solved), 4, by_pull),
+        "rubber on a floor, BDF2": (lambda: bdf2(_scene(rubber, floor, **thrown), 0.01, **solved), 5, by_c10),
         "ten nodes, midpoint rule": (lambda: midpoint(_scene(soft, mesh=_bar(2), **held), 0.02, **solved), 3, by_E),
         "equilibrium, nu = 0.49": (lambda: static(_scene(stiff, press, **squeezed)), 1, "poissons_ratio pressure"),
         "equilibrium by rest shape": (lambda: static(_scene(soft, **held)), 1, "rest_positions"),

@@ -16,17 +16,13 @@ from diffsim_ti.cli import options as opt
 from diffsim_ti.common.progress import progress
 from diffsim_ti.solvers import SOLVERS, StaticSolver
 
+PROBLEM = "oscillator, lame, lame-gradient, beam, sag, bounce, bounce-gradient, identify; a mesh; or "
+PROBLEM += "a Python file that defines scene, which is run"
 Quick = Annotated[bool, Option("--quick", help="small meshes, few steps: seconds instead of minutes")]
 
 
 def chart(
-    problem: Annotated[
-        str,
-        Argument(
-            help="oscillator, lame, lame-gradient, beam, sag, bounce, bounce-gradient, "
-            "identify; a mesh; or a Python file that defines scene, which is run"
-        ),
-    ],
+    problem: Annotated[str, Argument(help=PROBLEM)],
     output: opt.Folder = Path("output/chart"),
     quick: Quick = False,
     duration: Annotated[float, Option(help="of a scene of one's own [s]")] = 0.2,

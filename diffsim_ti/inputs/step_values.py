@@ -38,7 +38,9 @@ class StepValues:
         for name in given:
             if name not in self.names:
                 raise ValueError(self._unknown(name))
-        out = {name: self._staying(name, x) if self.is_ramp(name) else x for name, x in last.items()}
+        out = dict(last)
+        for name in filter(self.is_ramp, last):
+            out[name] = self.join([self._end(name, last[name])] * 2, int(name in self._own))
         for name, value in given.items():
             tensor = self.takes_tensors and hasattr(value, "detach")
             if getattr(value, "requires_grad", False) and not tensor:
@@ -65,10 +67,6 @@ class StepValues:
 
     def _end(self, name: str, rows):
         return rows[:, -1] if name in self._own else rows[-1]
-
-    def _staying(self, name: str, rows):
-        end = self._end(name, rows)
-        return self.join([end, end], int(name in self._own))
 
     def _of_step(self, name: str, value, step: int, last: Mapping):
         described, ramp = self.inputs.described[name], self.is_ramp(name)

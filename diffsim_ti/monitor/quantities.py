@@ -44,13 +44,13 @@ class ObserverKernels:
 
     @ti.func
     def observe_point(self, k, H: A, P: A, out: A):
-        F = H.matrix() + ti.Matrix.identity(self.element.types.fp, 3)
+        F = H.matrix() + ti.Matrix.identity(self.element.fp, 3)
         det = F.determinant()
         S = P.matrix() @ F.transpose() / det  # Cauchy
         out.J[k] = det
         a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
         shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
-        out.von_mises[k] = ti.sqrt(ti.cast(0.5, self.element.types.fp) * (a * a + b * b + c * c) + 3 * shear)
+        out.von_mises[k] = ti.sqrt(ti.cast(0.5, self.element.fp) * (a * a + b * b + c * c) + 3 * shear)
         if ti.static(self.features.order == 2):
             for i in ti.static(range(3)):
                 out.stress[i, k] = ti.Vector([S[i, 0], S[i, 1], S[i, 2], 0])

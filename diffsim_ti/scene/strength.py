@@ -33,7 +33,7 @@ def check_strength(scene: Scene) -> None:
     impact = rho * (own**2 + 2 * max(pull, 0.0) * fall)
     if max(weight, impact) <= E:
         return
-    enough = rounded_up(MARGIN * max(weight, impact))
+    enough = rounded(MARGIN * max(weight, impact), 1)
     advice = f"raise Young's modulus to {enough:g} Pa"
     if weight > E:
         raise ValueError(
@@ -41,20 +41,14 @@ def check_strength(scene: Scene) -> None:
             f"modulus, {E:.3g} Pa: {advice}, or make it smaller"
         )
     height = (E / MARGIN / rho - own**2) / (2 * pull) if pull > 0 else 0.0
-    lower = f", or let it fall from at most {rounded_down(height):g} m" if fall > height > 0 else ""
+    lower = f", or let it fall from at most {rounded(height, -1):g} m" if fall > height > 0 else ""
     raise ValueError(
         f"the body meets the floor at {math.sqrt(impact / rho):.3g} m/s, faster than waves run through it, sqrt(E / "
         f"density) = {math.sqrt(E / rho):.3g} m/s, and is crushed whatever the step: {advice}{lower}"
     )
 
 
-def rounded_up(x: float) -> float:
-    """With two digits."""
+def rounded(x: float, way: int) -> float:
+    """Up (1) or down (-1), with two digits."""
     unit = 10.0 ** (math.floor(math.log10(x)) - 1)
-    return math.ceil(x / unit * (1 - 1e-12)) * unit
-
-
-def rounded_down(x: float) -> float:
-    """With two digits."""
-    unit = 10.0 ** (math.floor(math.log10(x)) - 1)
-    return math.floor(x / unit * (1 + 1e-12)) * unit
+    return way * math.ceil(way * x / unit * (1 - way * 1e-12)) * unit

@@ -39,11 +39,6 @@ def lame_mode(X: np.ndarray, a: float = 1.0) -> np.ndarray:
     return np.stack([np.cos(p * x) * np.sin(p * y), -np.sin(p * x) * np.cos(p * y), 0 * z], 1)
 
 
-def lame_share(X: np.ndarray) -> np.ndarray:
-    """Weights that give the mode's share [m] in displacements: its projection by least squares."""
-    return lame_mode(X) / (lame_mode(X) ** 2).sum()
-
-
 def lame_share_by_mass(mesh: TetrahedralMesh) -> np.ndarray:
     """Weights that give the mode's share [m], weighed by mass: what the mesh mixes in counts squared only."""
     shares = np.outer(mesh.volumes, mesh.reference.lumped)
@@ -75,7 +70,8 @@ def lame(nu: float = 0.3) -> Problem:
     omega = lame_omega(nu)
 
     def frequency(frames, _):
-        q = np.tensordot(frames.displacements.astype(float), lame_share(frames.inputs["rest_positions"]), 2)
+        mode = lame_mode(frames.inputs["rest_positions"])  # its share: the projection by least squares
+        q = np.tensordot(frames.displacements.astype(float), mode / (mode**2).sum(), 2)
         return fit_oscillation(frames.times, q / LAME["reach"], omega)
 
     said = "lame", f"Lamé mode of a free cube, nu = {nu:g}, closed form", "error of frequency and decay"

@@ -159,21 +159,19 @@ class StabilityMap:
     def silent(self) -> list[str]:
         """Runs that went wrong without an error."""
         return [
-            f"{self.solver}, {self.axis.name} {value:g} {self.axis.unit}, dt {share * limit:.3g} s ({share:.2g} of the "
-            f"limit): {run.said}; energy rose by {run.rise:.2g} of what moves"
-            for share, row in zip(self.shares, self.runs)
-            for value, limit, run in zip(self.axis.values, self.limits, row)
-            if run.outcome == "wrong silently"
+            f"{row['solver']}, {row['axis']} {row['value']:g} {self.axis.unit}, dt {row['dt']:.3g} s ({row['share']:.2g} of "
+            f"the limit): {row['said']}; energy rose by {row['rise']:.2g} of what moves"
+            for row in self.rows()
+            if row["outcome"] == "wrong silently"
         ]
 
     def rows(self) -> list[dict]:
         """One row per run, for a table."""
-        return [
-            dict(solver=self.solver, axis=self.axis.name, value=value, dt=share * limit, share=share, limit=limit)
-            | asdict(run)
-            for share, row in zip(self.shares, self.runs)
-            for value, limit, run in zip(self.axis.values, self.limits, row)
-        ]
+        own, out = dict(solver=self.solver, axis=self.axis.name), []
+        for share, runs in zip(self.shares, self.runs):
+            for value, limit, run in zip(self.axis.values, self.limits, runs):
+                out.append(own | dict(value=value, dt=share * limit, share=share, limit=limit) | asdict(run))
+        return out
 
 
 SHARES = {

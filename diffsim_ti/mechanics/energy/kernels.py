@@ -175,11 +175,11 @@ class PotentialKernels:
     def tangent_column(self, e, scene, at, c, tangent):
         """Column c of d2psi/dF2 at each point q, nine numbers, to rows 81 q + 9 c .. 81 q + 9 c + 8 of its block."""
         el = self.element
-        dH = Tensor(el.broadcast(ti.cast(c == k, self.fp)) for k in range(9))
+        dH = Tensor(el.items.broadcast(ti.cast(c == k, self.fp)) for k in range(9))
 
         def see(q, H, numbers):
             dP = self.law.stress_differential(H, dH, numbers)
-            el.put(tangent, 81 * len(el.points), e, 81 * q + 9 * c, dP.numbers)
+            el.items.put(tangent, 81 * len(el.points), e, 81 * q + 9 * c, dP.numbers)
 
         el.each_seen(e, scene, at, 0, see)
 
@@ -191,12 +191,12 @@ class PotentialKernels:
         zero = ti.cast(0, self.fp)
         N = [[let(sum_of(B[a, j] for a in range(3)) * ti.cast(-1, self.fp)) for j in range(3)]]
         N += [[B[a, j] for j in range(3)] for a in range(3)]
-        C = [el.numbers(tangent, 9 * (3 * d + k), 9, 81, e) for k in range(3)]
+        C = [el.items.numbers(tangent, 9 * (3 * d + k), 9, 81, e) for k in range(3)]
         forces = []
         for a in range(4):
             dP = [let(sum_of(C[k][m] * N[a][k] for k in range(3)) * volume) for m in range(9)]
             forces.append([let(sum_of(dP[3 * i + j] * N[a][j] for j in range(3))) for i in range(3)])
-        el.store_corners(corners, e, forces, zero, first=first)
+        el.items.store(corners, e, forces, zero, first=first)
 
     @ti.func
     def contact_column(self, i, d, at: A, scene: A, pass_: A, plan: A):

@@ -93,7 +93,7 @@ class FrozenStrainKernels:
 
     @traced
     def hold_vjp(self, e, scene, at, adjoint, plan):
-        el, points = self.element, len(self.element.points)
+        el = self.element
         for s, (a, corner) in enumerate(zip(self.weights(plan), (adjoint.corner, adjoint.corner_before))):
             pushes = []
             for q, D in enumerate(el.edges(e, scene, at.u, s)):
@@ -102,7 +102,7 @@ class FrozenStrainKernels:
                 by_H = add_to_diagonal(D @ B, 1) @ by_E * a
                 pushes.append((by_H * self.law.real(-1)) @ B.transpose())
                 if self.features.shape:
-                    el.items.add(adjoint.gradients, 9 * points, e, (D.transpose() @ by_H).numbers, 9 * q)
+                    el.add_shape(e, adjoint, q, D.transpose() @ by_H)
             el.store(e, corner, pushes)
 
     @ti.func

@@ -2,7 +2,7 @@
 the frames of a run."""
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 import taichi as ti
@@ -81,12 +81,6 @@ class LawStateKernels:
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         return Kernel(name, body, self.law.precision, dict(scene=SCENE) | arrays, NUMBERS)
-
-
-@lru_cache(maxsize=None)
-def law_state_kernels(law, features: Features, parallel: bool, lanes: bool) -> LawStateKernels:
-    """Kernels for a law and a scene's features."""
-    return LawStateKernels(law, features, parallel, lanes)
 
 
 class LawFrames:

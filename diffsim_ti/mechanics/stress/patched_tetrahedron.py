@@ -195,7 +195,7 @@ class PatchedTetrahedron(Tetrahedron):
                 in_patch = patch.dtheta_p * (
                     patch.theta_p * (patch.lam - patch.lam_p - patch.lam_p) + patch.lam_p * theta
                 )
-                self._add_shape(item, adjoint, q, by_B, ti.cast(-1, self.fp) * (inner(P, dH) + in_patch))
+                self.add_shape(item, adjoint, q, by_B, ti.cast(-1, self.fp) * (inner(P, dH) + in_patch))
             by = self.law.split_vjp(by_p, let(minus * patch.theta_p * patch.dtheta_p))
             return [(dP * volume) @ B.transpose()], by
 

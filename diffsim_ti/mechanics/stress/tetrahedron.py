@@ -11,7 +11,6 @@ corner_of.
 
 from dataclasses import dataclass
 from functools import cached_property
-from types import SimpleNamespace
 
 import taichi as ti
 
@@ -20,7 +19,7 @@ from diffsim_ti.materials.law import Law
 from diffsim_ti.mechanics.stress.growing import Growing
 from diffsim_ti.mechanics.stress.items import Block, Single
 from diffsim_ti.mechanics.stress.nodes import Nodes, nodes_of
-from diffsim_ti.runtime import LANES, Bundle, assign, let, traced, variable
+from diffsim_ti.runtime import Bundle, assign, let, traced, variable
 from diffsim_ti.runtime import at as entry
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -97,19 +96,6 @@ class Tetrahedron(Growing):
     def points(self) -> range:
         """Where the law is evaluated."""
         return range(self.nodes.points)
-
-    @cached_property
-    def types(self) -> SimpleNamespace:
-        """Types of kernels' arguments."""
-        fp, vector, lanes, array = self.fp, self.items.vector, ti.types.vector(LANES, self.fp), ti.types.ndarray
-        one = dict(blocks=array(lanes, 1), scalars=array(fp, 1), vectors=array(vector, 1), ints=array(ti.i32, 1))
-        return SimpleNamespace(fp=fp, vector=vector, scalars2=array(fp, 2), vectors2=array(vector, 2), **one)
-
-    # what kernels that write numbers of their own need of the items
-    numbers = property(lambda self: self.items.numbers)
-    put = property(lambda self: self.items.put)
-    store_corners = property(lambda self: self.items.store)
-    broadcast = property(lambda self: self.items.broadcast)
 
     @property
     def is_short(self) -> bool:
@@ -214,7 +200,7 @@ class Tetrahedron(Growing):
     @ti.func
     def gather(self, i, scene: A, corner: A):
         """Sum of the corners that meet at vertex i, in a fixed order."""
-        f = self.types.vector(0)
+        f = self.items.vector(0)
         for c in range(scene.start[i], scene.start[i + 1]):
             f = f + corner[scene.corner_of[c]]
         return f
@@ -311,7 +297,7 @@ class Tetrahedron(Growing):
             if shape:
                 (P,) = P
                 by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
-                self._add_shape(item, adjoint, q, by_B * minus, ti.cast(-1, self.fp) * inner(P, dH))
+                self.add_shape(item, adjoint, q, by_B * minus, ti.cast(-1, self.fp) * inner(P, dH))
             return pushes, own
 
         edges = [*self._edges_read(item, scene, at, s), self.edges(item, scene, w, 0)]
@@ -324,11 +310,12 @@ class Tetrahedron(Growing):
         self.add_growth(item, adjoint, by_p, scene)
 
     @traced
-    def _add_shape(self, item, adjoint, q, by_B: Tensor, by_V) -> None:
+    def add_shape(self, item, adjoint, q, by_B: Tensor, by_V=None) -> None:
         """Add adjoints of B and V of point q."""
         points = self.nodes.points
         self.items.add(adjoint.gradients, 9 * points, item, by_B.numbers, 9 * q)
-        self.items.add(adjoint.volumes, points, item, [by_V], q)
+        if by_V is not None:
+            self.items.add(adjoint.volumes, points, item, [by_V], q)
 
     @traced
     def _parted(self, numbers: list) -> tuple[list, list]:
@@ -388,8 +375,7 @@ class Tetrahedron(Growing):
             self.items.add(adjoint.coefficients, len(by_p), item, by_p)
             self.add_growth(item, adjoint, by_p, scene)
             if shape:
-                points = self.nodes.points
-                self.items.add(adjoint.gradients, 9 * points, item, (D.transpose() @ by_H).numbers, 9 * q)
+                self.add_shape(item, adjoint, q, D.transpose() @ by_H)
             return [(by_H * ti.cast(-1, self.fp)) @ B.transpose()], ()
 
         self.store(item, corner, self.each_point([self._edges_onwards(item, scene, at, s, u_slot)], move)[0][0])

@@ -15,11 +15,12 @@ from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.frozen_strains import FrozenStrains
-from diffsim_ti.mechanics.stress.law_state import law_state_kernels
+from diffsim_ti.mechanics.stress.law_state import LawStateKernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
 from diffsim_ti.mechanics.surfaces.pair_shares import PairShares
 from diffsim_ti.monitor.energy_watch import EnergyWatch
+from diffsim_ti.runtime import kernels_of
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.implicit.closing import Closing
 from diffsim_ti.solvers.implicit.load_stepping import LoadStepping
@@ -193,7 +194,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     def launch_law_state(self, name: str, features, j: int, slot: int, end: int, **records) -> None:
         """Launch one of the LawStateKernels for pass j, from z in `slot` and u in slot `end`."""
         a = self.arrays
-        kernel = getattr(law_state_kernels(a.law, features, self.parallel, a.in_lanes), name)
+        kernel = getattr(kernels_of(LawStateKernels, a.law, features, self.parallel, a.in_lanes), name)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices, slot=slot, end=end)
         self.bound(kernel, **records)(**sizes, h=float(self.solver.schedule.length(j)))
 
