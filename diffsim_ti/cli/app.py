@@ -17,7 +17,6 @@ from typer import Option
 from diffsim_ti import runtime
 from diffsim_ti.cli import options as opt
 from diffsim_ti.cli import study, view
-from diffsim_ti.cli.check import check
 from diffsim_ti.cli.fit import fit
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.selftest import selftest
@@ -25,6 +24,8 @@ from diffsim_ti.common import interrupts
 from diffsim_ti.common.progress import LOG
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.doctor import findings, mended, step_in_words
+from diffsim_ti.mesh.files import read_mesh
 from diffsim_ti.monitor.stability import element_limit
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
@@ -43,7 +44,7 @@ app = typer.Typer(
     "in one line on stderr; 130 interrupted.",
 )
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
-measuring = study.chart, study.stability, study.growth, study.recommend, study.sweep, identify, fit, check, selftest
+measuring = study.chart, study.stability, study.growth, study.recommend, study.sweep, identify, fit, selftest
 for command in (*measuring, view.render, view.view):
     app.command()(command)
 
@@ -217,6 +218,35 @@ def info(
     print(f"  {element_limit(scene)}")
     if tight:
         print(f"  {stable_dt(scene)}")
+
+
+@app.command()
+def check(
+    mesh: opt.MeshFile,
+    mend: Annotated[Path | None, Option(help="write the mesh there without what can be mended in one way only")] = None,
+) -> None:
+    """Say what may be wrong with a mesh file, with a remedy for each; exit code 1 if there is anything."""
+    parts, left_out = read_mesh(mesh)
+    found = findings(parts)
+    for text in left_out:
+        print(f"- left out: {text}")
+    print(found)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            vertices, elements, vertex_sets, tetrahedron_sets, triangles = mended(parts)
+            sets = dict(vertex_sets=vertex_sets, tetrahedron_sets=tetrahedron_sets, surface_sets=triangles)
+            body = TetrahedralMesh(vertices, elements, **sets)
+            print(f"- {step_in_words(body)}")
+        except ValueError as error:
+            if mend:
+                raise
+            print(f"- it cannot be used as it is: {error}")
+        if mend:
+            body.save(mend)
+            print(f"written: {mend}, with {sum(finding.mended for finding in found)} of {len(found)} findings mended")
+    if found or left_out:
+        raise typer.Exit(1)
 
 
 @app.command("check-gradients")

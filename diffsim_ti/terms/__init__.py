@@ -2,11 +2,10 @@
 
 from diffsim_ti.terms.body_forces import Drag, Gravity, RotatingFrame
 from diffsim_ti.terms.chambers import Chamber, FilledChamber, GasChamber
-from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.growth import Growth
 from diffsim_ti.terms.lines import Anchor, Cable, Spring
-from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
+from diffsim_ti.terms.loads import BodyForce, ExternalForce, Load, Pressure, RemoteLoad, Traction
 from diffsim_ti.terms.multi_point_constraint import MultiPointConstraint
 from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
@@ -16,7 +15,6 @@ from diffsim_ti.terms.obstacles.half_space import HalfSpace
 from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.pose import Pose
-from diffsim_ti.terms.remote_load import RemoteLoad
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.surface_drag import SurfaceDrag
 from diffsim_ti.terms.term import Term, VertexForce
