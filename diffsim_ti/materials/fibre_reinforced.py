@@ -14,8 +14,8 @@ UNITS = {"k1": "Pa", "k2": "-", "fibre": "-"}
 
 
 @dataclass(frozen=True)
-class FibreLaw(EnergyLaw):
-    """psi = k1/(2 k2) (exp(k2 e^2) - 1), e = max(a . C a / |a|^2 - 1, 0)
+class FibreReinforcedLaw(EnergyLaw):
+    """What fibres add: psi = k1/(2 k2) (exp(k2 e^2) - 1), e = max(a . C a / |a|^2 - 1, 0)
 
     Where fibres are just slack, as in a body at rest, the stiffness is the mean of both sides, for any change of shape.
     """
@@ -29,15 +29,6 @@ class FibreLaw(EnergyLaw):
         e = along / sum(x * x for x in a)
         taut = where(e > 0, e, where(e < 0, 0, e / 2))
         return k1 / (2 * k2) * (exp(k2 * e * taut) - 1)
-
-
-@dataclass(frozen=True)
-class FibreReinforcedLaw(SumLaw):
-    """The sum of a law and of what fibres add."""
-
-    @property
-    def added(self) -> FibreLaw:
-        return FibreLaw(self.precision)
 
 
 class FibreReinforced(Around):
@@ -75,4 +66,4 @@ class FibreReinforced(Around):
         return mu + 2 * np.asarray(values[self.own[0]]), lam
 
     def law(self, precision):
-        return FibreReinforcedLaw(precision, self.material.law(precision))
+        return SumLaw(precision, self.material.law(precision), FibreReinforcedLaw(precision))

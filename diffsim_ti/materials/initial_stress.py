@@ -12,22 +12,13 @@ from diffsim_ti.materials.sum_law import SumLaw
 
 
 @dataclass(frozen=True)
-class ConstantStressLaw(EnergyLaw):
+class InitialStressLaw(EnergyLaw):
     """psi = S : E of a constant second Piola-Kirchhoff stress S and Green's strain E."""
 
     coefficient_names = ("S_xx", "S_yy", "S_zz", "S_yz", "S_xz", "S_xy")
 
     def psi(self, H, p):
         return inner(of_six(p), green_strain(H, 0.5))
-
-
-@dataclass(frozen=True)
-class InitialStressLaw(SumLaw):
-    """The sum of a law and of a constant stress."""
-
-    @property
-    def added(self) -> ConstantStressLaw:
-        return ConstantStressLaw(self.precision)
 
 
 class InitialStress(Around):
@@ -56,10 +47,8 @@ class InitialStress(Around):
 
     def lame(self, values):
         mu, lam = self.material.lame(self.inner(values))
-        tension = np.linalg.norm(
-            values["initial_stress"] * np.sqrt([1, 1, 1, 2, 2, 2]), axis=-1
-        )  # at least its largest
-        return mu + tension / 2, lam
+        S = values["initial_stress"] * np.sqrt([1, 1, 1, 2, 2, 2])
+        return mu + np.linalg.norm(S, axis=-1) / 2, lam  # at least its largest principal value
 
     def law(self, precision):
-        return InitialStressLaw(precision, self.material.law(precision))
+        return SumLaw(precision, self.material.law(precision), InitialStressLaw(precision))

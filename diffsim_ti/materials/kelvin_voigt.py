@@ -7,7 +7,7 @@ import numpy as np
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import SIX, green_strain, green_strain_differential, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.law import as_of
+from diffsim_ti.materials.law import Law, as_of
 from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 from diffsim_ti.materials.sum_law import SumLaw
 from diffsim_ti.runtime import traced
@@ -47,14 +47,7 @@ class ViscousLaw(EnergyLaw):
 class KelvinVoigtLaw(SumLaw):
     """P = P_base + F S. Who looks at a state, where nothing is held, sees the base alone."""
 
-    in_step: bool = False
-
-    viscous = True
-
-    @property
-    def added(self) -> ViscousLaw:
-        return ViscousLaw(self.precision, in_step=self.in_step)
-
+    viscous, title, in_step = True, Law.title, as_of("added", "in_step")
     state_names, initial_state = as_of("base", "state_names"), as_of("base", "initial_state")
     plastic, reads, frozen_names = as_of("base", "plastic"), as_of("added", "reads"), as_of("added", "frozen_names")
 
@@ -67,7 +60,7 @@ class KelvinVoigtLaw(SumLaw):
         return self.base.dissipated and replace(self, base=self.base.dissipated)
 
     def in_steps(self):
-        return replace(self, in_step=True)
+        return replace(self, added=replace(self.added, in_step=True))
 
     @traced
     def _parts(self, q):
@@ -180,4 +173,4 @@ class KelvinVoigt(Around):
         return [by_eta - 2 / 3 * by_lam, by_lam, 0 * by_eta, 0 * by_lam]
 
     def law(self, precision):
-        return KelvinVoigtLaw(precision, self.material.law(precision))
+        return KelvinVoigtLaw(precision, self.material.law(precision), ViscousLaw(precision))

@@ -13,8 +13,9 @@ from diffsim_ti.materials.sum_law import SumLaw
 
 
 @dataclass(frozen=True)
-class BranchesLaw(EnergyLaw):
-    """psi = sum_i g_i (mu |E - z_i|^2 + lam/2 tr(E - z_i)^2); dz_i/dt = (E - z_i) / tau_i, solved exactly for a frozen E."""
+class PronyLaw(EnergyLaw):
+    """Of branches: psi = sum_i g_i (mu |E - z_i|^2 + lam/2 tr(E - z_i)^2); dz_i/dt = (E - z_i) / tau_i, solved
+    exactly for a frozen E."""
 
     terms: int = 1
 
@@ -39,17 +40,6 @@ class BranchesLaw(EnergyLaw):
             share = 1 - exp(-h / p[self.terms + k])
             out += [b + share * (a - b) for a, b in zip(E, z[6 * k : 6 * k + 6])]
         return out
-
-
-@dataclass(frozen=True)
-class PronyLaw(SumLaw):
-    """The sum of a law and of branches."""
-
-    terms: int = 1
-
-    @property
-    def added(self) -> BranchesLaw:
-        return BranchesLaw(self.precision, terms=self.terms)
 
 
 class Prony(Around):
@@ -93,4 +83,4 @@ class Prony(Around):
         return mu + shares * own_mu, lam + shares * own_lam
 
     def law(self, precision):
-        return PronyLaw(precision, self.material.law(precision), self.terms)
+        return SumLaw(precision, self.material.law(precision), PronyLaw(precision, self.terms))

@@ -9,17 +9,17 @@ from diffsim_ti.runtime import let, traced
 
 @dataclass(frozen=True)
 class SumLaw(Law):
-    """A law `base`, and one that a subclass adds to it: `added`, whose coefficients come first; it may have a state.
+    """A law `base`, and `added`, after which the sum is called and whose coefficients come first; it may have a state.
 
     What resists a change of volume is that of the base.
     """
 
     base: Law | None = None
+    added: Law | None = None
 
     @property
-    def added(self) -> Law:
-        """What is added."""
-        raise NotImplementedError
+    def title(self):
+        return f"{self.added.title}({self.base.title})"
 
     @property
     def coefficient_names(self):
