@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import LinearLink, Link
+from diffsim_ti.inputs.chain import AnalyticLink, LinearLink, Link
 from diffsim_ti.inputs.loads import _Together
 from diffsim_ti.mesh.face_points import face_points
 from diffsim_ti.mesh.paths import Paths
@@ -136,7 +136,7 @@ def directions(segments: np.ndarray) -> np.ndarray:
     return np.divide(segments, lengths, out=np.zeros_like(segments), where=lengths > 0)
 
 
-class FoundationStiffness(Link):
+class FoundationStiffness(AnalyticLink):
     """K_i [N/m] of each of some vertices, shape (k, 3, 3): the sum over the triangles around of
 
         A / 3 [t I + (c - t) N N^T]
@@ -151,7 +151,7 @@ class FoundationStiffness(Link):
         self.nodes = np.searchsorted(vertices, faces)
 
     def _to_vertices(self, of_each):
-        out, by_nodes = np.zeros((self.count, 3, 3)), self.points.to_nodes(of_each)
+        out, by_nodes = np.zeros((self.count, 3, 3), of_each.dtype), self.points.to_nodes(of_each)
         for a in range(self.nodes.shape[1]):
             np.add.at(out, self.nodes[:, a], by_nodes[:, a])
         return out
@@ -167,23 +167,13 @@ class FoundationStiffness(Link):
     @staticmethod
     def _parts(n):
         """(A, n n^T / A) of normals as long as the area."""
-        A = np.linalg.norm(n, axis=1)[:, None, None]
+        A = np.sqrt((n * n).sum(1))[:, None, None]
         return A, n[:, :, None] * n[:, None, :] / A
 
-    def _filled(self, A, across, c, t):
-        c, t = (self._at_points(x)[..., None, None] for x in (c, t))
-        return self._to_vertices(t * A * np.eye(3) + (c - t) * across)
-
     def value(self, X, c, t):
-        return (self._filled(*self._parts(self.points.normals(X)), c, t),)
-
-    def jvp(self, x, dx):
-        (X, c, t), (dX, dc, dt) = x, dx
-        n, dn = self.points.normals(X), self.points.normals_jvp(X, dX)
-        A, across = self._parts(n)
-        dA = (n * dn).sum(1)[:, None, None] / A
-        turned = (n[:, :, None] * dn[:, None] + dn[:, :, None] * n[:, None]) / A - across * dA / A
-        return (self._filled(A, across, dc, dt) + self._filled(dA, turned, c, t),)
+        c, t = (self._at_points(x)[..., None, None] for x in (c, t))
+        A, across = self._parts(self.points.normals(X))
+        return (self._to_vertices(t * A * np.eye(3) + (c - t) * across),)
 
     def vjp(self, x, y_adj):
         X, c, t = x

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import LinearLink, Link
+from diffsim_ti.inputs.chain import AnalyticLink, LinearLink, Link
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.face_points import face_points
 
@@ -207,7 +207,7 @@ class PressureRows(_Together):
         return [self._pulled(part, y_adj[0][:, k, :2].T) for k, part in enumerate(x)]
 
 
-class RemoteForces(Link):
+class RemoteForces(AnalyticLink):
     """f_i = a_i (F / A + omega x r_i),    J omega = M + (p - c) x F,    J = sum a_i (|r_i|^2 - r_i r_i^T),
 
     shape (2, rows, k, 3), of (F, M) over time, (2, rows, 6), rest positions and areas a_i of k vertices, A = sum a_i, r_i
@@ -229,20 +229,6 @@ class RemoteForces(Link):
 
     def value(self, load, X, a):
         return (a[:, None] * self._parts(load, X, a)[-1],)
-
-    def jvp(self, x, dx):
-        (load, X, a), (dload, dX, da) = x, dx
-        F, A, r, arm, J, omega, per_area = self._parts(load, X, a)
-        dF, dM, dA = dload[..., :3], dload[..., 3:], da.sum()
-        dc = (da @ r + a @ dX[self.vertices]) / A
-        dr = dX[self.vertices] - dc
-        cross = (r.T * a) @ dr
-        dJ = (da * (r**2).sum(1) + 2 * a * (r * dr).sum(1)).sum() * np.eye(3) - (r.T * da) @ r - cross - cross.T
-        dT = dM + np.cross(arm, dF) - (0.0 if self.point is None else np.cross(dc, F))
-        domega = np.linalg.solve(J, (dT - omega @ dJ)[..., None])[..., 0]
-        change = dF[..., None, :] / A - F[..., None, :] * dA / A**2
-        change = change + np.cross(domega[..., None, :], r) + np.cross(omega[..., None, :], dr)
-        return (da[:, None] * per_area + a[:, None] * change,)
 
     def vjp(self, x, y_adj):
         load, X, a = x
@@ -312,7 +298,7 @@ class RestVolume(Link):
         return (self.enclosure.gradient(x[0]) * y_adj[0],)
 
 
-class MuscleTension(Link):
+class MuscleTension(AnalyticLink):
     """T = alpha s V / L0 [N] in time, shape (2, rows, points): alpha: activations in time as `InTime` has them, of all
     together or of each group; s: stress [Pa], a number or one for each group; V: volume of each of the points `chosen` among
     those of all tetrahedra; L0: length at rest of the segment there; group: that of each point."""
@@ -329,17 +315,11 @@ class MuscleTension(Link):
         """(alpha, s, V, D, L0)"""
         alpha = self._spread(activation.reshape(*activation.shape[:2], -1))
         D = segments[0::2]
-        return alpha, self._spread(stress.reshape(-1)), volumes.ravel()[self.chosen], D, np.linalg.norm(D, axis=1)
+        return alpha, self._spread(stress.reshape(-1)), volumes.ravel()[self.chosen], D, np.sqrt((D * D).sum(1))
 
     def value(self, *x):
         alpha, s, V, _, length = self._parts(*x)
         return (alpha * (s * V / length),)
-
-    def jvp(self, x, dx):
-        alpha, s, V, D, length = self._parts(*x)
-        dalpha, ds, dV, dD, _ = self._parts(*dx)
-        dlength = (D * dD).sum(1) / length
-        return (dalpha * (s * V / length) + alpha * (ds * V + s * dV - s * V * dlength / length) / length,)
 
     def vjp(self, x, y_adj):
         alpha, s, V, D, length = self._parts(*x)
