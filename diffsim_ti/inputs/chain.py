@@ -51,6 +51,12 @@ class AnalyticLink(Link):
         return [y.imag / 1e-30 for y in self.value(*(part + 1e-30j * change for part, change in zip(x, dx)))]
 
 
+def summed_at(places: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
+    """np.bincount of all of x, which may be complex."""
+    parts = [np.bincount(places.ravel(), part.ravel(), count) for part in (x.real, x.imag)[: 1 + np.iscomplexobj(x)]]
+    return parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
+
+
 class Chain:
     """Links one after the other, from some inputs on. What a link wrote is kept for as long as its arrays are the same.
 

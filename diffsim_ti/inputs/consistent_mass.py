@@ -9,12 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Link
+from diffsim_ti.inputs.chain import AnalyticLink
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.reference_element import QUADRATIC, quadrature
 
 
-class ElementMasses(Link):
+class ElementMasses(AnalyticLink):
     """Of densities and rest positions the masses M_ab of each element [kg], shape (m, 10, 10), by a rule that is exact for
     curved edges too: N_a N_b is of degree four, det dX/dxi a cubic."""
 
@@ -36,13 +36,6 @@ class ElementMasses(Link):
 
     def value(self, density, X):
         return (_times(density, self._by_volume(np.linalg.det(self._edges(X)))),)
-
-    def jvp(self, x, dx):
-        (density, X), (d_density, dX) = x, dx
-        D = self._edges(X)
-        det = np.linalg.det(D)
-        d_det = det * np.einsum("eqij,eqji->eq", np.linalg.inv(D), self._edges(dX))
-        return (_times(d_density, self._by_volume(det)) + _times(density, self._by_volume(d_det)),)
 
     def vjp(self, x, y_adj):
         (density, X), (adj,) = x, y_adj

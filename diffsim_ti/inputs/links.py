@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import LinearLink, Link
+from diffsim_ti.inputs.chain import AnalyticLink, LinearLink, Link
 from diffsim_ti.inputs.loads import VertexShares
 
 
@@ -64,7 +64,7 @@ class PerStep(Link):
         return (y_adj[0][0] if x[0].ndim < self.ndim else y_adj[0],)
 
 
-class NearestPoint(Link):
+class NearestPoint(AnalyticLink):
     """The point of a plane that is nearest to o, of any of its points p and a normal n of any length:
 
     q = o + s n,    s = n . (p - o) / n . n
@@ -75,11 +75,6 @@ class NearestPoint(Link):
 
     def value(self, p, n):
         return (self.near + n * (n @ (p - self.near)) / (n @ n),)
-
-    def jvp(self, x, dx):
-        (p, n), (dp, dn) = x, dx
-        s = n @ (p - self.near) / (n @ n)
-        return (s * dn + n * (dn @ (p - self.near) + n @ dp - 2 * s * (n @ dn)) / (n @ n),)
 
     def vjp(self, x, y_adj):
         (p, n), (q_adj,) = x, y_adj

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import AnalyticLink, LinearLink, Link
+from diffsim_ti.inputs.chain import AnalyticLink, LinearLink, Link, summed_at
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.face_points import face_points
 
@@ -39,7 +39,7 @@ class InTime(LinearLink):
         return (out,)
 
 
-class VertexAreas(Link):
+class VertexAreas(AnalyticLink):
     """Of rest positions the area [m^2] of each of some vertices, the integral of its shape function over the given faces
     around it, which is what a constant traction on these asks for: a third of triangles; of flat faces of six nodes a
     third at mid-edge vertices and nothing at corners."""
@@ -51,14 +51,11 @@ class VertexAreas(Link):
         self.nodes, self.count = np.searchsorted(vertices, faces), len(vertices)
 
     def _to_vertices(self, areas):
-        return np.bincount(self.nodes.ravel(), self.points.to_nodes(areas).ravel(), self.count)
+        return summed_at(self.nodes, self.points.to_nodes(areas), self.count)
 
     def value(self, X):
-        return (self._to_vertices(np.linalg.norm(self.points.normals(X), axis=1)),)
-
-    def jvp(self, x, dx):
-        n, dn = self.points.normals(x[0]), self.points.normals_jvp(x[0], dx[0])
-        return (self._to_vertices((n * dn).sum(1) / np.linalg.norm(n, axis=1)),)
+        n = self.points.normals(X)
+        return (self._to_vertices(np.sqrt((n * n).sum(1))),)
 
     def vjp(self, x, y_adj):
         n = self.points.normals(x[0])
@@ -66,7 +63,7 @@ class VertexAreas(Link):
         return (self.points.normals_vjp(x[0], self.points.from_nodes(y_adj[0][self.nodes])[:, None] * unit),)
 
 
-class VertexShares(Link):
+class VertexShares(AnalyticLink):
     """What each of some vertices has of the volume [m^3] or, with density, of the mass [kg] of the given tetrahedra around
     it: a fourth of each, or the shares of lumped masses of ten nodes; times factors of the vertices where there are some."""
 
@@ -77,16 +74,11 @@ class VertexShares(Link):
         self.nodes, self.factors = np.searchsorted(vertices, mesh.elements[chosen]), factors
 
     def _to_vertices(self, of_each):
-        out = np.bincount(self.nodes.ravel(), np.outer(of_each[self.chosen], self.shares).ravel(), self.count)
+        out = summed_at(self.nodes, np.outer(of_each[self.chosen], self.shares), self.count)
         return out if self.factors is None else self.factors * out
 
     def value(self, volumes, *density):
         return (self._to_vertices(density[0] * volumes if density else volumes),)
-
-    def jvp(self, x, dx):
-        if len(x) == 1:
-            return self.value(dx[0])
-        return (self._to_vertices(dx[1] * x[0] + x[1] * dx[0]),)
 
     def vjp(self, x, y_adj):
         by_vertex = y_adj[0] if self.factors is None else self.factors * y_adj[0]
@@ -99,7 +91,7 @@ class VertexShares(Link):
         return by_each * density, by_density if density.ndim else by_density.sum()
 
 
-class ConsistentShares(Link):
+class ConsistentShares(AnalyticLink):
     """What `VertexShares` says by integrals of the shape functions of ten nodes, of volumes or of masses."""
 
     def __init__(self, mesh, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str):
@@ -107,7 +99,7 @@ class ConsistentShares(Link):
         self.chosen, self.count, self.nodes = chosen, len(vertices), np.searchsorted(vertices, mesh.elements[chosen])
 
     def _to_vertices(self, masses):
-        return np.bincount(self.nodes.ravel(), masses[self.chosen].sum(2).ravel(), self.count)
+        return summed_at(self.nodes, masses[self.chosen].sum(2), self.count)
 
     @staticmethod
     def _by(density):
@@ -115,12 +107,6 @@ class ConsistentShares(Link):
 
     def value(self, masses, *density):
         return (self._to_vertices(masses / self._by(density[0]) if density else masses),)
-
-    def jvp(self, x, dx):
-        if len(x) == 1:
-            return self.value(dx[0])
-        rho = self._by(x[1])
-        return (self._to_vertices(dx[0] / rho - x[0] / rho**2 * self._by(dx[1])),)
 
     def vjp(self, x, y_adj):
         masses_adj = np.zeros_like(x[0])
@@ -132,7 +118,7 @@ class ConsistentShares(Link):
         return masses_adj / rho, by_density if x[1].ndim else by_density.sum()
 
 
-class Spread(Link):
+class Spread(AnalyticLink):
     """Forces of vertices, weight times vector, from vectors of shape (2, rows, 3) and one weight for each vertex."""
 
     def __init__(self, reads: Sequence[str], writes: str):
@@ -140,9 +126,6 @@ class Spread(Link):
 
     def value(self, vectors, weights):
         return (vectors[:, :, None] * weights[:, None],)
-
-    def jvp(self, x, dx):
-        return (self.value(dx[0], x[1])[0] + self.value(x[0], dx[1])[0],)
 
     def vjp(self, x, y_adj):
         return np.einsum("brki,k->bri", y_adj[0], x[1]), np.einsum("brki,bri->k", y_adj[0], x[0])
