@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Link
+from diffsim_ti.inputs.chain import AnalyticLink, Link
 
 
 def cross_matrix(a: np.ndarray) -> np.ndarray:
@@ -91,7 +91,7 @@ class Displacement(Link):
         return x_adj, X_adj
 
 
-class RigidVelocity(Link):
+class RigidVelocity(AnalyticLink):
     """v = free(v), and of sets that do not deform that of the nearest rigid motion."""
 
     reads, writes = ("initial_velocities", "displacement", "rest"), ("velocity",)
@@ -112,17 +112,6 @@ class RigidVelocity(Link):
         y = body.apart(X + u)
         inertia_of = inertia(y)
         return y, inertia_of, np.linalg.solve(inertia_of, np.cross(y, v[body.vertices]).sum(0))
-
-    def jvp(self, x, dx):
-        out = np.array(self.free(dx[0]))
-        for body in self.bodies:
-            at = body.vertices
-            y, inertia_of, omega = self._spin(body, *x)
-            dy = body.apart(dx[2] + dx[1])
-            change = 2 * (y * dy).sum() * np.eye(3) - dy.T @ y - y.T @ dy
-            torque = (np.cross(dy, x[0][at]) + np.cross(y, dx[0][at])).sum(0) - change @ omega
-            out[at] = dx[0][at].mean(0) + np.cross(np.linalg.solve(inertia_of, torque), y) + np.cross(omega, dy)
-        return (out,)
 
     def vjp(self, x, y_adj):
         (out_adj,) = y_adj
