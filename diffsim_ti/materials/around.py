@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti.materials.material import Material, _all_values, _short
+from diffsim_ti.materials.material import TINY, Material, _all_values, _short
 
 
 class Around(Material):
@@ -58,12 +58,8 @@ class Around(Material):
         return [*self._columns(values, self.own), *moduli]
 
     def own_coefficients(self, numbers: list) -> list:
-        """Columns, each shape () or (num_tetrahedra,), of these."""
+        """Columns, each shape () or (num_tetrahedra,), of these, which may be complex."""
         return numbers
-
-    def own_jvp(self, numbers: list, changes: list) -> list:
-        """Their changes."""
-        return changes
 
     def own_vjp(self, numbers: list, by_columns: list) -> list:
         """Adjoints of the numbers, those of each tetrahedron."""
@@ -85,8 +81,11 @@ class Around(Material):
         by_moduli = ()
         if self.takes_moduli:
             by_moduli = self.isotropic.lame_jvp(self._moduli_values(values), self._moduli_values(tangents))
-        columns = self.own_jvp(self._numbers_of(values), [*self._columns(own, self.own), *by_moduli])
-        return self._joined(columns, self.material.coefficients_jvp(self.inner(values), self.inner(tangents)))
+        changes = [*self._columns(own, self.own), *by_moduli]
+        moved = self.own_coefficients([x + 1j * TINY * dx for x, dx in zip(self._numbers_of(values), changes)])
+        return self._joined(
+            [x.imag / TINY for x in moved], self.material.coefficients_jvp(self.inner(values), self.inner(tangents))
+        )
 
     def coefficients_vjp(self, values, coefficients_adj):
         adj, count = np.asarray(coefficients_adj, np.float64), len(self.law("f64").coefficient_names)

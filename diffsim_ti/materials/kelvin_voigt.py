@@ -159,12 +159,6 @@ class KelvinVoigt(Around):
             return [own[0] * mu, own[0] * lam]
         return [own[0], own[1] - 2 / 3 * own[0]]
 
-    def own_jvp(self, numbers, changes):
-        (*own, mu, lam), (*d_own, dmu, dlam) = numbers, changes
-        if len(own) == 1:
-            return [d_own[0] * mu + own[0] * dmu, d_own[0] * lam + own[0] * dlam]
-        return self.own_coefficients(changes)
-
     def own_vjp(self, numbers, by_columns):
         *own, mu, lam = numbers
         by_eta, by_lam = by_columns

@@ -20,6 +20,7 @@ from diffsim_ti.mesh.sets import values_of_sets
 
 # one number, an array with one per tetrahedron, or {tetrahedron set: number}
 PerTetrahedron = TypeAliasType("PerTetrahedron", ArrayLike | Mapping[str, ArrayLike])
+TINY = 1e-100  # scale of imaginary parts, whose squares vanish: derivatives are exact to round-off
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
 
 
@@ -171,9 +172,9 @@ class Material(metaclass=Public):
             dp = self.coefficients_jvp(values, tangents) @ self.to_lame.T
             return dp[..., 0], dp[..., 1]
         self._check_known_moduli()
-        v = [np.asarray(values[name], np.float64) for name in self._of_lame]
-        dv = [np.broadcast_to(tangents.get(name, 0.0), x.shape) for name, x in zip(self._of_lame, v)]
-        return moduli.lame_jvp(*v, *dv) if self._begins_with_E_and_nu() else tuple(np.broadcast_arrays(*dv))
+        moved = [stepped(values, tangents)[name] for name in self._of_lame]
+        parts = moduli.lame(*moved) if self._begins_with_E_and_nu() else np.broadcast_arrays(*moved)
+        return tuple(part.imag / TINY for part in parts)
 
     def lame_vjp(self, values: dict, mu_adj: np.ndarray, lam_adj: np.ndarray) -> dict[str, np.ndarray]:
         """Adjoint of each value that they depend on, from theirs, each shape () or (num_tetrahedra,)."""
@@ -209,13 +210,18 @@ class Material(metaclass=Public):
     def coefficients(self, values: dict) -> np.ndarray:
         """The law's coefficients [Pa]: shape (K,) if all values are uniform, else (num_tetrahedra, K)."""
         self.check(values)
-        return self._linear(values, values)
+        return self._coefficients(values)
+
+    def _coefficients(self, values: dict) -> np.ndarray:
+        columns, matrix = self._columns(values, self.inputs), self._matrix()
+        if self._begins_with_E_and_nu():
+            columns[:2] = moduli.lame(*columns[:2])
+        numbers = np.stack(np.broadcast_arrays(*columns), -1)
+        return numbers if matrix is None else numbers @ matrix.T
 
     def coefficients_jvp(self, values: dict, tangents: dict) -> np.ndarray:
         """Change of the coefficients for changes of the values; names left out do not change."""
-        return self._linear(
-            values, {n: np.broadcast_to(tangents.get(n, 0.0), np.shape(v)) for n, v in values.items()}, True
-        )
+        return self._coefficients(stepped(values, tangents)).imag / TINY
 
     def coefficients_vjp(self, values: dict, coefficients_adj: np.ndarray) -> dict[str, np.ndarray]:
         """Adjoint of each value, of its shape, from the adjoint of the coefficients, shape (num_tetrahedra, K) or (K,).
@@ -240,7 +246,7 @@ class Material(metaclass=Public):
         """The components of some numbers, one after the other, each of shape () or (num_tetrahedra,)."""
         columns = []
         for name in names:
-            value, shape = np.asarray(values[name], np.float64), self.shape_of(name)
+            value, shape = np.asarray(values[name], np.result_type(values[name], np.float64)), self.shape_of(name)
             columns += [value[..., k] for k in range(shape[0])] if shape else [value]
         return columns
 
@@ -252,14 +258,6 @@ class Material(metaclass=Public):
             own = np.stack([next(rest) for _ in range(shape[0])], -1) if shape else next(rest)
             out[name] = summed(own, values[name], shape)
         return out
-
-    def _linear(self, values: dict, arguments: dict, derivative: bool = False) -> np.ndarray:
-        """Coefficients of `arguments`, or their change for changes `arguments` at `values`."""
-        v, a = (self._columns(of, self.inputs) for of in (values, arguments))
-        if self._begins_with_E_and_nu():
-            a[:2] = moduli.lame_jvp(*v[:2], *a[:2]) if derivative else moduli.lame(*a[:2])
-        numbers, matrix = np.stack(np.broadcast_arrays(*a), -1), self._matrix()
-        return numbers if matrix is None else numbers @ matrix.T
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{name}={_short(number)}" for name, number in self._numbers.items())
@@ -299,6 +297,11 @@ def summed(adjoint: np.ndarray, value, shape: tuple = ()) -> np.ndarray:
     if uniform:
         return adjoint.reshape(-1, *shape).sum(0)
     return adjoint if adjoint.shape == np.shape(value) else np.broadcast_to(adjoint, np.shape(value))
+
+
+def stepped(values: dict, tangents: dict) -> dict:
+    """The values with their change as an imaginary part, which analytic formulas carry through."""
+    return {name: x + 1j * TINY * np.asarray(tangents.get(name, 0.0)) for name, x in values.items()}
 
 
 def check_range(name: str, value, low: float, high: float, low_included: bool, remedy: str) -> None:

@@ -1,4 +1,4 @@
-"""Conversions between elastic moduli, in float64, with derivatives. Numbers or arrays.
+"""Conversions between elastic moduli, in float64, with adjoints. Numbers or arrays, which may be complex.
 
 Landau, Lifshitz, Theory of Elasticity, sections 4, 5, 22.
 """
@@ -9,12 +9,6 @@ import numpy as np
 def lame(E, nu):
     """(mu, lam) [Pa] of Young's modulus E [Pa] and Poisson's ratio nu: E / (2 (1 + nu)), E nu / ((1 + nu)(1 - 2 nu))."""
     return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
-
-
-def lame_jvp(E, nu, dE, dnu):
-    """(dmu, dlam) for changes dE, dnu."""
-    a, b = 1 + nu, 1 - 2 * nu
-    return dE / (2 * a) - E * dnu / (2 * a**2), nu * dE / (a * b) + E * (1 + 2 * nu**2) * dnu / (a * b) ** 2
 
 
 def lame_vjp(E, nu, mu_adj, lam_adj):

@@ -6,10 +6,9 @@ import numpy as np
 
 from diffsim_ti.materials.calculus.tensor import PAIRS, green_strain, six
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
+from diffsim_ti.materials.material import TINY, Material, PerTetrahedron, check_range, stepped
 
 ROWS, COLUMNS = np.triu_indices(6)
-TINY = 1e-100  # scale of imaginary parts, whose squares vanish: derivatives are exact to round-off
 
 
 @dataclass(frozen=True)
@@ -133,22 +132,11 @@ class Orthotropic(Material):
         N = first[..., i] * second[..., j] + (i != j) * first[..., j] * second[..., i]
         return (N @ self._stiffness(x) @ np.swapaxes(N, -1, -2))[..., ROWS, COLUMNS]
 
-    def _stepped(self, values: dict, tangents: dict) -> dict:
-        """The values with their change as an imaginary part, which analytic formulas carry through."""
-        return {name: x + 1j * TINY * np.asarray(tangents.get(name, 0.0)) for name, x in values.items()}
-
     def _pulled_back(self, values: dict, jvp, adjoint: np.ndarray) -> dict[str, np.ndarray]:
         """Adjoints of the values from the change that each brings."""
         units = ((name, unit) for name in self.inputs for unit in (np.eye(3) if self.shape_of(name) else [1.0]))
         columns = [(adjoint * jvp(values, {name: unit})).sum(-1) for name, unit in units]
         return self._columns_vjp(values, self.inputs, columns)
-
-    def coefficients(self, values):
-        self.check(values)
-        return self._coefficients(values)
-
-    def coefficients_jvp(self, values, tangents):
-        return self._coefficients(self._stepped(values, tangents)).imag / TINY
 
     def coefficients_vjp(self, values, coefficients_adj):
         return self._pulled_back(values, self.coefficients_jvp, np.asarray(coefficients_adj, np.float64))
@@ -176,7 +164,7 @@ class Orthotropic(Material):
         return np.stack([np.einsum("...i,...ij,...j", v, d_rest, v) / 2, d_lam], -1)
 
     def _moduli_jvp(self, values, tangents) -> np.ndarray:
-        return self._moduli(self._stiffness(values), self._stiffness(self._stepped(values, tangents)).imag / TINY)
+        return self._moduli(self._stiffness(values), self._stiffness(stepped(values, tangents)).imag / TINY)
 
     def lame_jvp(self, values, tangents):
         return tuple(np.moveaxis(self._moduli_jvp(values, tangents), -1, 0))
