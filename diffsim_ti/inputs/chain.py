@@ -34,15 +34,16 @@ class Link(ABC):
         """Adjoints of x, f'(x)^T y_adj, each of its x's shape."""
 
 
-class LinearLink(Link):
-    """A link whose change is its value of the changes."""
+class Linear:
+    """The part of a link whose change is its value of the changes."""
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
         return self.value(*dx)
 
 
-class AnalyticLink(Link):
-    """A link whose value takes complex numbers too: its change is that of a step into the complex plane, exact to round-off.
+class Analytic:
+    """The part of a link whose value takes complex numbers too: its change is that of a step into the complex plane, exact
+    to round-off.
 
     Squire, Trapp 1998, Using complex variables to estimate derivatives of real functions, doi:10.1137/S003614459631241X.
     """

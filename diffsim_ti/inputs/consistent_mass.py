@@ -9,12 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import AnalyticLink
+from diffsim_ti.inputs.chain import Analytic, Link
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.reference_element import QUADRATIC, quadrature
 
 
-class ElementMasses(AnalyticLink):
+class ElementMasses(Analytic, Link):
     """Of densities and rest positions the masses M_ab of each element [kg], shape (m, 10, 10), by a rule that is exact for
     curved edges too: N_a N_b is of degree four, det dX/dxi a cubic."""
 

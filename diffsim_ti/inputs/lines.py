@@ -10,13 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import AnalyticLink, LinearLink, Link
+from diffsim_ti.inputs.chain import Analytic, Linear, Link
 from diffsim_ti.inputs.loads import _Together
 from diffsim_ti.mesh.face_points import face_points
 from diffsim_ti.mesh.paths import Paths
 
 
-class Segments(LinearLink):
+class Segments(Linear, Link):
     """Of rest positions, and of the places of anchors [m], shape (k, 3) or (3,) for one, the segments of paths."""
 
     def __init__(self, paths: Paths, num_vertices: int, anchors: str | None, writes: str):
@@ -136,7 +136,7 @@ def directions(segments: np.ndarray) -> np.ndarray:
     return np.divide(segments, lengths, out=np.zeros_like(segments), where=lengths > 0)
 
 
-class FoundationStiffness(AnalyticLink):
+class FoundationStiffness(Analytic, Link):
     """K_i [N/m] of each of some vertices, shape (k, 3, 3): the sum over the triangles around of
 
         A / 3 [t I + (c - t) N N^T]
@@ -192,7 +192,7 @@ class FoundationStiffness(AnalyticLink):
         return self.points.normals_vjp(X, n_adj), self._of_faces(by_c, c), self._of_faces(by_t, t)
 
 
-class FoundationRows(LinearLink):
+class FoundationRows(Linear, Link):
     """Rows of K_i of all foundations, shape (3 k, 3) for the k vertices that any of them holds."""
 
     def __init__(self, reads: Sequence[str], vertices: Sequence[np.ndarray], writes: str):

@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import AnalyticLink, LinearLink, Link
+from diffsim_ti.inputs.chain import Analytic, Linear, Link
 from diffsim_ti.inputs.loads import VertexShares
 
 
-class FreeVelocity(LinearLink):
+class FreeVelocity(Linear, Link):
     """Velocities without what is held of them: free(v), a projection."""
 
     reads, writes = ("initial_velocities",), ("velocity",)
@@ -64,7 +64,7 @@ class PerStep(Link):
         return (y_adj[0][0] if x[0].ndim < self.ndim else y_adj[0],)
 
 
-class NearestPoint(AnalyticLink):
+class NearestPoint(Analytic, Link):
     """The point of a plane that is nearest to o, of any of its points p and a normal n of any length:
 
     q = o + s n,    s = n . (p - o) / n . n
@@ -82,7 +82,7 @@ class NearestPoint(AnalyticLink):
         return along * n, s * q_adj + along * (p - self.near - 2 * s * n)
 
 
-class Joined(LinearLink):
+class Joined(Linear, Link):
     """The numbers of several inputs in one row, or, with the `tail` of their shapes, rows of such a shape."""
 
     def __init__(self, reads: Sequence[str], writes: str, tail: tuple = ()):

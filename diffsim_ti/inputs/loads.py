@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import AnalyticLink, LinearLink, Link, summed_at
+from diffsim_ti.inputs.chain import Analytic, Linear, Link, summed_at
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.face_points import face_points
 
 
-class InTime(LinearLink):
+class InTime(Linear, Link):
     """At the beginning and at the end of each step, shape (2, rows, ...), of an array that is the same all the time or, with
     a leading axis of `ndim` in all, given for each step; `keyed`: for each step's ends instead, linear between."""
 
@@ -39,7 +39,7 @@ class InTime(LinearLink):
         return (out,)
 
 
-class VertexAreas(AnalyticLink):
+class VertexAreas(Analytic, Link):
     """Of rest positions the area [m^2] of each of some vertices, the integral of its shape function over the given faces
     around it, which is what a constant traction on these asks for: a third of triangles; of flat faces of six nodes a
     third at mid-edge vertices and nothing at corners."""
@@ -63,7 +63,7 @@ class VertexAreas(AnalyticLink):
         return (self.points.normals_vjp(x[0], self.points.from_nodes(y_adj[0][self.nodes])[:, None] * unit),)
 
 
-class VertexShares(AnalyticLink):
+class VertexShares(Analytic, Link):
     """What each of some vertices has of the volume [m^3] or, with density, of the mass [kg] of the given tetrahedra around
     it: a fourth of each, or the shares of lumped masses of ten nodes; times factors of the vertices where there are some."""
 
@@ -91,7 +91,7 @@ class VertexShares(AnalyticLink):
         return by_each * density, by_density if density.ndim else by_density.sum()
 
 
-class ConsistentShares(AnalyticLink):
+class ConsistentShares(Analytic, Link):
     """What `VertexShares` says by integrals of the shape functions of ten nodes, of volumes or of masses."""
 
     def __init__(self, mesh, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str):
@@ -118,7 +118,7 @@ class ConsistentShares(AnalyticLink):
         return masses_adj / rho, by_density if x[1].ndim else by_density.sum()
 
 
-class Spread(AnalyticLink):
+class Spread(Analytic, Link):
     """Forces of vertices, weight times vector, from vectors of shape (2, rows, 3) and one weight for each vertex."""
 
     def __init__(self, reads: Sequence[str], writes: str):
@@ -131,7 +131,7 @@ class Spread(AnalyticLink):
         return np.einsum("brki,k->bri", y_adj[0], x[1]), np.einsum("brki,bri->k", y_adj[0], x[0])
 
 
-class _Together(LinearLink):
+class _Together(Linear, Link):
     """Several loads in time, each of shape (2, rows, ...); those of one row hold in all steps."""
 
     def __init__(self, reads: Sequence[str], writes: str):
@@ -190,7 +190,7 @@ class PressureRows(_Together):
         return [self._pulled(part, y_adj[0][:, k, :2].T) for k, part in enumerate(x)]
 
 
-class RemoteForces(AnalyticLink):
+class RemoteForces(Analytic, Link):
     """f_i = a_i (F / A + omega x r_i),    J omega = M + (p - c) x F,    J = sum a_i (|r_i|^2 - r_i r_i^T),
 
     shape (2, rows, k, 3), of (F, M) over time, (2, rows, 6), rest positions and areas a_i of k vertices, A = sum a_i, r_i
@@ -281,7 +281,7 @@ class RestVolume(Link):
         return (self.enclosure.gradient(x[0]) * y_adj[0],)
 
 
-class MuscleTension(AnalyticLink):
+class MuscleTension(Analytic, Link):
     """T = alpha s V / L0 [N] in time, shape (2, rows, points): alpha: activations in time as `InTime` has them, of all
     together or of each group; s: stress [Pa], a number or one for each group; V: volume of each of the points `chosen` among
     those of all tetrahedra; L0: length at rest of the segment there; group: that of each point."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import AnalyticLink, Link
+from diffsim_ti.inputs.chain import Analytic, Link
 
 
 def cross_matrix(a: np.ndarray) -> np.ndarray:
@@ -91,7 +91,7 @@ class Displacement(Link):
         return x_adj, X_adj
 
 
-class RigidVelocity(AnalyticLink):
+class RigidVelocity(Analytic, Link):
     """v = free(v), and of sets that do not deform that of the nearest rigid motion."""
 
     reads, writes = ("initial_velocities", "displacement", "rest"), ("velocity",)
