@@ -22,7 +22,8 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
-from diffsim_ti.rollout.frames import Frames, check_finite, warn_of_large_stretch
+from diffsim_ti.outputs.frames import Frames
+from diffsim_ti.rollout.frames import check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape

@@ -1,17 +1,14 @@
 """Centre of mass of a body, or of some of its vertices."""
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Derived
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class CenterOfMass(Output):
@@ -46,7 +43,7 @@ class CenterOfMass(Output):
     def __repr__(self) -> str:
         return f"CenterOfMass({self.of!r}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "CenterOfMass":
+    def settled(self, scene: Scene) -> "CenterOfMass":
         out, mesh = copy(self), scene.mesh
         out.scene = scene
         out.vertices = np.arange(mesh.num_vertices) if self.of is None else mesh.vertex_indices(self.of)
@@ -65,24 +62,24 @@ class CenterOfMass(Output):
             np.add.at(mass, self.scene.mesh.elements, derived.element_masses.sum(2))
         return mass[vertices]
 
-    def _read(self, frames: "Frames") -> tuple[Derived, float, np.ndarray, np.ndarray, np.ndarray]:
+    def _read(self, frames: Frames) -> tuple[Derived, float, np.ndarray, np.ndarray, np.ndarray]:
         """(what kernels read, m [kg], shares m_i / m, positions x_i [m], x)."""
         derived = self.scene.inputs.derive(frames.inputs)
         own, x = self._masses(derived, self.vertices), frames.positions[:, self.vertices].astype(np.float64)
         share = own / own.sum()
         return derived, own.sum(), share, x, np.einsum("i,fij->fj", share, x)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         return self._read(frames)[-1]
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         _, mass, share, x, center = self._read(frames)
         dm = self._masses(self.scene.inputs.derive_jvp(frames.inputs, change.inputs), self.vertices)
         out = np.einsum("i,fij->fj", dm / mass, x - center[:, None])
         moved = change.positions
         return out if moved is None else out + np.einsum("i,fij->fj", share, moved[:, self.vertices])
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         derived, mass, share, x, center = self._read(frames)
         positions, adjoint, by_mass = np.zeros(frames.positions.shape), derived.zeros(), np.zeros(len(derived.rest))
         positions[:, self.vertices] = share[:, None] * seed[:, None]

@@ -1,18 +1,15 @@
 """The pressure in a chamber."""
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.mechanics.chambers.laws import law_of
 from diffsim_ti.mechanics.chambers.pressures import rows_of
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Chamber
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
 
 
 class ChamberPressure(Output):
@@ -38,7 +35,7 @@ class ChamberPressure(Output):
     def __repr__(self) -> str:
         return f"ChamberPressure({self.chamber!r}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "ChamberPressure":
+    def settled(self, scene: Scene) -> "ChamberPressure":
         out = copy(self)
         chambers = scene.terms_of(Chamber)
         out.place, out.inputs = scene.place_among(chambers, self.chamber, "chamber"), scene.inputs
@@ -61,7 +58,7 @@ class ChamberPressure(Output):
     def _volumes(self, frames) -> list[float]:
         return [self.enclosure.volume(x.astype(np.float64)) for x in frames.positions]
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         if self.law.holds:
             return frames.chamber_pressures[:, self.place].copy()
         follower, out = self.inputs.derive(frames.inputs).follower, []
@@ -70,7 +67,7 @@ class ChamberPressure(Output):
             out.append(self.law.pressure(V))
         return np.array(out)
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         if self.law.holds:
             zero = np.zeros(len(frames.positions))
             return zero if change.chamber_pressures is None else change.chamber_pressures[:, self.place]
@@ -85,7 +82,7 @@ class ChamberPressure(Output):
                 out[-1] += self.law.slope(V) * (G * change.positions[k]).sum()
         return np.array(out)
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         if self.law.holds:
             out = np.zeros(frames.chamber_pressures.shape)
             out[:, self.place] = seed

@@ -1,18 +1,15 @@
 """How much a surface of the body encloses."""
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import wholes
 from diffsim_ti.mesh.enclosure import Enclosure, open_edges
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class EnclosedVolume(Output):
@@ -43,7 +40,7 @@ class EnclosedVolume(Output):
         if self.triangles is not None and (self.triangles.ndim != 2 or self.triangles.shape[1] not in (3, 6)):
             raise ValueError(f"EnclosedVolume: triangles must have shape (k, 3) or (k, 6), got {self.triangles.shape}")
 
-    def settled(self, scene: "Scene") -> "EnclosedVolume":
+    def settled(self, scene: Scene) -> "EnclosedVolume":
         out, n = copy(self), scene.mesh.num_vertices
         faces = scene.mesh.surface_faces if self.triangles is None else self.triangles
         if faces.size == 0 or faces.min() < 0 or faces.max() >= n:
@@ -65,15 +62,15 @@ class EnclosedVolume(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         return np.array([-self.enclosure.volume(x) for x in frames.positions.astype(np.float64)])
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         if change.positions is None:
             return np.zeros(len(frames.positions))
         by = self.vjp(frames, np.ones(len(frames.positions))).positions
         return (by * change.positions).sum((1, 2))
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         gradients = [-s * self.enclosure.gradient(x) for s, x in zip(seed, frames.positions.astype(np.float64))]
         return Change(positions=np.stack(gradients))  # a closed surface: where it counts from adds nothing

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,12 +9,10 @@ from diffsim_ti.inputs import ConsistentMass
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import Deformation
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.patch_pressure import PatchPressure
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class ElasticEnergy(Output):
@@ -34,7 +31,7 @@ class ElasticEnergy(Output):
     def __init__(self, sets: Sequence[SetOrIndices] | None = None, name: str = "elastic_energy"):
         self.sets, self.name = None if sets is None else list(sets), name
 
-    def settled(self, scene: "Scene") -> "ElasticEnergy":
+    def settled(self, scene: Scene) -> "ElasticEnergy":
         law, mesh = scene.law, scene.mesh
         if law.in_steps().reads != ("H",):
             raise ValueError(
@@ -81,12 +78,12 @@ class ElasticEnergy(Output):
         K = len(self.law.coefficient_names)
         return np.repeat(np.broadcast_to(coefficients, (len(self.all), K)), self.points, 0)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         derived, _, psi, *_, at = self._densities(frames)
         psi = psi if at is None else psi + 0.5 * at.value * at.theta
         return ((psi * derived.volumes.ravel()) @ self.masks.T).reshape(self.shape(len(psi)))
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         derived, deformation, psi, P, by, by_z, at = self._densities(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
@@ -98,7 +95,7 @@ class ElasticEnergy(Output):
             dpsi = dpsi + 0.5 * (at.jvp(dH, dp, dV) * at.theta + at.value * at.theta_jvp(dH))
         return ((dpsi * derived.volumes.ravel() + psi * dV) @ self.masks.T).reshape(self.shape(len(psi)))
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         derived, deformation, psi, P, by, by_z, at = self._densities(frames)
         adjoint, weight = derived.zeros(), seed.reshape(len(psi), -1) @ self.masks  # by frames and points
         scaled = weight * derived.volumes.ravel()
@@ -127,7 +124,7 @@ class Dissipation(ElasticEnergy):
     def __init__(self, sets: Sequence[SetOrIndices] | None = None, name: str = "dissipation"):
         super().__init__(sets, name)
 
-    def settled(self, scene: "Scene") -> "Dissipation":
+    def settled(self, scene: Scene) -> "Dissipation":
         if not scene.law.plastic:
             raise ValueError(f"Dissipation: {scene.law.title} has no plastic flow; take J2Plasticity as the material")
         out = super().settled(scene)
@@ -151,7 +148,7 @@ class KineticEnergy(Output):
     def __init__(self, sets: Sequence[SetOrIndices] | None = None, name: str = "kinetic_energy"):
         self.sets, self.name = None if sets is None else list(sets), name
 
-    def settled(self, scene: "Scene") -> "KineticEnergy":
+    def settled(self, scene: Scene) -> "KineticEnergy":
         out, mesh = copy(self), scene.mesh
         out.scene, out.masks = scene, np.ones((1, mesh.num_vertices))
         if self.sets is not None:
@@ -173,18 +170,18 @@ class KineticEnergy(Output):
         mass = ConsistentMass.of(self.scene.mesh, derived.element_masses)
         return np.stack([mass * frame for frame in v])
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         v, derived = self._read(frames)
         return (0.5 * (v * self._products(derived, v)).sum(2) @ self.masks.T).reshape(self.shape(len(v)))
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         v, derived = self._read(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dv = np.zeros(v.shape) if change.velocities is None else change.velocities
         grown = dv * self._products(derived, v) + v * (self._products(derived, dv) + self._products(moved, v))
         return (0.5 * grown.sum(2) @ self.masks.T).reshape(self.shape(len(v)))
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         v, derived = self._read(frames)
         adjoint, weight = derived.zeros(), (seed.reshape(len(v), -1) @ self.masks)[..., None]
         if derived.element_masses is None:

@@ -2,19 +2,16 @@
 
 from abc import abstractmethod
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.common.deprecated import renamed_arguments
 from diffsim_ti.mechanics.lines.interaction import SpringsAndCables
 from diffsim_ti.outputs.applied_loads import at_end
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.scene import Scene
 from diffsim_ti.terms.lines import LineTerm
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
 
 
 class _OfLines(Output):
@@ -27,7 +24,7 @@ class _OfLines(Output):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.of!r}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "_OfLines":
+    def settled(self, scene: Scene) -> "_OfLines":
         out = copy(self)
         lines = scene.interaction(SpringsAndCables)
         number = scene.place_among(lines.terms if lines else (), self.of, "spring or cable")
@@ -56,12 +53,12 @@ class _OfLines(Output):
             instant = at_end(int(step))
             yield self.lines.take(derived, instant), x - derived.rest, instant
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         derived = self.scene.inputs.derive(frames.inputs)
         found = [self._value(lines, u)[self.own] for lines, u, _ in self._frames(frames, derived)]
         return np.reshape(found, self.shape(len(found)))
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         derived = self.scene.inputs.derive(frames.inputs)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dx, out = np.zeros(frames.positions.shape) if change.positions is None else change.positions, []
@@ -70,7 +67,7 @@ class _OfLines(Output):
             out.append(self._jvp(lines, u, moving - moved.rest, numbers)[self.own])
         return np.reshape(out, self.shape(len(out)))
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         derived, positions = self.scene.inputs.derive(frames.inputs), np.zeros(frames.positions.shape)
         adj, all_lines = derived.zeros(), np.zeros((len(positions), len(self.lines.paths)))
         all_lines[:, self.own] = seed.reshape(len(positions), -1)

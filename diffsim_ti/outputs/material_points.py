@@ -1,7 +1,6 @@
 """Positions of points of the body, such as markers that a camera follows."""
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,11 +8,9 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.geometry import inverse_edges, shape_gradients
 from diffsim_ti.mesh.inverse_map import barycentric_in, solved
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class MaterialPoints(Output):
@@ -50,7 +47,7 @@ class MaterialPoints(Output):
     def __repr__(self) -> str:
         return f"MaterialPoints({len(self.points)} points, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "MaterialPoints":
+    def settled(self, scene: Scene) -> "MaterialPoints":
         out = copy(self)
         out.located = scene.mesh.locate(self.points, nearest=self.nearest)
         out.points, out.element = out.located.points, scene.mesh.reference
@@ -87,11 +84,11 @@ class MaterialPoints(Output):
         u = frames.displacements[:, self.located.vertices].astype(np.float64)
         return np.eye(3) + np.einsum("fpai,paj->fpij", u, gradients)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         u = frames.displacements[:, self.located.vertices].astype(np.float64)
         return self.points + np.einsum("pa,fpai->fpi", self._weights(frames)[1], u)
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         gradients, N = self._weights(frames)
         out = np.zeros(self.shape(len(frames.positions)))
         if change.positions is not None:
@@ -101,7 +98,7 @@ class MaterialPoints(Output):
             out -= np.einsum("fpij,pj->fpi", self._deformation(frames, gradients), moved)
         return out
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         gradients, N = self._weights(frames)
         positions, rest = np.zeros(frames.positions.shape), np.zeros(frames.positions.shape[1:])
         for frame, s in zip(positions, seed):

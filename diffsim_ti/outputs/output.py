@@ -2,17 +2,13 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.common.public import Public
+from diffsim_ti.outputs.frames import Frames
+from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Growth
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
-
 
 NOTED = ("contact_forces", "chamber_pressures", "law_state")  # what runs note besides states, where outputs read it
 
@@ -54,7 +50,7 @@ class Output(metaclass=Public):
 
     Write one outside the package by giving it `name`, `shape`, `value`, `jvp` and `vjp`, in NumPy and float64; it is then
     in `frames[name]` and `Rollout.tangents`, takes a seed in `Rollout.vjp(frames, name=...)`, and has a field under
-    `ti.ad.Tape` and a tensor in torch. `frames` (rollout/frames.py) holds the states and, in `frames.inputs`, the values of
+    `ti.ad.Tape` and a tensor in torch. `frames` (frames.py) holds the states and, in `frames.inputs`, the values of
     all inputs. Rollout.tangents and Rollout.vjp must agree in <w, J d> = <J^T w, d>: check a new output by that and by
     differences.
     Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.
@@ -73,14 +69,14 @@ class Output(metaclass=Public):
         return self.reads_contact_forces
 
     @staticmethod
-    def refuse_growth(output: str, scene: "Scene") -> None:
+    def refuse_growth(output: str, scene: Scene) -> None:
         """Raise ValueError where tetrahedra grow over time: an output knows frames, not what they had grown by."""
         if scene.term(Growth):
             raise ValueError(
                 f"{output} evaluates the law and does not support Growth over time; take Grown(material, growth), or strains"
             )
 
-    def remembered(self, frames: "Frames", scene: "Scene") -> np.ndarray:
+    def remembered(self, frames: Frames, scene: Scene) -> np.ndarray:
         """What the law remembers at each point in frames, shape (frames, num_tetrahedra, points, S), S being 0 where it
         remembers nothing, or this output does not read it. Raises ValueError for frames of a run that did not note it."""
         law, mesh = scene.law, scene.mesh
@@ -101,11 +97,11 @@ class Output(metaclass=Public):
         return change.law_state.reshape(z.shape) if z.size and change.law_state is not None else np.zeros_like(z)
 
     @staticmethod
-    def remembered_vjp(frames: "Frames", z_adj: np.ndarray) -> np.ndarray | None:
+    def remembered_vjp(frames: Frames, z_adj: np.ndarray) -> np.ndarray | None:
         """The gradient by frames.law_state for that by the same, z."""
         return z_adj.reshape(frames.law_state.shape) if z_adj.size else None
 
-    def settled(self, scene: "Scene") -> "Output":
+    def settled(self, scene: Scene) -> "Output":
         """This output for a scene: checked, with what depends on the scene alone; raises ValueError if it does not fit."""
         return self
 
@@ -114,13 +110,13 @@ class Output(metaclass=Public):
         """Shape of the value; three numbers at the end make vectors of a Taichi field."""
 
     @abstractmethod
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         """y."""
 
     @abstractmethod
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         """Change of y for a change of frames and inputs, to first order."""
 
     @abstractmethod
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         """Gradient by frames and inputs of a loss whose gradient by y is `seed`."""

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.geometry import barycentric_in_plane
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.scene import Scene
 
 if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
     from diffsim_ti.visual.camera import Camera
 
 
@@ -48,7 +48,7 @@ class PixelTracks(Output):
     def __repr__(self) -> str:
         return f"PixelTracks({len(self._given.points)} points, {self.size}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "PixelTracks":
+    def settled(self, scene: Scene) -> "PixelTracks":
         out = copy(self)
         out.points, out.triangles = self._given.settled(scene), scene.mesh.surface_triangles
         out.length = float(np.ptp(scene.mesh.bounding_box, 0).max())
@@ -67,7 +67,7 @@ class PixelTracks(Output):
         by_a[..., 2] = a[..., :2] / depth
         return (np.array([focal[0], -focal[1]])[:, None] * by_a / depth[..., None]) @ axes
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         x = self.points.value(frames)
         depth = -(x - self.camera.position) @ self.camera.axes[2]
         if not np.all(depth > 0):
@@ -77,15 +77,15 @@ class PixelTracks(Output):
             )
         return self.camera.project(x, self.size)[..., :2]
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         x = self.points.value(frames)
         return np.einsum("fpij,fpj->fpi", self._jacobian(x), self.points.jvp(frames, change))
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         x = self.points.value(frames)
         return self.points.vjp(frames, np.einsum("fpij,fpi->fpj", self._jacobian(x), seed))
 
-    def visible(self, frames: "Frames", within: float = 1e-3) -> np.ndarray:
+    def visible(self, frames: Frames, within: float = 1e-3) -> np.ndarray:
         """Which points lie within the picture and are not hidden by the body, bool (frames, num_points).
 
         within: how deep under the surface a marker may lie and still be seen, as a share of the body's length.

@@ -1,15 +1,11 @@
 """How far a metal has flowed."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.tensors import _Tensors
-
-if TYPE_CHECKING:
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class PlasticStrain(_Tensors):
@@ -29,7 +25,7 @@ class PlasticStrain(_Tensors):
     ):
         super().__init__(name, at, of)
 
-    def settled(self, scene: "Scene") -> "PlasticStrain":
+    def settled(self, scene: Scene) -> "PlasticStrain":
         if not scene.law.plastic:
             raise ValueError(f"PlasticStrain: {scene.law.title} has no plastic flow; take J2Plasticity as the material")
         out = super().settled(scene)

@@ -1,7 +1,6 @@
 """What holds a body: force and moment of a support."""
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,13 +9,11 @@ from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.applied_loads import AppliedLoads
 from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Tie
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
 
 
 class Reaction(Output):
@@ -72,7 +69,7 @@ class Reaction(Output):
     def __repr__(self) -> str:
         return f"Reaction({self.support!r}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "Reaction":
+    def settled(self, scene: Scene) -> "Reaction":
         out = copy(self)
         if isinstance(self.support, Tie):
             if self.support not in (*scene.terms, *scene.arguments["terms"]):
@@ -122,7 +119,7 @@ class Reaction(Output):
         """Of forces on the support's vertices, shape (..., k, 3), what it can hold."""
         return np.einsum("kij,...kj->...ki", self.onto, f)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         return self._of(frames, self._held(frames))
 
     def _of(self, frames, held: np.ndarray) -> np.ndarray:
@@ -130,7 +127,7 @@ class Reaction(Output):
             return moments(frames.positions[:, self.vertices], self.about, held)
         return held if self.per_vertex else held.sum(1)
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         derived = self.body.load(frames.inputs)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         tangent, zero, out = self.body.tangent(moved), np.zeros(frames.positions.shape), []
@@ -150,7 +147,7 @@ class Reaction(Output):
         held, x = self._held(frames), frames.positions[:, self.vertices]
         return moments_jvp(x, self.about, held, dx[:, self.vertices], np.stack(out))
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         positions, velocities, w = np.zeros((3, *frames.positions.shape))
         if self.about is not None:
             held, x = self._held(frames), frames.positions[:, self.vertices]

@@ -1,20 +1,17 @@
 """Force and moment that a body carries through a plane cut."""
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.outputs.deformation import Deformation
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.tensors import Stress
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class SectionForce(Output):
@@ -54,7 +51,7 @@ class SectionForce(Output):
                     raise ValueError(f"SectionForce: {key} must be 3 finite numbers, of a normal not all zero, got {x}")
             setattr(self, key, x)
 
-    def settled(self, scene: "Scene") -> "SectionForce":
+    def settled(self, scene: Scene) -> "SectionForce":
         out, mesh = copy(self), scene.mesh
         behind = (mesh.centroids - self.point) @ self.normal > 0
         here, there = (np.unique(mesh.elements[side]) for side in (behind, ~behind))
@@ -101,10 +98,10 @@ class SectionForce(Output):
     def _of(self, frames, f: np.ndarray) -> np.ndarray:
         return f.sum(1) if self.about is None else moments(frames.positions[:, self.vertices], self.about, f)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         return self._of(frames, self._start(frames)[-1])
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         derived, deformation, z, P, V, G, f = self._start(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dx = np.zeros(frames.positions.shape) if change.positions is None else change.positions
@@ -121,7 +118,7 @@ class SectionForce(Output):
         at = frames.positions[:, self.vertices]
         return moments_jvp(at, self.about, f, dx[:, self.vertices], df)
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         derived, deformation, z, P, V, G, f = self._start(frames)
         positions, w = np.zeros(frames.positions.shape), np.zeros(frames.positions.shape)
         if self.about is None:

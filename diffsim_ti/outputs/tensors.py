@@ -2,20 +2,18 @@
 
 from abc import abstractmethod
 from copy import copy
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointInterpolation, PointMeans
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.recovery import PatchRecovery
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class _Tensors(Output):
@@ -48,7 +46,7 @@ class _Tensors(Output):
                 '"recovered"'
             )
 
-    def settled(self, scene: "Scene") -> "Output":
+    def settled(self, scene: Scene) -> "Output":
         out, mesh = copy(self), scene.mesh
         out.scene, out.num_vertices, out.means, out.points = scene, mesh.num_vertices, None, mesh.reference.num_points
         every, of = isinstance(self.at, str), [] if self.of is None else mesh.tetrahedron_indices(self.of)
@@ -106,11 +104,11 @@ class _Tensors(Output):
             return self.means.shares_jvp(derived.rest, moved.rest)
         return moved.volumes[self.chosen].ravel()
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         shown = self._start(frames)[-1]
         return NUMBERS[self.numbers][1](shown) if self.numbers else shown
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         derived, deformation, z, T, shown = self._start(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
@@ -120,7 +118,7 @@ class _Tensors(Output):
             dT = self.means.jvp(T, dT, self._shares(derived), self._shares_jvp(derived, moved))
         return NUMBERS[self.numbers][2](shown, dT) if self.numbers else dT
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         derived, deformation, z, T, shown = self._start(frames)
         by_rest = 0.0
         adjoint, seed = derived.zeros(), NUMBERS[self.numbers][3](shown, seed) if self.numbers else seed
@@ -228,7 +226,7 @@ class Stress(_Tensors):
         super().__init__(name, at, of, principal=principal, von_mises=von_mises)
         self.kind = kind
 
-    def settled(self, scene: "Scene") -> "Stress":
+    def settled(self, scene: Scene) -> "Stress":
         law = scene.law
         if law.in_steps().reads != ("H",):
             raise ValueError(

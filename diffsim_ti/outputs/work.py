@@ -1,16 +1,13 @@
 """Work of loads on a body, frame after frame."""
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.outputs.applied_loads import AppliedLoads
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class WorkOfLoads(Output):
@@ -41,7 +38,7 @@ class WorkOfLoads(Output):
     def __repr__(self) -> str:
         return f"WorkOfLoads(weight={self.weight}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "WorkOfLoads":
+    def settled(self, scene: Scene) -> "WorkOfLoads":
         out = copy(self)
         out.scene, out.loads = scene, AppliedLoads(scene, weight=self.weight)
         if not out.loads.any:
@@ -75,7 +72,7 @@ class WorkOfLoads(Output):
     def _gone(self, frames, k: int) -> np.ndarray:
         return frames.positions[k].astype(np.float64) - frames.positions[k - 1].astype(np.float64)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         derived, parts = self.scene.inputs.derive(frames.inputs), [0.0]
         for k in range(1, len(frames.positions)):
             mean = 0.0
@@ -84,7 +81,7 @@ class WorkOfLoads(Output):
             parts.append(float((mean * self._gone(frames, k)).sum()))
         return np.cumsum(parts)
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         derived = self.scene.inputs.derive(frames.inputs)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dx = np.zeros(frames.positions.shape) if change.positions is None else change.positions
@@ -100,7 +97,7 @@ class WorkOfLoads(Output):
             parts.append(float((dmean * self._gone(frames, k) + mean * (dx[k] - dx[k - 1])).sum()))
         return np.cumsum(parts)
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         derived = self.scene.inputs.derive(frames.inputs)
         positions, adjoint = np.zeros(frames.positions.shape), derived.zeros()
         by_held = np.zeros_like(frames.chamber_pressures) if self.scene.holds_volumes else None

@@ -18,8 +18,9 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
+from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.rollout.checkpoints import Checkpoints
-from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite, warn_of_large_stretch
+from diffsim_ti.rollout.frames import HostSeed, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
 from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
