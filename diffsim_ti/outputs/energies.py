@@ -11,7 +11,7 @@ from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
-from diffsim_ti.outputs.patch_pressure import PatchPressure
+from diffsim_ti.outputs.stresses import PatchPressure
 from diffsim_ti.scene import Scene
 
 

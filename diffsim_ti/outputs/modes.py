@@ -12,7 +12,7 @@ from diffsim_ti.inputs import StressPoints
 from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
-from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.outputs.forces_at_frames import BodyForces
 from diffsim_ti.scene import Scene
 
 SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to which all of them are computed

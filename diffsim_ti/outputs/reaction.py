@@ -7,8 +7,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.named_sets import SetOrIndices
-from diffsim_ti.outputs.applied_loads import AppliedLoads
-from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.outputs.forces_at_frames import AppliedLoads, BodyForces
 from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output

@@ -4,7 +4,7 @@ from copy import copy
 
 import numpy as np
 
-from diffsim_ti.outputs.applied_loads import AppliedLoads
+from diffsim_ti.outputs.forces_at_frames import AppliedLoads
 from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.scene import Scene
