@@ -120,8 +120,8 @@ class PatchPressure:
 
         pi_p = lam_p theta_p,   lam_p = sum V_e lam_e / W_p,   theta_p = sum V_e theta_e / W_p,   W_p = sum V_e
 
-    with G = dtheta/dF and its change `turned` for a change W of F, so that tetrahedra have the stress P(H; p') + pi G and, as
-    their share of the patch's energy, pi theta / 2 per volume (mechanics/stress/patched_tetrahedron.py,
+    with G = dtheta/dF and its change `turned` for a change W of F, so that tetrahedra have the stress P(H; p') + pi G and,
+    as their share of the patch's energy, pi theta / 2 per volume (mechanics/stress/patched_tetrahedron.py,
     materials/patch_law.py). Arrays are by frames and the points of all tetrahedra.
     """
 

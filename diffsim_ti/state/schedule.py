@@ -314,3 +314,48 @@ class UnequalSteps(Schedule):
         ends = np.flatnonzero(np.abs(np.diff(h)) > 1e-12 * h[1:]) + 1 + first if last > first else []
         bounds = [first, *(int(e) for e in ends), last]
         return [(a, b) for a, b in zip(bounds, bounds[1:]) if a < b]
+
+
+@dataclass(frozen=True)
+class StagedSteps(Schedule):
+    """Every pass of other steps as `stages` passes, each of which has the length and the place in time of that pass."""
+
+    whole: Schedule
+    stages: int
+
+    @property
+    def varies(self):
+        return self.whole.varies
+
+    @property
+    def substeps(self):
+        return self.stages * self.whole.substeps
+
+    def row(self, j):
+        return self.whole.row(j // self.stages)
+
+    def first(self, step):
+        return self.stages * self.whole.first(step)
+
+    def time(self, step):
+        return self.whole.time(step)
+
+    def step_length(self, j):
+        return self.whole.step_length(j // self.stages)
+
+    def length(self, j):
+        return self.whole.length(j // self.stages)
+
+    def begin(self, j):
+        return self.whole.begin(j // self.stages)
+
+    def end(self, j):
+        return self.whole.end(j // self.stages)
+
+    @property
+    def longest(self):
+        return self.whole.longest
+
+    def stretches(self, first, last):
+        of_whole = self.whole.stretches(first // self.stages, -(-last // self.stages))
+        return [(max(first, a * self.stages), min(last, b * self.stages)) for a, b in of_whole]

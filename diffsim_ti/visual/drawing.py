@@ -13,8 +13,17 @@ from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.backdrop import Backdrop
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.colouring import Colouring, to_vertices
-from diffsim_ti.visual.glyphs import COLOURS, arrow_length, cones, glyphs, key_lines, longest
-from diffsim_ti.visual.legend import legend, write_key, write_text
+from diffsim_ti.visual.glyphs import (
+    COLOURS,
+    arrow_length,
+    cones,
+    glyphs,
+    key_lines,
+    legend,
+    longest,
+    write_key,
+    write_text,
+)
 from diffsim_ti.visual.surface import OBSTACLE, PLAIN, Soup, Surface, marks, with_edges
 
 if TYPE_CHECKING:

@@ -19,8 +19,7 @@ from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Gravity
 from diffsim_ti.terms.marks import Mark
 from diffsim_ti.terms.obstacles.shapes import Triangles
-from diffsim_ti.visual.colouring import measured_fields
-from diffsim_ti.visual.fields import FIELDS
+from diffsim_ti.visual.colouring import FIELDS, measured_fields
 from diffsim_ti.visual.scene_marks import marks_of
 
 
@@ -55,7 +54,7 @@ class Frame(metaclass=Public):
     """A moment of a run.
 
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
-    fields: numbers to colour by, one per vertex or per tetrahedron, under the names in fields.py: "displacement" [m],
+    fields: numbers to colour by, one per vertex or per tetrahedron, under the names in colouring.py: "displacement" [m],
     "speed" [m/s], "von_mises" [Pa], "energy_density" [J/m^3], "J" [-] ...; where the scene has loads, "loads" [N]: what
     tractions, pressures, gases, body and external forces, springs, cables and foundations do to each vertex, shape
     (num_vertices, 3).

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.visual.colouring import field_named
 from diffsim_ti.visual.dragging import picked_vertex
 from diffsim_ti.visual.drawing import Drawing
-from diffsim_ti.visual.fields import field_named
 from diffsim_ti.visual.scene_marks import results_as_arrows
 from diffsim_ti.visual.surface import Soup, marks
 

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from diffsim_ti.visual.colouring import Colouring, to_vertices
-from diffsim_ti.visual.fields import field_named
+from diffsim_ti.visual.colouring import Colouring, field_named, to_vertices
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.writers.writer import Writer
 
