@@ -15,24 +15,8 @@ from diffsim_ti.outputs.tactile_pad import TactilePad
 from diffsim_ti.outputs.tensors import PlasticStrain, Strain, Stress
 from diffsim_ti.outputs.work import WorkOfLoads
 
-__all__ = [
-    "CenterOfMass",
-    "ChamberPressure",
-    "Change",
-    "ContactForce",
-    "ContactSlip",
-    "ContactTraction",
-    "Displacements",
-]
-__all__ += ["Dissipation", "PixelTracks", "PlasticStrain", "SectionForce", "SmoothMaximum"]
-__all__ += [
-    "ElasticEnergy",
-    "EnclosedVolume",
-    "KineticEnergy",
-    "Length",
-    "MaterialPoints",
-    "Output",
-    "Positions",
-    "Reaction",
-]
-__all__ += ["SelfContactForce", "Strain", "Stress", "TactilePad", "Tension", "Velocities", "WorkOfLoads"]
+__all__ = ["CenterOfMass", "ChamberPressure", "Change", "ContactForce", "ContactSlip", "ContactTraction"]
+__all__ += ["Displacements", "Dissipation", "ElasticEnergy", "EnclosedVolume", "KineticEnergy", "Length"]
+__all__ += ["MaterialPoints", "Output", "PixelTracks", "PlasticStrain", "Positions", "Reaction", "SectionForce"]
+__all__ += ["SelfContactForce", "SmoothMaximum", "Strain", "Stress", "TactilePad", "Tension", "Velocities"]
+__all__ += ["WorkOfLoads"]

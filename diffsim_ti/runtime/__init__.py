@@ -27,19 +27,8 @@ from diffsim_ti.runtime.quadrants import QUADRANTS, stand_in
 
 stand_in()
 
-from diffsim_ti.runtime.arrays import (
-    allocated_megabytes,
-    array,
-    clear,
-    fetch,
-    fetch_row,
-    fill,
-    full_shape,
-    look,
-    to_numpy_dtype,
-    upload,
-    view,
-)
+from diffsim_ti.runtime.arrays import allocated_megabytes, array, clear, fetch, fetch_row, fill, full_shape, look
+from diffsim_ti.runtime.arrays import to_numpy_dtype, upload, view
 from diffsim_ti.runtime.device import device_name, use_device
 from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
 from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, Repeated, array_types, kernel, kernels_of
@@ -47,22 +36,9 @@ from diffsim_ti.runtime.language import Bundle, Expr, assign, at, each_lane, let
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
 from diffsim_ti.runtime.piecewise import Piecewise
 from diffsim_ti.runtime.repeated_loops import can_repeat
-from diffsim_ti.runtime.start import (
-    NUMPY,
-    PRECISIONS,
-    arch_name,
-    available_archs,
-    check_alive,
-    check_backend,
-    check_host_init,
-    check_precision,
-    init,
-    is_alive,
-    moves_vectors,
-    program,
-    runs_on_cpu,
-    set_precision,
-)
+from diffsim_ti.runtime.start import NUMPY, PRECISIONS, arch_name, available_archs, check_alive, check_backend
+from diffsim_ti.runtime.start import check_host_init, check_precision, init, is_alive, moves_vectors, program
+from diffsim_ti.runtime.start import runs_on_cpu, set_precision
 from diffsim_ti.runtime.threads import take_turns as _take_turns
 from diffsim_ti.runtime.threads import untaped
 from diffsim_ti.runtime.vectors import cross, number_type, vector_type
