@@ -5,10 +5,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.batch.batch_inputs import change_of, checked_values, spread_given
+from diffsim_ti.batch.batch_inputs import change_of, checked_values, gathered_scenes, spread_given
 from diffsim_ti.batch.frames import BatchFrames, LazyFrames
 from diffsim_ti.batch.joined_sweep import JoinedSweep
-from diffsim_ti.batch.set_values import gathered_scenes
 from diffsim_ti.batch.side_by_side import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeAdapter
@@ -26,7 +25,7 @@ from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.rollout.frames import check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
-from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
+from diffsim_ti.rollout.set_values import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FAR, FacesBend
 from diffsim_ti.state.schedule import UnequalSteps

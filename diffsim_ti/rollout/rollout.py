@@ -22,8 +22,7 @@ from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import HostSeed, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.run import Run
-from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
-from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
+from diffsim_ti.rollout.set_values import change_like, gathered, spread_all, spread_change, spread_shape, with_shape
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeAdapter
 from diffsim_ti.scene.scene import SceneArguments
@@ -219,7 +218,7 @@ class Rollout(metaclass=Public):
 
         A material's numbers and others per tetrahedron may be given by named sets, `youngs_modulus={"soft": 2e4}`; gradients
         by them have the same names, and so may tangents (set_values.py). `shape` [m], (num_vertices, 3), moves initial and
-        rest positions together, and supports with them (shape.py).
+        rest positions together, and supports with them.
         """
         values, sets = spread_all(self.scene, self.values, spread_shape(values, self.values))
         frames = self.frames_of(self.sweep.run(values, law_state=law_state))

@@ -9,7 +9,7 @@ from diffsim_ti.common.brief import brief
 from diffsim_ti.common.origin import START_NEARER, warn_of_rounding
 from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.rollout.shape import spread_shape
+from diffsim_ti.rollout.set_values import spread_shape
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
 from diffsim_ti.torch_bridge.batch_node import TorchBatchFrames, batch_frames
 from diffsim_ti.torch_bridge.set_tensors import as_tensors

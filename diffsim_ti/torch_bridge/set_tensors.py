@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from diffsim_ti.batch.set_values import own_sets
+from diffsim_ti.batch.batch_inputs import own_sets
 from diffsim_ti.common.checked import numbers as as_array
 from diffsim_ti.rollout.set_values import per_tetrahedron, rows_of_sets
 from diffsim_ti.scene import Scene

@@ -5,7 +5,7 @@ from diffsim_ti.writers.arrays import ArraysWriter
 from diffsim_ti.writers.drawn import FilmWriter, PictureWriter
 from diffsim_ti.writers.gltf import GltfWriter
 from diffsim_ti.writers.paraview import ParaViewWriter
-from diffsim_ti.writers.ply import PlyWriter
+from diffsim_ti.writers.surfaces import PlyWriter
 from diffsim_ti.writers.usd import UsdWriter
 from diffsim_ti.writers.writer import WRITERS, View, Writer, open_writer, register, save_frames, writer_for
 
