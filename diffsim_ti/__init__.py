@@ -23,7 +23,7 @@ from diffsim_ti.materials import KelvinVoigt, LinearElastic, Material, MooneyRiv
 from diffsim_ti.materials import SmithNeoHookean, StableNeoHookean, StVenantKirchhoff, Yeoh
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.monitor.energy_watch import EnergyGained
+from diffsim_ti.monitor.energy_balance import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import CenterOfMass, ChamberPressure, ContactForce, ContactSlip, ContactTraction, Dissipation
 from diffsim_ti.outputs import ElasticEnergy, EnclosedVolume, KineticEnergy, Length, MaterialPoints, PixelTracks

@@ -5,8 +5,7 @@ import weakref
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.batch.layouts import in_slots
-from diffsim_ti.batch.side_by_side import growths_placed, placed
+from diffsim_ti.batch.layouts import growths_placed, in_slots, placed
 from diffsim_ti.inputs import Derived
 
 OF_STEPS = "forces", "motion", "path"

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.batch.batch_inputs import change_of, checked_values, gathered_scenes, spread_given
 from diffsim_ti.batch.frames import BatchFrames, LazyFrames
-from diffsim_ti.batch.joined_sweep import JoinedSweep
-from diffsim_ti.batch.side_by_side import why_not
+from diffsim_ti.batch.joined_workspace import JoinedSweep
+from diffsim_ti.batch.layouts import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeAdapter
 from diffsim_ti.common.checked import as_numbers, instance, whole
@@ -22,9 +22,8 @@ from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
 from diffsim_ti.outputs.frames import Frames
-from diffsim_ti.rollout.frames import check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.rollout import Rollout
-from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.run import Run, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.set_values import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FAR, FacesBend

@@ -20,8 +20,8 @@ from diffsim_ti.batch.views import (
 )
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, at, let, traced
-from diffsim_ti.solvers.explicit.item_forces import ItemForces
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
+from diffsim_ti.solvers.explicit.vertex_parts import ItemForces
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.pass_table import pass_at
 

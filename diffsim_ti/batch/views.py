@@ -1,4 +1,4 @@
-"""One scene of a batch as Taichi functions of a single scene see it, and numbers of the tetrahedra of a batch.
+"""One scene of a batch as Taichi functions of a single scene see it, and functions of the tetrahedra of a batch.
 
 Numbers that scenes have of their own lie as batch/layouts.py says; what all scenes share lies as it does for one scene.
 """
@@ -245,9 +245,6 @@ class Corners:
 
     def __init__(self, array, tets):
         self.array, self.tets = array, tets
-
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

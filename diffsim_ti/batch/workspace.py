@@ -13,8 +13,7 @@ from diffsim_ti.batch.block_views import SHARED
 from diffsim_ti.batch.free_vertices import NEAR, SPECIAL
 from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
 from diffsim_ti.batch.kernels import BatchKernels, batch_kernels
-from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
-from diffsim_ti.batch.side_by_side import growths_placed, placed
+from diffsim_ti.batch.layouts import Innermost, Lanes, growths_placed, in_slots, placed
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.runtime.slots import copy_slot

@@ -13,7 +13,7 @@ from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.chatter import Chatter
-from diffsim_ti.monitor.energy_watch import EnergyGained
+from diffsim_ti.monitor.energy_balance import EnergyGained
 from diffsim_ti.terms.obstacles.barrier import beta
 
 

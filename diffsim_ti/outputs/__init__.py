@@ -2,18 +2,15 @@
 
 from diffsim_ti.outputs.chambers import ChamberPressure, EnclosedVolume
 from diffsim_ti.outputs.contact import ContactForce, ContactSlip, ContactTraction
-from diffsim_ti.outputs.energies import Dissipation, ElasticEnergy, KineticEnergy
+from diffsim_ti.outputs.energies import Dissipation, ElasticEnergy, KineticEnergy, WorkOfLoads
 from diffsim_ti.outputs.lines import Length, Tension
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.outputs.points import CenterOfMass, MaterialPoints, PixelTracks
-from diffsim_ti.outputs.reaction import Reaction
-from diffsim_ti.outputs.section_force import SectionForce
+from diffsim_ti.outputs.reaction import Reaction, SectionForce
 from diffsim_ti.outputs.self_contact_force import SelfContactForce
 from diffsim_ti.outputs.smooth_maximum import SmoothMaximum
-from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tactile_pad import TactilePad
 from diffsim_ti.outputs.tensors import PlasticStrain, Strain, Stress
-from diffsim_ti.outputs.work import WorkOfLoads
 
 __all__ = ["CenterOfMass", "ChamberPressure", "Change", "ContactForce", "ContactSlip", "ContactTraction"]
 __all__ += ["Displacements", "Dissipation", "ElasticEnergy", "EnclosedVolume", "KineticEnergy", "Length"]

@@ -8,17 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.named_sets import SetOrIndices
-from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointInterpolation, PointMeans
+from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PatchRecovery, PointInterpolation, PointMeans
 from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.output import Change, Output
-from diffsim_ti.outputs.recovery import PatchRecovery
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
 from diffsim_ti.scene import Scene
 
 
 class _Tensors(Output):
     """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means of what the tetrahedra around have there;
-    "recovered", at vertices, too, by superconvergent patches (recovery.py); or material points X [m], shape (k, 3), each
+    "recovered", at vertices, too, by superconvergent patches (`PatchRecovery`); or material points X [m], shape (k, 3), each
     with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is the mean over its points, by their volumes;
     at X and at its nodes it is the linear function of place that these four make, which is more accurate than the tensor of
     the displacements there. of: the tetrahedra that are meant: only these have a tensor, or count alone at their vertices.

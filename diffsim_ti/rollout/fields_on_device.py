@@ -5,7 +5,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.outputs import Change
-from diffsim_ti.rollout.frames import HostSeed, check_finite, norm
+from diffsim_ti.rollout.run import HostSeed, check_finite, norm
 from diffsim_ti.runtime.slots import copy_slot
 
 # Fields of frames have shape (frames, vertices), or (runs, frames, vertices) in a rollout of several runs.

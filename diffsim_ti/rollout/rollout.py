@@ -20,8 +20,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.rollout.checkpoints import Checkpoints
-from diffsim_ti.rollout.frames import HostSeed, check_finite, warn_of_large_stretch
-from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.run import HostSeed, Run, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.set_values import change_like, gathered, spread_all, spread_change, spread_shape, with_shape
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeAdapter

@@ -20,7 +20,7 @@ from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
 from diffsim_ti.outputs.frames import Frames
-from diffsim_ti.rollout.frames import warn_of_large_stretch
+from diffsim_ti.rollout.run import warn_of_large_stretch
 from diffsim_ti.solvers import SemiImplicitSolver
 from diffsim_ti.solvers.implicit.multigrid import Following
 from diffsim_ti.solvers.solver import Solver

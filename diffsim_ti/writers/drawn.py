@@ -11,8 +11,7 @@ import numpy as np
 
 from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.extent import Extent
-from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.visual.scene_marks import results_as_arrows
+from diffsim_ti.visual.frame import Frame, Setting, results_as_arrows
 from diffsim_ti.writers.writer import View, Writer, file_of, numbered, register
 
 

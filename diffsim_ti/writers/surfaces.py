@@ -1,4 +1,5 @@
-"""What formats of animated surfaces share: places of the body's surface and of the obstacles wait until the run is over."""
+"""What formats of animated surfaces share: places of the body's surface and of the obstacles wait until the run is
+over; PLY."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -9,8 +9,8 @@ from diffsim_ti.mechanics.obstacles.outside_work import with_drag
 from diffsim_ti.mechanics.reduced.body_adjoint import BodyStage
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
-from diffsim_ti.solvers.explicit.item_forces import ItemForces
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
+from diffsim_ti.solvers.explicit.vertex_parts import ItemForces
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, adjoints, needed, with_state
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
