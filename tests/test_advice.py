@@ -189,7 +189,7 @@ FOLLOWED = {
         lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 1, outputs=[ds.WorkOfLoads()]),
         lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 1, outputs=[ds.WorkOfLoads(weight=True)]),
     ),
-    ("outputs/frames.py", "pass others to Rollout"): (
+    ("outputs/output.py", "pass others to Rollout"): (
         lambda: ds.Rollout(verlet(), 0).forward()["kinetic"],
         lambda: ds.Rollout(verlet(), 0, outputs=[ds.KineticEnergy(name="kinetic")]).forward()["kinetic"],
     ),

@@ -21,7 +21,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Output
-from diffsim_ti.outputs.frames import Frames
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.set_values import spread_change, spread_shape, with_shape

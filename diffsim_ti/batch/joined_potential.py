@@ -7,7 +7,6 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.batch.free_vertices import Numbers
 from diffsim_ti.batch.joined_cg import COUNTING, COUNTS, WHOLE, JoinedCG
 from diffsim_ti.batch.joined_scene import of_scenes
 from diffsim_ti.mechanics.energy.kernels import PotentialKernels
@@ -17,6 +16,7 @@ from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollision
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
 from diffsim_ti.mechanics.obstacles.swept import SweptKernels
 from diffsim_ti.runtime import Bundle, Kernel, Piecewise, at, kernels_of, let, traced
+from diffsim_ti.runtime.piecewise import Piece
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.state.obstacle_poses import Moment
 
@@ -37,7 +37,7 @@ class SeesOneScene:
     @traced
     def _own(self, record, b, count):
         there = {name: x for name, x in vars(record).items() if name in ("parameters", "poses", "places", "drifts")}
-        own = {name: Numbers(x, let(b * (x.shape[0] // count))) for name, x in there.items()}
+        own = {name: Piece(x, let(b * (x.shape[0] // count))) for name, x in there.items()}
         return Bundle(**vars(record) | own)
 
 

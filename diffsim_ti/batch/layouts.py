@@ -154,31 +154,26 @@ class Innermost:
 def why_not(solver) -> str | None:
     """What keeps scenes of a solver from being computed side by side, or None if nothing does."""
     scene = solver.scene
-    if not solver.explicit:
-        return _why_not_joined(solver)
-    if runtime.runs_on_cpu() and not scene.law.lanes:
+    if solver.explicit and runtime.runs_on_cpu() and not scene.law.lanes:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
-    terms = dict(self_contact=scene.term(SelfContact)) | {x.name: True for x in scene.interactions if x.apart}
+    terms = dict(self_contact=scene.term(SelfContact))
+    terms |= {x.name: True for x in scene.interactions if solver.explicit and x.apart}
     terms |= dict(contact_by_pairs=any(term.primitives is not None for term in scene.terms))
-    terms |= dict(mesh_obstacles=_tables(scene), reduced_sets=scene.reduced)
-    there = [name.replace("_", " ") for name, some in terms.items() if some]
-    return f"it has {' and '.join(there)}" if there else None
+    terms |= dict(mesh_obstacles=any(term.table.size for term in scene.ordered_terms if term.acts_on_surface))
+    if solver.explicit:
+        terms |= dict(reduced_sets=scene.reduced)
+    else:
+        terms |= dict(reduced_sets_or_ties=scene.reduced, chambers_of_given_volume=scene.holds_volumes)
+    if there := [name.replace("_", " ") for name, some in terms.items() if some]:
+        return f"it has {' and '.join(there)}"
+    return None if solver.explicit else _why_not_joined(solver)
 
 
 def _why_not_joined(solver) -> str | None:
-    """The same of scenes whose implicit steps are solved together (joined_newton.py)."""
-    scene = solver.scene
-    terms = dict(
-        self_contact=scene.term(SelfContact), contact_by_pairs=any(t.primitives is not None for t in scene.terms)
-    )
-    terms |= dict(
-        mesh_obstacles=_tables(scene), reduced_sets_or_ties=scene.reduced, chambers_of_given_volume=scene.holds_volumes
-    )
-    there = [name.replace("_", " ") for name, some in terms.items() if some]
-    if there:
-        return f"it has {' and '.join(there)}"
+    """The same of the forces of scenes whose implicit steps are solved together (joined_newton.py)."""
     if solver.loose:
         return f"but for contact {solver.loose}, and each scene closes its contact by itself"
+    scene = solver.scene
     values = scene.inputs.derive(scene.inputs.at_times([0.0, solver.dt]))
     hosts, u = host_forces(scene).take(values), values.displacement
     free = scene.supports.freedom(scene.mesh.num_vertices)
@@ -192,10 +187,6 @@ def _is_matrix(host, u: np.ndarray, w: np.ndarray) -> bool:
     """Whether the product with w is that of the matrix that a host force knows."""
     matrix, product = host.matrix(u), host.product(u, w)
     return matrix is not None and np.allclose(matrix @ w.ravel(), product.ravel(), 1e-9, 1e-9 * np.abs(product).max())
-
-
-def _tables(scene) -> bool:
-    return any(term.table.size for term in scene.ordered_terms if term.acts_on_surface)
 
 
 def placed(arrays, name: str, x: np.ndarray) -> np.ndarray:

@@ -9,8 +9,7 @@ from diffsim_ti.common.checked import wholes
 from diffsim_ti.mechanics.chambers.laws import law_of
 from diffsim_ti.mechanics.chambers.pressures import rows_of
 from diffsim_ti.mesh.enclosure import Enclosure, open_edges
-from diffsim_ti.outputs.frames import Frames
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Chamber
 

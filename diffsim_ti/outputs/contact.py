@@ -8,9 +8,8 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
-from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Obstacle, Term
 

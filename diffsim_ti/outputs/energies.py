@@ -10,8 +10,7 @@ from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads
-from diffsim_ti.outputs.frames import Frames
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.outputs.stresses import PatchPressure
 from diffsim_ti.scene import Scene
 

@@ -8,8 +8,7 @@ import numpy as np
 from diffsim_ti.common.deprecated import renamed_arguments
 from diffsim_ti.mechanics.lines.interaction import SpringsAndCables
 from diffsim_ti.outputs.forces_at_frames import at_end
-from diffsim_ti.outputs.frames import Frames
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms.lines import LineTerm
 

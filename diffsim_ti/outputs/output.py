@@ -3,13 +3,86 @@ and the states themselves as outputs, which every rollout has."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import Public
-from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.scene import Scene
+from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import Growth
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout.run import Run
+
+
+@dataclass(eq=False, repr=False)
+class Frames(metaclass=Public):
+    """Saved states of one run: positions [m] (far from the origin in float64), velocities [m/s], displacements from the rest
+    shape [m] (which keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
+
+    `outputs` has what the Rollout was asked to compute besides, by name; `frames["name"]` gives any of them.
+
+    `contact_resolution` says how near the body came to obstacles and how finely the steps resolve that (state/watch.py).
+
+    `contact_forces` [N], where an output reads them: what each obstacle did to each vertex, on average since the frame
+    before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
+    `scene.obstacles`. The first frame has none. In implicit runs of surfaces with friction a row more has that of each
+    other's friction, in the substep that ends in the frame.
+
+    `computed` are these outputs themselves, as settled for the scene; `sets`: those of inputs that were given by named sets.
+
+    `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is constrained, shape (frames,
+    chambers), of the substep that ends in the frame; others, and the first frame, have none (0).
+
+    `law_state`, where an output reads it: what the law remembers of each tetrahedron, shape (frames, num_tetrahedra, S), or
+    (frames, num_tetrahedra, 4, S) at the points of ten-node tetrahedra, in the order of the law's `state_names`.
+
+    `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
+    the last good one.
+
+    `scene`: of which they are.
+
+    `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    displacements: np.ndarray
+    times: np.ndarray
+    inputs: dict = field(repr=False)
+    contact_resolution: ContactResolution | None = field(default=None, repr=False)
+    outputs: dict[str, np.ndarray] = field(default_factory=dict)
+    contact_forces: np.ndarray | None = field(default=None, repr=False)
+    computed: dict = field(default_factory=dict, repr=False)
+    chamber_pressures: np.ndarray | None = field(default=None, repr=False)
+    sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
+    law_state: np.ndarray | None = field(default=None, repr=False)
+    steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
+    run: "Run | None" = field(default=None, repr=False)
+    error: FloatingPointError | None = None
+    scene: Scene | None = field(default=None, repr=False)
+
+    __repr__ = brief_fields
+
+    @property
+    def alive(self) -> bool:
+        """Whether the run came to its end."""
+        return self.error is None
+
+    def __getstate__(self) -> dict:
+        """Without the run, which lives on the device, and the scene: a copy by pickle has no gradient and no picture."""
+        return vars(self) | dict(run=None, scene=None)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name in ("positions", "velocities", "displacements"):
+            return getattr(self, name)
+        if name not in self.outputs:
+            known = ", ".join(("positions", "velocities", "displacements", *self.outputs))
+            raise KeyError(f"no output named {name!r}; there are {known}: pass others to Rollout(..., outputs=[...])")
+        return self.outputs[name]
+
 
 NOTED = ("contact_forces", "chamber_pressures", "law_state")  # what runs note besides states, where outputs read it
 
@@ -51,7 +124,7 @@ class Output(metaclass=Public):
 
     Write one outside the package by giving it `name`, `shape`, `value`, `jvp` and `vjp`, in NumPy and float64; it is then
     in `frames[name]` and `Rollout.tangents`, takes a seed in `Rollout.vjp(frames, name=...)`, and has a field under
-    `ti.ad.Tape` and a tensor in torch. `frames` (frames.py) holds the states and, in `frames.inputs`, the values of
+    `ti.ad.Tape` and a tensor in torch. `frames` (`Frames`) holds the states and, in `frames.inputs`, the values of
     all inputs. Rollout.tangents and Rollout.vjp must agree in <w, J d> = <J^T w, d>: check a new output by that and by
     differences.
     Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.

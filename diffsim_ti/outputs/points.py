@@ -10,8 +10,7 @@ from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh.geometry import barycentric_in_plane, inverse_edges, shape_gradients
 from diffsim_ti.mesh.inverse_map import barycentric_in, solved
-from diffsim_ti.outputs.frames import Frames
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.scene import Scene
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads, BodyForces
-from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.outputs.tensors import Stress
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Tie

@@ -10,9 +10,8 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.curved_pairs import pairs_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
 from diffsim_ti.mesh.named_sets import SetOrIndices
-from diffsim_ti.outputs.frames import Frames
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.scene import Scene
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.numbers import Tangent

@@ -6,8 +6,7 @@ from typing import Literal
 import numpy as np
 
 from diffsim_ti.common.checked import number
-from diffsim_ti.outputs.frames import Frames
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.scene import Scene
 
 

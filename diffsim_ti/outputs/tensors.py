@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PatchRecovery, PointInterpolation, PointMeans
-from diffsim_ti.outputs.frames import Frames
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
 from diffsim_ti.scene import Scene
 

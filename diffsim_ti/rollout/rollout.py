@@ -18,7 +18,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
-from diffsim_ti.outputs.frames import Frames
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.run import HostSeed, Run, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.set_values import change_like, gathered, spread_all, spread_change, spread_shape, with_shape

@@ -11,7 +11,7 @@ from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Strain
-from diffsim_ti.outputs.frames import Frames
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.state.watch import ContactResolution
 
 

@@ -19,7 +19,7 @@ from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
-from diffsim_ti.outputs.frames import Frames
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.run import warn_of_large_stretch
 from diffsim_ti.solvers import SemiImplicitSolver
 from diffsim_ti.solvers.implicit.multigrid import Following

@@ -13,7 +13,7 @@ from diffsim_ti.obstacles import floor_of, obstacle_surfaces
 from diffsim_ti.outputs import Output, Stress
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads
-from diffsim_ti.outputs.frames import Frames
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Gravity
