@@ -240,15 +240,7 @@ class EnergyWatch:
         self.begin()
         return added
 
-    def note(
-        self,
-        u: np.ndarray,
-        u_star: np.ndarray,
-        u_next: np.ndarray,
-        v_next: np.ndarray,
-        places: tuple,
-        kinetic: float = 0.0,
-    ) -> None:
+    def note(self, u, u_star, u_next, v_next, places: tuple, kinetic: float = 0.0) -> None:
         """A step went from u by u_star to u_next, obstacles from places[0] by places[1] to places[2] (displacements [m],
         shape (num_obstacles, 3)); contacts are as in its pass. kinetic: what it has added to that energy [J]."""
         potential = self.ws.potential  # what viscosity and friction take is no gain, and none of a step's making

@@ -101,18 +101,7 @@ class AppliedLoads:
             out[self.dead.acts_at] += self._dead(step, derived.forces, begins)
         return out + self._hosts(derived, x, step, begins, held, v).forces(x - derived.rest)
 
-    def jvp(
-        self,
-        derived: Derived,
-        moved: Derived,
-        x: np.ndarray,
-        dx: np.ndarray,
-        step: int,
-        begins: bool = False,
-        held=None,
-        v=None,
-        dv=0.0,
-    ) -> np.ndarray:
+    def jvp(self, derived, moved, x, dx, step: int, begins: bool = False, held=None, v=None, dv=0.0) -> np.ndarray:
         """Their change, at frozen pressures."""
         out = np.zeros(x.shape)
         if self.gravity is not None:
@@ -123,17 +112,7 @@ class AppliedLoads:
         hosts = self._hosts(derived, x, step, begins, held, v)
         return out + hosts.jvp(x - derived.rest, dx - moved.rest, dv + np.zeros_like(dx), moved)
 
-    def vjp(
-        self,
-        derived: Derived,
-        x: np.ndarray,
-        w: np.ndarray,
-        step: int,
-        adj: Derived,
-        begins: bool = False,
-        held=None,
-        v=None,
-    ) -> tuple:
+    def vjp(self, derived, x, w, step: int, adj: Derived, begins: bool = False, held=None, v=None) -> tuple:
         """Adjoints of x and v for that of the forces; adds those of all else, but for held pressures, to `adj`."""
         if self.gravity is not None:
             by_mass = w @ derived.parameters[self.gravity][:3]
