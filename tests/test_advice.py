@@ -168,7 +168,7 @@ FOLLOWED = {
         lambda: ds.modes(scene(mesh=JOINED, reduced={"body_0": "rigid"}), 1),
         lambda: ds.modes(scene(mesh=JOINED), 1),
     ),
-    ("outputs/contact.py", "give about= or per_vertex=True"): (
+    ("outputs/contact_force.py", "give about= or per_vertex=True"): (
         lambda: ds.ContactForce("a", about=(0, 0, 0), per_vertex=True),
         lambda: (ds.ContactForce("a", about=(0, 0, 0)), ds.ContactForce("a", per_vertex=True)),
     ),
@@ -247,7 +247,7 @@ FOLLOWED = {
         lambda: CUBE.quadratic().compute_deformation_gradient(CUBE.quadratic().vertices),
         lambda: ds.Strain(stretches=True).settled(scene(mesh=CUBE.quadratic())),
     ),
-    ("outputs/contact.py", "give on=, a set whose sum"): (
+    ("outputs/contact_force.py", "give on=, a set whose sum"): (
         lambda: ds.ContactForce("floor", on="xmin", per_vertex=True),
         lambda: (ds.ContactForce("floor", on="xmin"), ds.ContactForce("floor", per_vertex=True)),
     ),
@@ -339,7 +339,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("materials/patch_law.py", "does not say what its theta is"): "test_open_laws.py, with a law of one's own",
     ("mesh/checks.py", "in no tetrahedron"): "test_mesh.py",
     ("mesh/enclosure.py", "must not be moved"): "test_chambers.py",
-    ("outputs/contact.py", "pass friction= to it"): "test_contact_force.py",
+    ("outputs/contact_slip.py", "pass friction= to it"): "test_contact_force.py",
     ("outputs/points.py", "take frames.computed"): "test_camera.py",
     ("monitor/chatter.py", "vibrates at {} m/s"): "test_contact_friction.py",
     ("monitor/guard.py", "has gained {} J"): "test_energy_watch.py",

@@ -1,7 +1,9 @@
 """Outputs, which losses use like positions: functions of a run's frames, one file each, and their interface for others."""
 
 from diffsim_ti.outputs.chambers import ChamberPressure, EnclosedVolume
-from diffsim_ti.outputs.contact import ContactForce, ContactSlip, ContactTraction
+from diffsim_ti.outputs.contact_force import ContactForce
+from diffsim_ti.outputs.contact_slip import ContactSlip
+from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.energies import Dissipation, ElasticEnergy, KineticEnergy, WorkOfLoads
 from diffsim_ti.outputs.lines import Length, Tension
 from diffsim_ti.outputs.output import Change, Displacements, Output, Positions, Velocities

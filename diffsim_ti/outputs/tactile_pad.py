@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti.mesh.geometry import barycentric_in_plane, triangle_normals, triangle_normals_jvp, triangle_normals_vjp
 from diffsim_ti.mesh.named_sets import SetOrIndices
-from diffsim_ti.outputs.contact import ContactTraction
+from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Term

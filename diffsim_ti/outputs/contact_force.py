@@ -1,0 +1,105 @@
+"""Forces and moments of obstacles on the body."""
+
+from copy import copy
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
+from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.scene import Scene
+from diffsim_ti.terms import Term
+
+PARTS = ("total", "normal", "friction")
+
+
+class ContactForce(Output):
+    """Force [N] of an obstacle on the body, shape (frames, 3), or on each vertex, (frames, num_vertices, 3).
+
+    obstacle: its name, or the term as the scene lists it. part: "normal" is what its barrier pushes with, "friction" what
+        drags, "total" both. per_vertex: of each vertex instead of the sum. name: how a loss calls it.
+    on: the vertices whose sum or moment is taken, by a vertex set's name, indices, a mask or a list of names, such as a body
+        of a joined mesh; None: all.
+    about: the moment [N m] about this point [m], 3 numbers, instead: sum (x_i - about) x f_i, x being the frame's positions.
+
+    A frame holds the mean over the time T since the frame before it, zero in the first:
+
+        f = 1/T sum over passes of the impulses,    in explicit passes h P n + m (v after - v before friction)
+
+    so that with save_every=1 it is the force of each step, and T f is what the obstacle added to the body's momentum: to
+    round-off in explicit steps, in backward Euler and the midpoint rule to the tolerance of their solves; of implicit steps
+    the forces are those where they take them. In static solves it is the force of the last equilibrium.
+    Obstacles act on fixed vertices in implicit steps and static solves alone, and what holds them takes that up.
+    The gradient is exact by all inputs: moduli, density, rest shape, the obstacle's stiffness, friction, shape, path.
+
+    Raises ValueError, when a Rollout is made, for an obstacle that the scene has not, another part, a name that is taken,
+    and an explicit solver with contact="force".
+    Wriggers, Computational Contact Mechanics, 2nd ed., 2006, sec. 5 and 8, doi:10.1007/978-3-540-32609-0.
+    """
+
+    reads_contact_forces, unit = True, "N"
+
+    def __init__(
+        self,
+        obstacle: Term | str,
+        part: Literal["total", "normal", "friction"] = "total",
+        name: str = "contact_force",
+        per_vertex: bool = False,
+        about: ArrayLike | None = None,
+        on: str | ArrayLike | None = None,
+    ):
+        if part not in PARTS:
+            raise ValueError(f"ContactForce: part must be {', '.join(PARTS[:-1])} or {PARTS[-1]}, got {part!r}")
+        if about is not None and per_vertex:
+            raise ValueError("ContactForce: a moment is of all vertices: give about= or per_vertex=True, not both")
+        if on is not None and per_vertex:
+            raise ValueError("ContactForce: give on=, a set whose sum is taken, or per_vertex=True, of all vertices")
+        self.obstacle, self.part, self.name, self.per_vertex = obstacle, part, name, bool(per_vertex)
+        self.on = on
+        self.about = None if about is None else np.array(about, np.float64)
+        if self.about is not None and (self.about.shape != (3,) or not np.all(np.isfinite(self.about))):
+            raise ValueError(f"ContactForce: about must be 3 finite numbers [m], got {about!r}")
+
+    def __repr__(self) -> str:
+        return f"ContactForce({self.obstacle!r}, {self.part!r}, name={self.name!r})"
+
+    def settled(self, scene: Scene) -> "ContactForce":
+        out = copy(self)
+        out.place, out.num_vertices = scene.place_of(self.obstacle), scene.mesh.num_vertices
+        n = out.num_vertices
+        out.vertices = np.arange(n) if self.on is None else scene.mesh.vertex_indices(self.on)
+        out.sides = {"total": slice(0, 2), "normal": slice(0, 1), "friction": slice(1, 2)}[self.part]
+        return out
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        return (num_frames, self.num_vertices, 3) if self.per_vertex else (num_frames, 3)
+
+    def _of(self, forces: np.ndarray) -> np.ndarray:
+        """On each vertex that counts."""
+        return forces[:, self.place, self.sides].sum(1)[:, self.vertices]
+
+    def value(self, frames: Frames) -> np.ndarray:
+        f = self._of(frames.contact_forces)
+        if self.about is not None:
+            return moments(frames.positions[:, self.vertices], self.about, f)
+        return f if self.per_vertex else f.sum(1)
+
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
+        x, dx = frames.positions[:, self.vertices], change.positions
+        df = np.zeros(x.shape) if change.contact_forces is None else self._of(change.contact_forces)
+        if self.about is not None:
+            dx = None if dx is None else dx[:, self.vertices]
+            return moments_jvp(x, self.about, self._of(frames.contact_forces), dx, df)
+        return df if self.per_vertex else df.sum(1)
+
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
+        by_forces, positions = np.zeros(frames.contact_forces.shape), None
+        by_vertex = np.zeros(frames.positions.shape)
+        by_vertex[:, self.vertices] = seed if self.per_vertex else seed[:, None]
+        if self.about is not None:
+            positions, x = np.zeros(by_vertex.shape), frames.positions[:, self.vertices]
+            own = moments_vjp(x, self.about, self._of(frames.contact_forces), seed)
+            positions[:, self.vertices], by_vertex[:, self.vertices] = own
+        by_forces[:, self.place, self.sides] = by_vertex[:, None]
+        return Change(positions=positions, contact_forces=by_forces)
