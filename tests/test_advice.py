@@ -341,7 +341,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("mesh/enclosure.py", "must not be moved"): "test_chambers.py",
     ("outputs/contact_slip.py", "pass friction= to it"): "test_contact_force.py",
     ("outputs/points.py", "take frames.computed"): "test_camera.py",
-    ("monitor/chatter.py", "vibrates at {} m/s"): "test_contact_friction.py",
+    ("monitor/guard.py", "vibrates at {} m/s"): "test_contact_friction.py",
     ("monitor/guard.py", "has gained {} J"): "test_energy_watch.py",
     ("monitor/guard.py", "reduce the substep to {} s"): "test_contact_crossing.py, battery_of_impacts.py",
     ("monitor/guard.py", "the barrier cannot stop it"): "test_contact_crossing.py, battery_of_impacts.py",

@@ -1,4 +1,4 @@
-"""Outputs, which losses use like positions: functions of a run's frames, one file each, and their interface for others."""
+"""Outputs, which losses use like positions: functions of a run's frames, and their interface for others."""
 
 from diffsim_ti.outputs.chambers import ChamberPressure, EnclosedVolume
 from diffsim_ti.outputs.contact_force import ContactForce
