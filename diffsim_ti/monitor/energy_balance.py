@@ -243,20 +243,18 @@ class EnergyWatch:
     def note(self, u, u_star, u_next, v_next, places: tuple, kinetic: float = 0.0) -> None:
         """A step went from u by u_star to u_next, obstacles from places[0] by places[1] to places[2] (displacements [m],
         shape (num_obstacles, 3)); contacts are as in its pass. kinetic: what it has added to that energy [J]."""
-        potential = self.ws.potential  # what viscosity and friction take is no gain, and none of a step's making
-        with potential.without_viscosity(), potential.without_friction():
-            self._note(u, u_star, u_next, v_next, places, kinetic)
-
-    def _note(self, u, u_star, u_next, v_next, places, kinetic) -> None:
         potential, energies = self.ws.potential, []
         drift = self.ws.arrays.poses.drift(places[0], places[2])
-        for displacement, place in ((u, places[0]), (u_next, places[2])):
-            self.ws.collisions.put(place)
-            potential.place(displacement)
-            energies.append(potential.energy()[0])
-        self.ws.collisions.put(places[1])
-        potential.place(u_star)
-        work = float((potential.forces()[0] * (u_next - u)).sum()) - self._work_of_obstacles(u_star, places[1], drift)
+        # what viscosity and friction take is no gain, and none of a step's making
+        with potential.without_viscosity(), potential.without_friction():
+            for displacement, place in ((u, places[0]), (u_next, places[2])):
+                self.ws.collisions.put(place)
+                potential.place(displacement)
+                energies.append(potential.energy()[0])
+            self.ws.collisions.put(places[1])
+            potential.place(u_star)
+            work = float((potential.forces()[0] * (u_next - u)).sum())
+            work -= self._work_of_obstacles(u_star, places[1], drift)
         self.gained += energies[1] - energies[0] + work + kinetic
         self.moving = max(self.moving, kinetic_energy(self.ws.mass, v_next) + energies[1])
 

@@ -316,45 +316,28 @@ class UnequalSteps(Schedule):
         return [(a, b) for a, b in zip(bounds, bounds[1:]) if a < b]
 
 
+def _of_whole(method: str):
+    """A method of pass j: that of other steps for the pass which it is a part of."""
+    return lambda self, j: getattr(self.whole, method)(j // self.stages)
+
+
 @dataclass(frozen=True)
 class StagedSteps(Schedule):
-    """Every pass of other steps as `stages` passes, each of which has the length and the place in time of that pass."""
+    """Every pass of other steps as `stages` passes, each of which has the length and the place in time of that pass: each
+    substep is kicked several times before it drifts."""
 
     whole: Schedule
     stages: int
 
-    @property
-    def varies(self):
-        return self.whole.varies
-
-    @property
-    def substeps(self):
-        return self.stages * self.whole.substeps
-
-    def row(self, j):
-        return self.whole.row(j // self.stages)
+    row, step_length, length, begin, end = map(_of_whole, ("row", "step_length", "length", "begin", "end"))
+    varies, longest = (property(lambda self, name=name: getattr(self.whole, name)) for name in ("varies", "longest"))
+    substeps = property(lambda self: self.stages * self.whole.substeps)
 
     def first(self, step):
         return self.stages * self.whole.first(step)
 
     def time(self, step):
         return self.whole.time(step)
-
-    def step_length(self, j):
-        return self.whole.step_length(j // self.stages)
-
-    def length(self, j):
-        return self.whole.length(j // self.stages)
-
-    def begin(self, j):
-        return self.whole.begin(j // self.stages)
-
-    def end(self, j):
-        return self.whole.end(j // self.stages)
-
-    @property
-    def longest(self):
-        return self.whole.longest
 
     def stretches(self, first, last):
         of_whole = self.whole.stretches(first // self.stages, -(-last // self.stages))
