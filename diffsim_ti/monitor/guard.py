@@ -17,6 +17,9 @@ from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.energy_balance import EnergyGained
 from diffsim_ti.terms.obstacles.barrier import beta
 
+SHAKEN, OPEN, NEAR = 0.3, 0.5, 2  # of the sliding speed; of what has touched; widths
+VISCOUS = 0.1  # of the stable step
+
 
 class Divergence(CarriesMore, FloatingPointError):
     """The state is not finite, or the step has become unstable. Carries step, vertex, tetrahedron and stable_dt [s], and
@@ -51,10 +54,6 @@ class Crossing(Divergence):
         super().__init__(message, step, vertex, None, stable_dt)
         self.depth, self.speed, self.stiffness = depth, speed, stiffness
         self.enough = stable_dt if stiffness is None else None
-
-
-SHAKEN, OPEN, NEAR = 0.3, 0.5, 2  # of the sliding speed; of what has touched; widths
-VISCOUS = 0.1  # of the stable step
 
 
 class Chatter:

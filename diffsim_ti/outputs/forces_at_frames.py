@@ -22,6 +22,9 @@ from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.terms import Chamber, Gravity, Growth
 
 STEPS = EqualSteps(1.0, 1)  # a pass for each step
+A = ti.template()
+STATE = dict(u="vectors2", v="vectors2")
+CORNERS = dict(corner="vectors", rate_corner="vectors")
 
 
 def at_end(step: int, begins: bool = False) -> Instant:
@@ -126,11 +129,6 @@ class AppliedLoads:
         by_u, by_v = self._hosts(derived, x, step, begins, held, v).vjp(x - derived.rest, w, adj)
         adj.rest -= by_u
         return by_u, by_v
-
-
-A = ti.template()
-STATE = dict(u="vectors2", v="vectors2")
-CORNERS = dict(corner="vectors", rate_corner="vectors")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from diffsim_ti.runtime.slots import copy_slot
 
 # Fields of frames have shape (frames, vertices), or (runs, frames, vertices) in a rollout of several runs.
 
+STATES = ("positions", "velocities", "displacements")
+
 
 @ti.func
 def _row(field: ti.template(), k, f, i):
@@ -100,9 +102,6 @@ def add_vectors(field: ti.template(), values: ti.types.ndarray()):
     for I in ti.grouped(field):
         for d in ti.static(range(3)):
             field[I][d] += values[I, d]
-
-
-STATES = ("positions", "velocities", "displacements")
 
 
 def field_seed(face, k: int | None, change: Change) -> HostSeed:

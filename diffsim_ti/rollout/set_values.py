@@ -16,6 +16,7 @@ from diffsim_ti.common.checked import as_numbers, instance, shown
 from diffsim_ti.scene import Scene
 
 Rows = dict[str, np.ndarray]  # tetrahedra of each set
+MOVED = "initial_positions", "rest_positions"
 
 
 def rows_of_sets(scene: Scene, name: str, sets: Iterable[str]) -> Rows:
@@ -101,9 +102,6 @@ def split_name(name: str) -> tuple[str, str | None]:
     """ "youngs_modulus[soft]" as (input, set); a plain name as (name, None)."""
     plain, bracket, rest = instance("field", "name", name, str, "that of an input or output").partition("[")
     return (plain, rest[:-1]) if bracket and rest.endswith("]") else (name, None)
-
-
-MOVED = "initial_positions", "rest_positions"
 
 
 def spread_shape(given: Mapping, values: Mapping) -> dict:

@@ -21,6 +21,9 @@ from diffsim_ti.runtime.repeated_loops import RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
 from diffsim_ti.runtime.threads import LOCK, materialize, untaped
 
+PATIENCE, SHORT = 5, 500  # [s]; variables of kernels that take less than a second
+_WORD = ctypes.sizeof(ctypes.c_void_p)
+
 
 class Launch:
     """A kernel with its arrays bound once, launched many times with other numbers.
@@ -112,9 +115,6 @@ class Launch:
             self._owner().launch_kernel(self._code, self._context)
 
 
-PATIENCE, SHORT = 5, 500  # [s]; variables of kernels that take less than a second
-
-
 @contextlib.contextmanager
 def say_if_long(what: str):
     """Say so on stderr, once, if a `with` block of Taichi takes longer than PATIENCE [s] and the logger "diffsim_ti" shows
@@ -175,9 +175,6 @@ class TensorLaunch(Launch):
             size = tensor.numel() * tensor.element_size()
             self._context.set_arg_external_array_with_shape((k,), tensor.data_ptr(), size, tuple(tensor.shape), 0)
         self._owner().launch_kernel(self._code, self._context)
-
-
-_WORD = ctypes.sizeof(ctypes.c_void_p)
 
 
 def _word(address: int) -> ctypes.c_void_p:

@@ -55,6 +55,8 @@ _DECORATORS = {
     id(ast_transformer.ndrange): "ndrange",
 }
 _record_of = lru_cache(maxsize=None)(core.DebugInfo)  # of a place in a file
+_AS_IT_IS = template()  # Taichi copies no argument of a parameter with this annotation
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 class _Fails:
@@ -214,10 +216,6 @@ def _variable(value):
         return _any_variable(value)
     made["variables"] += 1
     return Expr(impl.pytaichi.compiling_callable.ast_builder().expr_var(value.ptr, _record()))
-
-
-_AS_IT_IS = template()  # Taichi copies no argument of a parameter with this annotation
-_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def may_share(file: str) -> bool:

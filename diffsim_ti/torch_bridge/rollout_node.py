@@ -14,6 +14,7 @@ from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms
 from diffsim_ti.torch_bridge.tensors import TensorRollout, as_tensors, on_host
 
 REMEDY = "use verify.hessian_product or verify.gauss_newton_product"
+STATES = "positions", "velocities", "displacements"
 
 
 class _States(NamedTuple):
@@ -96,9 +97,6 @@ def _as_tensors(gradients: dict, names, tensors, needed) -> list:
         value = torch.tensor(value) if isinstance(value, np.ndarray) else value  # a copy: gradients may be read-only
         out.append(None if value is None else value.to(tensor.device, tensor.dtype))
     return out
-
-
-STATES = "positions", "velocities", "displacements"
 
 
 class TorchBatchFrames(dict):

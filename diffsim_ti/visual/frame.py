@@ -21,6 +21,8 @@ from diffsim_ti.terms.marks import Arrows, Mark, Moment, arrows
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.colouring import FIELDS, measured_fields
 
+OF_A_RESULT = 200  # arrows that are drawn of one
+
 
 @dataclass(repr=False)
 class Setting(metaclass=Public):
@@ -169,9 +171,6 @@ def _loads(scene: Scene, positions: np.ndarray, step: int, values: dict) -> dict
     if scene.holds_volumes or not loads.any:
         return {}
     return {"loads": loads.forces(scene.inputs.derive(values), positions.astype(np.float64), step)}
-
-
-OF_A_RESULT = 200  # arrows that are drawn of one
 
 
 @public

@@ -18,6 +18,7 @@ COLOURS = tuple(
     np.array([int(c[k : k + 2], 16) / 255 for k in (0, 2, 4)])
     for c in ("B2182B", "1B7837", "762A83", "01665E", "8C510A", "2D2D2D")
 )
+INK = "#333333"
 
 
 def arrow_length(mesh: TetrahedralMesh) -> float:
@@ -121,9 +122,6 @@ def key_lines(
         out[mark.label] = f"{sign} {words}", colours[mark.label]
     held_rows = [("● held in all directions", MARK)] * held + [("▲ held along the cone", MARK)] * partly_fixed
     return [*held_rows, *out.values()] if out or partly_fixed else []
-
-
-INK = "#333333"
 
 
 def legend(colouring: Colouring, size: tuple[int, int]) -> tuple:

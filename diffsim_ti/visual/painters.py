@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 
 SUPERSAMPLING = 2  # pictures are drawn larger and averaged, which smooths their edges
+_open: "list[VulkanPainter]" = []  # two hidden windows at once end in a crash when the process exits
 
 
 def spans(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -130,9 +131,6 @@ def _averaged(colour, row, column, background) -> np.ndarray:
     part *= 1 - mean[..., 3:]
     part += mean[..., :3]
     return out
-
-
-_open: "list[VulkanPainter]" = []  # two hidden windows at once end in a crash when the process exits
 
 
 def has_vulkan() -> bool:

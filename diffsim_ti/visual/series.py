@@ -21,6 +21,7 @@ from diffsim_ti.visual.colouring import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
 
 REMEDY = "take the .pvd that a run of diffsim-ti wrote"
+ARROW, LINE, POINT = range(3)
 
 
 def text_of(name: str) -> str:
@@ -113,9 +114,6 @@ class SavedSeries:
                 out.append((surface.points[used], corners.reshape(-1, 3)))
             self._read = file, out
         return self._read[1]
-
-
-ARROW, LINE, POINT = range(3)
 
 
 def write_marks(path: Path, drawn: Sequence[Mark], labels: list[str]) -> None:

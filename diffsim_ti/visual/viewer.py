@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 STRIDE = 2  # the backdrop is drawn this much smaller and stretched
 NO_DISPLAY = "there is no display with a Vulkan driver; use `diffsim-ti render` to draw a film instead"
 PANEL = (0.01, 0.01, 0.3)  # left, top and width of the panel, as shares of the window
+RATE, FASTEST = 15.0, 150.0  # of the whole body on the spring, and at most of what is held [1/s]
+REACH = 0.2  # radius of what is held, as a share of the body's size
+NEAR = 1e-12  # a ray along a triangle does not meet it
 
 
 class Viewer:
@@ -249,11 +252,6 @@ def open_window(title: str, size: tuple[int, int]) -> "Window | None":
         return ti.ui.Window(title, tuple(size), vsync=True)
     except RuntimeError:  # a display that cannot be reached
         return None
-
-
-RATE, FASTEST = 15.0, 150.0  # of the whole body on the spring, and at most of what is held [1/s]
-REACH = 0.2  # radius of what is held, as a share of the body's size
-NEAR = 1e-12  # a ray along a triangle does not meet it
 
 
 def picked_vertex(origin: ArrayLike, ray: ArrayLike, points: np.ndarray, triangles: np.ndarray) -> int | None:

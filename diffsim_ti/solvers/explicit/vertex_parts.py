@@ -15,6 +15,9 @@ from diffsim_ti.runtime import let, number_type, traced, vector_type
 from diffsim_ti.state.bodies import BODIES
 from diffsim_ti.state.features import Features
 
+OF_BODIES = "body_place", "body_mass", "body_numbers", "body_force"  # of which there are changes
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
 
 @dataclass(frozen=True)
 class VertexParts:
@@ -59,10 +62,6 @@ class VertexParts:
     @cached_property
     def sliding_supports(self) -> SlidingSupports:
         return SlidingSupports(self.precision, self.features.motion)
-
-
-OF_BODIES = "body_place", "body_mass", "body_numbers", "body_force"  # of which there are changes
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
