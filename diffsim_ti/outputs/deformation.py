@@ -121,6 +121,19 @@ class PointMeans:
         return back * _like(V, T), (back * T).reshape(len(T), len(V), -1).sum((0, 2)) - kept
 
 
+def followed(X: np.ndarray, located, start: np.ndarray) -> np.ndarray:
+    """xi of places in ten-node tetrahedra at rest positions X, from those in the mesh. Raises ValueError where X carries a
+    tetrahedron too far away."""
+    xi, found = solved(X[located.vertices], located.points, start)
+    if not found.all():
+        k = int(np.argmin(found))
+        raise ValueError(
+            f"rest_positions carry tetrahedron {located.tetrahedra[k]} so far from point {k} at "
+            f"{located.points[k].tolist()} that it cannot be followed; take a smaller step in the rest shape"
+        )
+    return xi
+
+
 class PointInterpolation:
     """Values at places in ten-node tetrahedra, of the linear functions that those at their four points make."""
 
@@ -131,14 +144,7 @@ class PointInterpolation:
 
     def _inner(self, X: np.ndarray) -> np.ndarray:
         """xi of the places in rest positions X."""
-        xi, found = solved(X[self.located.vertices], self.located.points, self._start)
-        if not found.all():
-            k = int(np.argmin(found))
-            raise ValueError(
-                f"rest_positions carry tetrahedron {self.located.tetrahedra[k]} so far from point {k} at "
-                f"{self.located.points[k].tolist()} that it cannot be followed; take a smaller step in the rest shape"
-            )
-        return xi
+        return followed(X, self.located, self._start)
 
     def shares(self, X: np.ndarray) -> np.ndarray:
         """Of the points in the value, shape (4 k,)."""

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh.geometry import barycentric_in_plane, inverse_edges, shape_gradients
-from diffsim_ti.mesh.inverse_map import barycentric_in, solved
+from diffsim_ti.mesh.inverse_map import barycentric_in
+from diffsim_ti.outputs.deformation import followed
 from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.scene import Scene
 
@@ -66,22 +67,11 @@ class MaterialPoints(Output):
         """(grad N, shape (num_points, nodes, 3), N, shape (num_points, nodes)) at the points, in the rest shape."""
         X, nodes = frames.inputs["rest_positions"], self.located.vertices
         if self.element.order == 2:
-            return self._quadratic_weights(X[nodes])
+            by_xi = self.element.derivatives(xi := followed(X, self.located, self.xi))
+            return by_xi @ np.linalg.inv(np.einsum("pai,pak->pik", X[nodes], by_xi)), self.element.functions(xi)
         B = inverse_edges(X, nodes)
         inner = np.einsum("pij,pj->pi", B, self.points - X[nodes[:, 0]])
         return shape_gradients(B), np.concatenate([1 - inner.sum(1, keepdims=True), inner], 1)
-
-    def _quadratic_weights(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the map of ten nodes at X, shape (num_points, 10, 3), reaches the points."""
-        xi, found = solved(X, self.points, self.xi)
-        if not found.all():
-            k = int(np.argmin(found))
-            raise ValueError(
-                f"MaterialPoints: rest_positions carry tetrahedron {self.located.tetrahedra[k]} so far from point {k} at "
-                f"{self.points[k].tolist()} that it cannot be followed; take a smaller step in the rest shape"
-            )
-        by_xi = self.element.derivatives(xi)
-        return by_xi @ np.linalg.inv(np.einsum("pai,pak->pik", X, by_xi)), self.element.functions(xi)
 
     def _deformation(self, frames, gradients: np.ndarray) -> np.ndarray:
         """F at the points, shape (frames, num_points, 3, 3)."""
