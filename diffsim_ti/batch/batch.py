@@ -60,8 +60,7 @@ class Batch(metaclass=Public):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> batch = ds.Batch(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10, scenes=2)
     >>> frames = batch.forward(gravity=[[0.0, -9.81, 0.0], [0.0, -1.62, 0.0]])  # on earth and on the moon
     >>> frames.displacements[:, -1, 0, 1].round(7).tolist()

@@ -116,8 +116,7 @@ class EnclosedVolume(Output):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], fixed="ymin", precision="f64")
     >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.EnclosedVolume()]).forward()
     >>> frames["volume"].round(4).tolist()  # before and under its weight
     [1.0, 0.9691]

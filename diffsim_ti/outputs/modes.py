@@ -153,8 +153,7 @@ def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> frequencies = ds.modes(scene, 7).frequencies  # six rigid motions, and the first that strains
     >>> print(abs(frequencies[:6]).max() < 1e-3, f"{frequencies[6]:.3f} Hz")
     True 2.282 Hz

@@ -36,8 +36,7 @@ class MaterialPoints(Output):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], fixed="ymin", precision="f64")
     >>> top = ds.MaterialPoints([[0.5, 1.0, 0.5]], name="top")
     >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[top]).forward()
     >>> frames["top"][:, 0, 1].round(4).tolist()

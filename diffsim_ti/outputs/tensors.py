@@ -199,8 +199,7 @@ class Stress(_Tensors):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], fixed="ymin", precision="f64")
     >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.Stress(von_mises=True)]).forward()
     >>> frames["stress"].shape, bool((frames["stress"][-1] > 0).all())
     ((2, 6), True)

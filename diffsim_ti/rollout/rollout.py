@@ -76,8 +76,7 @@ class Rollout(metaclass=Public):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10)
     >>> frames = rollout.forward(gravity=(0.0, -1.62, 0.0))
     >>> gradients = rollout.vjp(frames, positions=frames.positions[-1:].repeat(2, 0) * 0 + 1)

@@ -239,8 +239,7 @@ class UnequalSteps(Schedule):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> steps = ds.UnequalSteps([1e-3, 2e-3, 7e-3], substeps=[1, 2, 7])
     >>> frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), steps).forward()
     >>> print(f"{frames.times[-1]:.3f} s, {frames.displacements[-1, 0, 1]:.7f} m")
