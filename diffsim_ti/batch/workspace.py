@@ -12,7 +12,7 @@ from diffsim_ti import runtime
 from diffsim_ti.batch.block_views import SHARED
 from diffsim_ti.batch.free_vertices import NEAR, SPECIAL
 from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
-from diffsim_ti.batch.kernels import BatchKernels, batch_kernels
+from diffsim_ti.batch.kernels import BatchKernels
 from diffsim_ti.batch.layouts import Innermost, Lanes, growths_placed, in_slots, placed
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
@@ -206,7 +206,7 @@ class BatchWorkspace:
         a, features = self.arrays, self.arrays.features()
         out = np.zeros(a.num_vertices, np.int32)
         if features.groups:
-            free = batch_kernels(a.law, features, frozenset()).free
+            free = runtime.kernels_of(BatchKernels, a.law, features, frozenset()).free
             out[self.derived[0].surface > 0] = NEAR if free.lane_groups else SPECIAL
         if features.motion:
             out[a.held] = SPECIAL
@@ -224,7 +224,7 @@ class BatchWorkspace:
     def kernels(self, features) -> BatchKernels | InnermostKernels:
         law = self.arrays.law
         if self.layout.in_lanes:
-            return batch_kernels(law, features, self.own)
+            return runtime.kernels_of(BatchKernels, law, features, self.own)
         return innermost_kernels(law, features, self.own, self.in_parallel > 1)
 
     @property

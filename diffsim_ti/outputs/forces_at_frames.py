@@ -1,7 +1,7 @@
 """Forces at the states that frames show, with derivatives, for outputs: of loads, and of the body's own stress."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -188,11 +188,6 @@ class BodyForceKernels:
         return self._kernel("body_forces_vjp", self.all_vjp, seed=dict(w="vectors2"), adjoint=own)
 
 
-@lru_cache(maxsize=None)
-def _kernels(law, features: Features, lanes: bool) -> BodyForceKernels:
-    return BodyForceKernels(law, features, lanes)
-
-
 class BodyForces:
     """Forces -dE/du [N] of stress, shape (num_vertices, 3), at the states that frames show, for outputs of any law."""
 
@@ -214,7 +209,8 @@ class BodyForces:
         """The numbers of a run; what kernels read of them."""
         derived = self.scene.inputs.derive(values)
         self.arrays.load(derived)
-        self.kernels = _kernels(self.arrays.law, self.arrays.features(True, True), self.arrays.in_lanes)
+        a = self.arrays
+        self.kernels = runtime.kernels_of(BodyForceKernels, a.law, a.features(True, True), a.in_lanes)
         return derived
 
     def _run(self, name: str, **records) -> np.ndarray:
