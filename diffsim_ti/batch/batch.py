@@ -20,7 +20,7 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.face_points import bow, bows
-from diffsim_ti.outputs import Output
+from diffsim_ti.outputs import Change, Output
 from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run, check_finite, warn_of_large_stretch
@@ -174,9 +174,11 @@ class Batch(metaclass=Public):
             last_good[b] = max(0, int(np.argmin(good)) - 1) if not good.all() else last_good[b]
         for b in np.flatnonzero(last_good < self.num_frames - 1):
             u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
-        alone, errors = self._alone(values)
-        for b, own in alone.items():
-            u[b], v[b], last_good[b] = own.displacements, own.velocities, self._last_good(errors.get(b))
+        alone, errors = {}, {}
+        for b in self.sweep.left:  # which the solves of all together gave up
+            alone[b], error = self._one_by_one(values, b)
+            errors |= {b: error} if error else {}
+            u[b], v[b], last_good[b] = alone[b].displacements, alone[b].velocities, self._last_good(error)
         resolution = self.sweep.resolutions()
         states = self._positions(values, u), v, u
         make = lambda b: alone.get(b) or self._frames_of(values, b, states, times, resolution(b))  # noqa: E731
@@ -186,14 +188,6 @@ class Batch(metaclass=Public):
         out = BatchFrames(self, values, frames, last_good, run, errors, states)
         out.alone = tuple(alone)
         return out
-
-    def _alone(self, values: dict) -> tuple[dict[int, Frames], dict[int, Exception]]:
-        """Frames of the scenes that the solves of all together left out, and the errors that stopped some."""
-        frames, errors = {}, {}
-        for b in self.sweep.left:
-            frames[b], error = self._one_by_one(values, b)
-            errors |= {b: error} if error else {}
-        return frames, errors
 
     def _warn_of_bent_faces(self, positions: np.ndarray) -> None:
         """Where faces of some frame lie farther from the triangles of their nodes than contact there may be taken for
@@ -381,7 +375,7 @@ class Batch(metaclass=Public):
         by_one = not self.lanes or not self.solver.explicit
         for b in np.flatnonzero(frames.alive):
             changes = self.one.tangents(frames[b], **own[b]) if by_one else None
-            changes = changes or self.one.changes_of(frames[b], du[b], dv[b], own[b])
+            changes = changes or self.one.changes_of(frames[b], Change(du[b], dv[b], own[b]))
             for name, change in changes.items():
                 out[name][b] = change
         return out

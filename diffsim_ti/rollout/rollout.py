@@ -304,12 +304,10 @@ class Rollout(metaclass=Public):
 
     def tangents(self, frames: Frames, **tangents: InputValue) -> dict[str, np.ndarray]:
         """Changes of all outputs, by name, for changes of inputs, to first order, float64."""
-        change = self._pushed_to_frames(frames, tangents)
-        return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
+        return self.changes_of(frames, self._pushed_to_frames(frames, tangents))
 
-    def changes_of(self, frames: Frames, positions: np.ndarray, velocities: np.ndarray, tangents: dict) -> dict:
+    def changes_of(self, frames: Frames, change: Change) -> dict[str, np.ndarray]:
         """Changes of all outputs from those of the frames' states and of inputs."""
-        change = Change(positions, velocities, tangents)
         return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
 
     def _pushed_to_frames(self, frames: Frames, tangents: dict) -> Change:
