@@ -16,66 +16,19 @@ from diffsim_ti import notebook  # noqa: F401  gives classes their form there
 from diffsim_ti.accuracy.estimate import Accuracy
 from diffsim_ti.accuracy.refine import Refined, refine
 from diffsim_ti.batch import Batch, BatchFrames
-from diffsim_ti.identification import (
-    Identification,
-    Measurement,
-    ModalTest,
-    Normal,
-    Smooth,
-    Unknown,
-    compare,
-    expected,
-    identifiability,
-    identify,
-)
-from diffsim_ti.materials import (
-    Corotated,
-    EnergyLaw,
-    FibreReinforced,
-    Gent,
-    Grown,
-    InitialStress,
-    J2Plasticity,
-    KelvinVoigt,
-    LinearElastic,
-    Material,
-    MooneyRivlin,
-    Ogden,
-    Orthotropic,
-    Prony,
-    SmithNeoHookean,
-    StableNeoHookean,
-    StVenantKirchhoff,
-    Yeoh,
-)
+from diffsim_ti.identification import Identification, Measurement, ModalTest, Normal, Smooth, Unknown, compare, expected
+from diffsim_ti.identification import identifiability, identify
+from diffsim_ti.materials import Corotated, EnergyLaw, FibreReinforced, Gent, Grown, InitialStress, J2Plasticity
+from diffsim_ti.materials import KelvinVoigt, LinearElastic, Material, MooneyRivlin, Ogden, Orthotropic, Prony
+from diffsim_ti.materials import SmithNeoHookean, StableNeoHookean, StVenantKirchhoff, Yeoh
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.monitor.energy_watch import EnergyGained
+from diffsim_ti.monitor.energy_balance import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
-from diffsim_ti.outputs import (
-    CenterOfMass,
-    ChamberPressure,
-    ContactForce,
-    ContactSlip,
-    ContactTraction,
-    Dissipation,
-    ElasticEnergy,
-    EnclosedVolume,
-    KineticEnergy,
-    Length,
-    MaterialPoints,
-    PixelTracks,
-    PlasticStrain,
-    Reaction,
-    SectionForce,
-    SelfContactForce,
-    SmoothMaximum,
-    Strain,
-    Stress,
-    TactilePad,
-    Tension,
-    WorkOfLoads,
-)
+from diffsim_ti.outputs import CenterOfMass, ChamberPressure, ContactForce, ContactSlip, ContactTraction, Dissipation
+from diffsim_ti.outputs import ElasticEnergy, EnclosedVolume, KineticEnergy, Length, MaterialPoints, PixelTracks
+from diffsim_ti.outputs import PlasticStrain, Reaction, SectionForce, SelfContactForce, SmoothMaximum, Strain, Stress
+from diffsim_ti.outputs import TactilePad, Tension, WorkOfLoads
 from diffsim_ti.outputs.load_path import CriticalPoint, LoadPath, load_path
 from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.rollout import Frames, Rollout
@@ -83,48 +36,14 @@ from diffsim_ti.rollout.adaptive_steps import adaptive_steps
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.runtime import init
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers import (
-    BDF2Solver,
-    ImplicitEulerSolver,
-    ImplicitMidpointSolver,
-    NotConverged,
-    SemiImplicitSolver,
-    StaticSolver,
-    VelocityVerletSolver,
-    stable_dt,
-)
+from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, ImplicitMidpointSolver, NotConverged, SemiImplicitSolver
+from diffsim_ti.solvers import StaticSolver, VelocityVerletSolver, stable_dt
 from diffsim_ti.state.schedule import UnequalSteps
 from diffsim_ti.state.solve_report import Buckled, SolveReport
-from diffsim_ti.terms import (
-    Anchor,
-    BodyForce,
-    Box,
-    Cable,
-    Capsule,
-    Cylinder,
-    Drag,
-    ElasticFoundation,
-    ExternalForce,
-    FilledChamber,
-    GasChamber,
-    Gravity,
-    Ground,
-    Growth,
-    HalfSpace,
-    MeshObstacle,
-    MultiPointConstraint,
-    Muscle,
-    Pose,
-    Pressure,
-    RemoteLoad,
-    RotatingFrame,
-    SelfContact,
-    Sphere,
-    Spring,
-    SurfaceDrag,
-    Tie,
-    Traction,
-)
+from diffsim_ti.terms import Anchor, BodyForce, Box, Cable, Capsule, Cylinder, Drag, ElasticFoundation, ExternalForce
+from diffsim_ti.terms import FilledChamber, GasChamber, Gravity, Ground, Growth, HalfSpace, MeshObstacle
+from diffsim_ti.terms import MultiPointConstraint, Muscle, Pose, Pressure, RemoteLoad, RotatingFrame, SelfContact
+from diffsim_ti.terms import Sphere, Spring, SurfaceDrag, Tie, Traction
 from diffsim_ti.torch_bridge.ensemble import Ensemble
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 

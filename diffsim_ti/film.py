@@ -18,7 +18,7 @@ from diffsim_ti.visual.drawing import Drawing, Look
 from diffsim_ti.visual.glyphs import arrow_length, ends, longest
 from diffsim_ti.visual.series import SavedSeries
 from diffsim_ti.writers import View, writer_for
-from diffsim_ti.writers.film import check_film, encoder
+from diffsim_ti.writers.drawn import check_film, encoder
 
 KINDS = (".mp4", ".gif", ".png")
 
@@ -41,7 +41,7 @@ def render_series(
     """Write every frame of a .pvd series into `output`, in the format of its suffix (writers/); the number written.
 
     A film (.mp4, .gif) has all frames, a picture (.png) the last one, "name_%04d.png" all, numbered.
-    colour: a name in visual/fields.py; fps: frames per second of the film (a GIF keeps time in steps of 10 ms); size:
+    colour: a name in visual/colouring.py; fps: frames per second of the film (a GIF keeps time in steps of 10 ms); size:
     pixels, even for .mp4; ground: height of a floor to draw [m], default the run's own, if it had one; azimuth, elevation
     of the eye [degrees]; backend: "auto", "vulkan" or "software"; say: called once with what draws; wireframe: draw edges.
     arrows: point data of the series that are vectors, such as forces, to draw as arrows.

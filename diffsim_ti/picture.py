@@ -15,8 +15,8 @@ from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.colouring import Colouring, to_vertices
 from diffsim_ti.visual.depth_image import DepthImage
 from diffsim_ti.visual.drawing import Drawing, Look
+from diffsim_ti.visual.frame import marks_of
 from diffsim_ti.visual.glyphs import arrow_length, ends, longest
-from diffsim_ti.visual.scene_marks import marks_of
 
 __all__ = ["Arrows", "Camera", "DepthImage", "Lines", "Points", "arrows", "draw", "marks_of", "save_picture"]
 

@@ -77,7 +77,7 @@ class _Scene:
 
     def __init__(self, window: "Window", mesh: TetrahedralMesh, ground: float | None, look: dict):
         from diffsim_ti.visual.drawing import Drawing
-        from diffsim_ti.visual.vulkan_painter import Canvas
+        from diffsim_ti.visual.painters import Canvas
 
         self.window, self.size = window, (1024, 768)
         self.drawing = Drawing(mesh, self.size, ground=ground, backend="software", **look)

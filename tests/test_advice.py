@@ -185,11 +185,11 @@ FOLLOWED = {
         lambda: ds.SelfContactForce(),
         lambda: (ds.SelfContactForce("xmin"), ds.SelfContactForce(per_vertex=True)),
     ),
-    ("outputs/work.py", "the scene has no load"): (
+    ("outputs/energies.py", "the scene has no load"): (
         lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 1, outputs=[ds.WorkOfLoads()]),
         lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 1, outputs=[ds.WorkOfLoads(weight=True)]),
     ),
-    ("rollout/frames.py", "pass others to Rollout"): (
+    ("outputs/output.py", "pass others to Rollout"): (
         lambda: ds.Rollout(verlet(), 0).forward()["kinetic"],
         lambda: ds.Rollout(verlet(), 0, outputs=[ds.KineticEnergy(name="kinetic")]).forward()["kinetic"],
     ),
@@ -267,7 +267,7 @@ FOLLOWED = {
             rollout_frames(ds.Rollout(verlet(), 1, gradients=names), density=TORCH_E) for names in (["density"], "all")
         ],
     ),
-    ("torch_bridge/batch_node.py", "requires a gradient"): (
+    ("torch_bridge/rollout_node.py", "requires a gradient"): (
         lambda: rollout_frames(ds.Batch(verlet(), 1, 2, gradients=["initial_positions"]), youngs_modulus=TORCH_E),
         lambda: rollout_frames(ds.Batch(verlet(), 1, 2, gradients="all"), youngs_modulus=TORCH_E),
     ),
@@ -340,8 +340,8 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("mesh/checks.py", "in no tetrahedron"): "test_mesh.py",
     ("mesh/enclosure.py", "must not be moved"): "test_chambers.py",
     ("outputs/contact_slip.py", "pass friction= to it"): "test_contact_force.py",
-    ("outputs/pixel_tracks.py", "take frames.computed"): "test_camera.py",
-    ("monitor/chatter.py", "vibrates at {} m/s"): "test_contact_friction.py",
+    ("outputs/points.py", "take frames.computed"): "test_camera.py",
+    ("monitor/guard.py", "vibrates at {} m/s"): "test_contact_friction.py",
     ("monitor/guard.py", "has gained {} J"): "test_energy_watch.py",
     ("monitor/guard.py", "reduce the substep to {} s"): "test_contact_crossing.py, battery_of_impacts.py",
     ("monitor/guard.py", "the barrier cannot stop it"): "test_contact_crossing.py, battery_of_impacts.py",
@@ -363,7 +363,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("rollout/sweep.py", "gradients through contacts"): "test_contact_gradients.py",
     ("rollout/sweep.py", "the adjoint grew"): "test_gradient_faults.py; a chaotic run has no better gradient",
     ("rollout/taped.py", "already ran in this tape"): "test_tape.py",
-    ("runtime/argument_buffer.py", "install taichi"): ANOTHER_MACHINE,
+    ("runtime/launch.py", "install taichi"): ANOTHER_MACHINE,
     ("runtime/device.py", "needs Taichi on CUDA"): ANOTHER_MACHINE,
     ("runtime/repeated_loops.py", "install taichi"): ANOTHER_MACHINE,
     ("runtime/start.py", "was forked"): ANOTHER_MACHINE,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti.monitor.energy_watch import EnergyGained
+from diffsim_ti.monitor.energy_balance import EnergyGained
 from diffsim_ti.monitor.stability import lanczos_limit
 from diffsim_ti.study.stability_axes import AXES
 from diffsim_ti.study.stability_map import given_by_muscles

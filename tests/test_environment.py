@@ -21,7 +21,7 @@ def jumper():
 
 def test_registering_starts_nothing():
     code = (
-        "import diffsim_ti.envs, gymnasium; from diffsim_ti.runtime.current_program import current_program; "
+        "import diffsim_ti.envs, gymnasium; from diffsim_ti.runtime.threads import current_program; "
         "assert current_program() is None; "
         "print(sorted(name for name in gymnasium.registry if name.startswith('diffsim_ti/')))"
     )

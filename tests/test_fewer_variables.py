@@ -9,7 +9,7 @@ import pytest
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.runtime import variables
+from diffsim_ti.runtime import tracer
 
 CALLEES = """
 def same(x):
@@ -102,7 +102,7 @@ def by_taichi(run, start) -> np.ndarray:
 @pytest.fixture
 def shared(monkeypatch):
     """Functions of any file are taken as those of the package."""
-    monkeypatch.setattr(variables, "may_share", lambda file: True)
+    monkeypatch.setattr(tracer, "may_share", lambda file: True)
 
 
 @pytest.mark.parametrize("seed", range(24))
@@ -129,7 +129,7 @@ def f(a, b, c, d, e):
         z = k
     e.part = y
 """
-    assert variables.changed_names(ast.parse(text).body[0]) == {"b", "c", "d", "e", "x"}
+    assert tracer.changed_names(ast.parse(text).body[0]) == {"b", "c", "d", "e", "x"}
 
 
 BY_REFERENCE = """

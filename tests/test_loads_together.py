@@ -138,7 +138,7 @@ def test_forces_balance():
     scene = scene_of()
     outputs = [ds.Reaction("bottom"), ds.ContactForce("wall", name="wall", per_vertex=True)]
     frames = rollout_of(ds.StaticSolver, scene, outputs=outputs).forward()
-    from diffsim_ti.outputs.applied_loads import AppliedLoads
+    from diffsim_ti.outputs.forces_at_frames import AppliedLoads
 
     free = np.delete(
         np.arange(BODY.num_vertices), scene.fixed

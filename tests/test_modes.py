@@ -200,7 +200,7 @@ def test_stiffness_is_the_slope_of_forces(volume):
     """At a bent state; that of patches reaches beyond their tetrahedra."""
     mesh = ds.TetrahedralMesh.create_box(3, size=0.2)
     scene = scene_of(mesh, volume=volume)
-    from diffsim_ti.outputs.body_forces import BodyForces
+    from diffsim_ti.outputs.forces_at_frames import BodyForces
 
     body, u = BodyForces(scene), bent(mesh)
     body.load(scene.inputs.values)

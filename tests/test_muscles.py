@@ -9,8 +9,8 @@ from test_gradients import random_mesh
 from test_term_order import SOLVERS
 
 import diffsim_ti as ds
-from diffsim_ti.solvers.explicit.item_forces import ItemForces
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
+from diffsim_ti.solvers.explicit.vertex_parts import ItemForces
 
 STEPS = 3
 

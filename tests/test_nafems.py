@@ -5,8 +5,7 @@ import pytest
 from quadratic_meshes import with_vertices
 
 import diffsim_ti as ds
-from diffsim_ti.outputs.deformation import PointMeans
-from diffsim_ti.outputs.recovery import PatchRecovery
+from diffsim_ti.outputs.deformation import PatchRecovery, PointMeans
 
 
 def graded_box(cells, size, *powers) -> ds.TetrahedralMesh:

@@ -14,12 +14,12 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti import obstacles
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.visual import rasteriser
+from diffsim_ti.visual import painters
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.colouring import Colouring
 from diffsim_ti.visual.drawing import Drawing
+from diffsim_ti.visual.painters import has_vulkan
 from diffsim_ti.visual.surface import Soup
-from diffsim_ti.visual.vulkan_painter import has_vulkan
 
 ROOT = Path(__file__).parents[1]
 SIZE = (200, 150)
@@ -170,10 +170,10 @@ def test_spans_cover_the_pixels_inside(size):
         sides = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in ((a, b), (b, c), (c, a))]
         inside[k] = np.all(np.array(sides) > 0, 0) | np.all(np.array(sides) < 0, 0)
     found = np.zeros_like(inside)
-    for k, row, first, end in zip(*rasteriser.spans(corners, size)):
+    for k, row, first, end in zip(*painters.spans(corners, size)):
         found[k, row, first:end] = True
     assert inside.any() and np.array_equal(found, inside)
-    assert np.array_equal(rasteriser.covered(corners, size), inside.any(0))
+    assert np.array_equal(painters.covered(corners, size), inside.any(0))
 
 
 def test_the_nearer_triangle_is_seen_and_colours_are_linear_in_space():
@@ -182,7 +182,7 @@ def test_the_nearer_triangle_is_seen_and_colours_are_linear_in_space():
     colours = np.zeros((2, 3, 3))
     colours[0, :, 0], colours[1, :, 2] = 1, [0.5, 0.5, 1.0]
     soup = Soup(corners, colours, corners[..., 2].mean(1))
-    image = rasteriser.SoftwarePainter((40, 40)).paint(soup, np.ones((40, 40, 3), np.float32))
+    image = painters.SoftwarePainter((40, 40)).paint(soup, np.ones((40, 40, 3), np.float32))
     assert (
         image[18, 5] == pytest.approx([1, 0, 0]) and image[22, 5, 0] == 0 and image[35, 35] == pytest.approx([1, 1, 1])
     )

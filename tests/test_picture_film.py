@@ -11,7 +11,7 @@ from saved_series import Series
 import diffsim_ti as ds
 from diffsim_ti import cli, film
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.visual import fields as series_fields
+from diffsim_ti.visual import colouring as series_fields
 
 SIZE = (160, 120)
 LEFT = slice(0, 110)  # columns without the legend

@@ -15,10 +15,9 @@ from diffsim_ti.cli import options as cli_options
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual import viewer
 from diffsim_ti.visual.camera import Camera
-from diffsim_ti.visual.dragging import Grip, picked_vertex
 from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
-from diffsim_ti.visual.viewer import Viewer
+from diffsim_ti.visual.viewer import Grip, Viewer, picked_vertex
 from diffsim_ti.writers import View, writer_for
 from diffsim_ti.writers.adaptive_run import ForwardRun
 
@@ -98,7 +97,7 @@ def make_viewer(monkeypatch):
         out.draw()
         return out, window
 
-    monkeypatch.setattr("diffsim_ti.visual.vulkan_painter.Canvas", lambda window: None)
+    monkeypatch.setattr("diffsim_ti.visual.painters.Canvas", lambda window: None)
     return make
 
 

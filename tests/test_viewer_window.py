@@ -15,7 +15,7 @@ import pytest
 from saved_series import Series
 
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.visual.vulkan_painter import has_vulkan
+from diffsim_ti.visual.painters import has_vulkan
 
 ROOT = Path(__file__).parents[1]
 missing = [name for name in ("Xvfb", "xdotool") if shutil.which(name) is None] + ([] if has_vulkan() else ["Vulkan"])

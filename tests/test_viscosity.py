@@ -7,8 +7,8 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti import verify
-from diffsim_ti.monitor.energy_watch import EnergyGained
-from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.monitor.energy_balance import EnergyGained
+from diffsim_ti.outputs.forces_at_frames import BodyForces
 
 EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
 IMPLICIT = (ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver)

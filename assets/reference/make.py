@@ -43,7 +43,7 @@ REFERENCE = {
     "Contact": ("terms.obstacles terms.self_contact terms.pose", "obstacles"),
     "Loads and supports": ("terms", "terms"),
     "Scenes and solvers": ("scene solvers state.schedule rollout.adaptive_steps", "solvers"),
-    "Runs": ("rollout batch torch_bridge.ensemble", ""),
+    "Runs": ("rollout batch torch_bridge.ensemble outputs.output", ""),
     "Results": ("outputs accuracy", "outputs"),
     "Gradients": ("verify common.differences", "verify"),
     "Identification": ("identification", ""),

@@ -5,8 +5,7 @@ import weakref
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.batch.layouts import in_slots
-from diffsim_ti.batch.side_by_side import growths_placed, placed
+from diffsim_ti.batch.layouts import growths_placed, in_slots, placed
 from diffsim_ti.inputs import Derived
 
 OF_STEPS = "forces", "motion", "path"
@@ -117,17 +116,14 @@ class BatchAdjoint:
         out.displacement, out.velocity = (vectors(x)[:, 0] for x in (self.u, self.v))
         if one.motion is not None:
             out.displacement[:, a.held] += vectors(self.anchor)
-        self._collect_further(out)
-        return out
-
-    def _collect_further(self, out: Derived) -> None:
-        a, found = self.ws.arrays, {name: self._vectors(x) for name, x in self.further.items()}
+        found = {name: vectors(x) for name, x in self.further.items()}
         for x in a.interactions:
             x.collect(found, out, self.features.shape)
         if self.features.growing:
             rows = self._of(self.growths).reshape(*out.growths.shape[:2], a.num_places, 2)[:, :, a.place]
             own = np.swapaxes(rows, 2, 3)
             out.growths = own.sum(3, keepdims=True) if out.growths.shape[3] == 1 else own
+        return out
 
     def _of_tetrahedra(self, array, *shape: int) -> np.ndarray:
         a = self.ws.arrays

@@ -5,11 +5,10 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.batch.batch_inputs import change_of, checked_values, spread_given
+from diffsim_ti.batch.batch_inputs import change_of, checked_values, gathered_scenes, spread_given
 from diffsim_ti.batch.frames import BatchFrames, LazyFrames
-from diffsim_ti.batch.joined_sweep import JoinedSweep
-from diffsim_ti.batch.set_values import gathered_scenes
-from diffsim_ti.batch.side_by_side import why_not
+from diffsim_ti.batch.joined_workspace import JoinedSweep
+from diffsim_ti.batch.layouts import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeAdapter
 from diffsim_ti.common.checked import as_numbers, instance, whole
@@ -21,11 +20,11 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh.face_points import bow, bows
-from diffsim_ti.outputs import Output
-from diffsim_ti.rollout.frames import Frames, check_finite, warn_of_large_stretch
+from diffsim_ti.outputs import Change, Output
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.rollout import Rollout
-from diffsim_ti.rollout.run import Run
-from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
+from diffsim_ti.rollout.run import Run, check_finite, warn_of_large_stretch
+from diffsim_ti.rollout.set_values import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FAR, FacesBend
 from diffsim_ti.state.schedule import UnequalSteps
@@ -61,8 +60,7 @@ class Batch(metaclass=Public):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> batch = ds.Batch(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10, scenes=2)
     >>> frames = batch.forward(gravity=[[0.0, -9.81, 0.0], [0.0, -1.62, 0.0]])  # on earth and on the moon
     >>> frames.displacements[:, -1, 0, 1].round(7).tolist()
@@ -176,9 +174,11 @@ class Batch(metaclass=Public):
             last_good[b] = max(0, int(np.argmin(good)) - 1) if not good.all() else last_good[b]
         for b in np.flatnonzero(last_good < self.num_frames - 1):
             u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
-        alone, errors = self._alone(values)
-        for b, own in alone.items():
-            u[b], v[b], last_good[b] = own.displacements, own.velocities, self._last_good(errors.get(b))
+        alone, errors = {}, {}
+        for b in self.sweep.left:  # which the solves of all together gave up
+            alone[b], error = self._one_by_one(values, b)
+            errors |= {b: error} if error else {}
+            u[b], v[b], last_good[b] = alone[b].displacements, alone[b].velocities, self._last_good(error)
         resolution = self.sweep.resolutions()
         states = self._positions(values, u), v, u
         make = lambda b: alone.get(b) or self._frames_of(values, b, states, times, resolution(b))  # noqa: E731
@@ -188,14 +188,6 @@ class Batch(metaclass=Public):
         out = BatchFrames(self, values, frames, last_good, run, errors, states)
         out.alone = tuple(alone)
         return out
-
-    def _alone(self, values: dict) -> tuple[dict[int, Frames], dict[int, Exception]]:
-        """Frames of the scenes that the solves of all together left out, and the errors that stopped some."""
-        frames, errors = {}, {}
-        for b in self.sweep.left:
-            frames[b], error = self._one_by_one(values, b)
-            errors |= {b: error} if error else {}
-        return frames, errors
 
     def _warn_of_bent_faces(self, positions: np.ndarray) -> None:
         """Where faces of some frame lie farther from the triangles of their nodes than contact there may be taken for
@@ -383,7 +375,7 @@ class Batch(metaclass=Public):
         by_one = not self.lanes or not self.solver.explicit
         for b in np.flatnonzero(frames.alive):
             changes = self.one.tangents(frames[b], **own[b]) if by_one else None
-            changes = changes or self.one.changes_of(frames[b], du[b], dv[b], own[b])
+            changes = changes or self.one.changes_of(frames[b], Change(du[b], dv[b], own[b]))
             for name, change in changes.items():
                 out[name][b] = change
         return out

@@ -6,12 +6,22 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.batch.free_vertices import FreeVertices
-from diffsim_ti.batch.tetrahedra import TetrahedronOfEight, element_of_eight
-from diffsim_ti.batch.views import AtVertices, Corners, Item, Scratch, Shared, Uniform, Vectors, View
+from diffsim_ti.batch.views import (
+    AtVertices,
+    Corners,
+    Item,
+    Scratch,
+    Shared,
+    TetrahedronOfEight,
+    Uniform,
+    Vectors,
+    View,
+    element_of_eight,
+)
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, at, let, traced
-from diffsim_ti.solvers.explicit.item_forces import ItemForces
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
+from diffsim_ti.solvers.explicit.vertex_parts import ItemForces
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.pass_table import pass_at
 

@@ -10,7 +10,7 @@ from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import as_numbers
 from diffsim_ti.common.names import no_such
 from diffsim_ti.common.public import Public
-from diffsim_ti.rollout.frames import Frames
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.watch import ContactResolution
 

@@ -11,25 +11,13 @@ import taichi as ti
 
 from diffsim_ti.mechanics.loads.explicit import AppliedForces
 from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced, variable
+from diffsim_ti.runtime.piecewise import Piece
 from diffsim_ti.solvers.explicit import kick_drift
 from diffsim_ti.state.features import Features
 
 A = ti.template()
-FREE, NEAR, SPECIAL = range(3)  # vertices: as above; if obstacles are far; never
+NEAR, SPECIAL = 1, 2  # vertices that are as above if obstacles are far; never
 MARGIN = 1.01  # of an obstacle's width, and of a move towards it, so that rounding decides nothing
-
-
-@traced
-class Numbers:
-    """Numbers of eight scenes: `array[k]` is number k of each, in lanes."""
-
-    _data_oriented = True
-
-    def __init__(self, array, first):
-        self._array, self._first = array, first
-
-    def __getitem__(self, k):
-        return at(self._array, self._first + k)
 
 
 @traced
@@ -204,7 +192,7 @@ class FreeVertices:
 
     @traced
     def hits_of(self, g, k, i, b, moved, now, scene, plan):
-        first, parameters = let(g.first + k * g.size), Numbers(scene.parameters, let(b * plan.num_parameters))
+        first, parameters = let(g.first + k * g.size), Piece(scene.parameters, let(b * plan.num_parameters))
         X = self.rest(i, b, scene, plan)
         move = [let(x - y) for x, y in zip(moved.u_next, moved.u)]
         if g.path >= 0:

@@ -11,8 +11,7 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.batch.tetrahedra import element_of_scenes
-from diffsim_ti.batch.views import Column, ItemOfScene, Shared, Uniform
+from diffsim_ti.batch.views import Column, ItemOfScene, Shared, Uniform, element_of_scenes
 from diffsim_ti.runtime import Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift

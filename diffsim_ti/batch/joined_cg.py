@@ -125,22 +125,6 @@ class JoinedCGKernels(CGKernels):
                 if cg.state[b, SQUARE] <= cg.state[b, LEAST]:
                     cg.state[b, STOPPED] = ti.cast(DONE, self.fp)
 
-    @ti.func
-    def multiply(self, c, begin, end, cg: A, at: A):
-        curvature, pp, qq = ti.cast(0, self.fp), ti.cast(0, self.fp), ti.cast(0, self.fp)
-        for i in range(begin, end):
-            p = cg.p[0, i]
-            q = p * cg.mass[i] + self.to(self.fp, at.y[0, i]) * ti.cast(-1, self.fp)
-            if ti.static(self.more):
-                for k in range(cg.start[i], cg.start[i + 1]):
-                    q += self.block(cg.blocks, k, cg.p[0, cg.column[k]])
-            q = self.allowed(i, cg, q)
-            cg.q[0, i] = q
-            curvature += self.dot(p, q)
-            pp += self.dot(p, p)
-            qq += self.dot(q, q)
-        cg.part[0, c], cg.part[1, c], cg.part[2, c] = curvature, pp, qq
-
     @cached_property
     def step(self) -> Kernel:
         arrays = super().step.arrays

@@ -1,11 +1,13 @@
 """The scenes of a batch as one body of so many pieces, for implicit steps: scene b has vertices b n .. (b + 1) n - 1.
 
 Numbers of vertices and tetrahedra stand one scene after the other, and so do those of terms and obstacles, of which
-kernels and host forms see those of one scene (batch/joined_kernels.py, batch/joined_hosts.py).
+kernels and host forms see those of one scene (joined_potential.py; `JoinedHost`).
 """
 
 import warnings
 from copy import copy
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import taichi as ti
@@ -13,6 +15,8 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.batch.layouts import in_slots
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.host_force import HostForce, HostForces
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.patches import in_eights, volume_patches
 from diffsim_ti.runtime import LANES
@@ -104,3 +108,76 @@ class JoinedArrays(SceneArrays):
         if path is not None:
             begin, own = schedule.begin(j), of_scenes(path, self.num_scenes, axis=1)[0]
             runtime.fill(self.offsets, self.poses.value(own, Moment(schedule, j, begin, begin)))
+
+
+class JoinedHost(HostForce):
+    """Forces of one kind on the bodies of all scenes, whose host forms are `parts`."""
+
+    def __init__(self, parts: list[HostForce]):
+        self.parts, self.count = parts, len(parts)
+        self.has_energy, self.reads_velocities = parts[0].has_energy, parts[0].reads_velocities
+
+    @property
+    def symmetric(self) -> bool:
+        return all(part.symmetric for part in self.parts)
+
+    def _each(self, *vectors) -> list[tuple]:
+        """(host form, its part of each of some vectors of all vertices) of each scene."""
+        return list(zip(self.parts, *(of_scenes(x, self.count) for x in vectors)))
+
+    def restrict(self, free, rest):
+        for part, *own in self._each(free, rest):
+            part.restrict(*own)
+
+    def take(self, values, instant):
+        """values: `each` of the scenes' own."""
+        origins = [None] * self.count if instant.origin is None else of_scenes(instant.origin, self.count)
+        for part, own, origin in zip(self.parts, values.each, origins):
+            part.take(own, replace(instant, origin=origin))
+        return self
+
+    def forces(self, u):
+        return np.concatenate([part.forces(x) for part, x in self._each(u)])
+
+    def sizes(self, u):
+        return np.concatenate([part.sizes(x) for part, x in self._each(u)])
+
+    def energies(self, u):
+        """(scenes, parts)"""
+        return np.stack([part.energies(x) for part, x in self._each(u)])
+
+    def work(self, u, step):
+        """(scenes,)"""
+        return np.array([part.work(*own) for part, *own in self._each(u, step)])
+
+    def product(self, u, w, convex=False):
+        return np.concatenate([part.product(*own, convex) for part, *own in self._each(u, w)])
+
+    def blocks(self, u):
+        return np.concatenate([part.blocks(x) for part, x in self._each(u)])
+
+    def matrix(self, u):
+        from scipy.sparse import block_diag
+
+        found = [part.matrix(x) for part, x in self._each(u)]
+        return None if found[0] is None else block_diag(found, format="csr")
+
+    def vjp(self, u, w, adj=None):
+        """adj: `each` of the scenes' own."""
+        each = [None] * self.count if adj is None else adj.each
+        found = [part.vjp(*own, a) for (part, *own), a in zip(self._each(u, w), each)]
+        return tuple(
+            np.concatenate([np.broadcast_to(x, own.shape) for x, own in zip(by, of_scenes(u, self.count))])
+            for by in zip(*found)
+        )
+
+
+def joined_hosts(scene, count: int) -> HostForces:
+    """Of `count` scenes like one."""
+    each = [host_forces(scene) for _ in range(count)]
+    return HostForces(JoinedHost(list(parts)) for parts in zip(*each))
+
+
+def of_each(each: list) -> SimpleNamespace:
+    """What the host forces of each scene take."""
+    return SimpleNamespace(each=each)

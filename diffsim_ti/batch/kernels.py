@@ -6,13 +6,12 @@ which nothing else acts in any of the eight (free_vertices.py); at the others th
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.batch.block_views import OF_STEPS, BlockViews, in_blocks, in_lanes
 from diffsim_ti.runtime import LANES, Bundle, Kernel, at, let, traced
-from diffsim_ti.state.features import Features
 from diffsim_ti.state.pass_table import reversed_pass
 
 A = ti.template()
@@ -197,9 +196,3 @@ class BatchKernels(BlockViews):
         few = self.law.short and self.features.order == 1 and not (self.features.groups or self.items.any)
         numbers = NUMBERS | numbers | self.items.counts | self.lengths
         return Kernel(f"batch_{name}", body, self.law.precision, arrays, numbers, polished=few)
-
-
-@lru_cache(maxsize=None)
-def batch_kernels(law, features: Features, own: frozenset) -> BatchKernels:
-    """Kernels for a law, a scene's features, and what each scene has of its own."""
-    return BatchKernels(law, features, own)

@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.batch.sweep import Own
-from diffsim_ti.rollout.field_seed import STATES
+from diffsim_ti.rollout.fields_on_device import STATES
 from diffsim_ti.rollout.set_values import split_name
 from diffsim_ti.rollout.taped import SPELLING, TapeAdapter
 

@@ -11,17 +11,56 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.batch.block_views import SHARED
 from diffsim_ti.batch.free_vertices import NEAR, SPECIAL
-from diffsim_ti.batch.history import BatchHistory
 from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
-from diffsim_ti.batch.kernels import BatchKernels, batch_kernels
-from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
-from diffsim_ti.batch.side_by_side import growths_placed, placed
-from diffsim_ti.batch.table import ScenesTable
+from diffsim_ti.batch.kernels import BatchKernels
+from diffsim_ti.batch.layouts import Innermost, Lanes, growths_placed, in_slots, placed
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
+from diffsim_ti.state.pass_table import FLOATS, INTS, PassTable
 from diffsim_ti.state.solve_report import SolveReport
+
+
+class BatchHistory:
+    """States of a batch in `num_slots` slots, forces and what vertices met with them if recorded, and the law's states."""
+
+    def __init__(self, workspace, num_slots: int, record: bool = False):
+        layout, n, self.num_slots = workspace.layout, workspace.arrays.num_vertices, num_slots
+        self.u, self.v = (layout.vectors(num_slots, n) for _ in range(2))
+        self.f = layout.vectors(num_slots, n) if record else runtime.array(layout.vector, 1, 1)
+        self.z = layout.numbers(num_slots, workspace.law_rows) if workspace.law_rows else None
+        calm = record and layout.in_lanes and workspace.some_special
+        self.calm = runtime.array(ti.i32, num_slots * n * layout.num_blocks if calm else 1)
+
+    def copy(self, slot: int, target: "BatchHistory", to: int) -> None:
+        for name in ("u", "v") if self.z is None else ("u", "v", "z"):
+            copy_slot(getattr(self, name), slot, getattr(target, name), to)
+
+
+class ScenesTable(PassTable):
+    """Tables of passes; where scenes have drag of their own, `floats` are numbers of scenes."""
+
+    def __init__(self, fp, own: bool, layout: Lanes | Innermost):
+        super().__init__(fp)
+        self.own, self._layout, self._numbers = own, layout, None
+        if own:
+            self.floats = layout.numbers(self.size * len(FLOATS))
+
+    def show_scenes(self, window: int, run: tuple, rates: tuple, make: Callable) -> None:
+        """As `show`, for the drag rates of all scenes [1/s]."""
+        if not self.own:
+            self.show(window, (*run, rates[0]), lambda first, last: make(first, last, rates[0]))
+        elif self._numbers != (window, run, rates):
+            self._numbers = window, run, rates
+            tables = [make(window, min(window + self.size, run[0]), rate) for rate in rates]
+            ints = np.zeros(self.size * len(INTS))
+            ints[: tables[0][0].size] = tables[0][0].ravel()
+            floats = np.zeros((len(rates), self.size * len(FLOATS)))
+            for row, (_, numbers) in zip(floats, tables):
+                row[: numbers.size] = numbers.ravel()
+            runtime.fill(self.ints, ints)
+            runtime.fill(self.floats, self._layout.pack(floats))
 
 
 class BatchWorkspace:
@@ -167,7 +206,7 @@ class BatchWorkspace:
         a, features = self.arrays, self.arrays.features()
         out = np.zeros(a.num_vertices, np.int32)
         if features.groups:
-            free = batch_kernels(a.law, features, frozenset()).free
+            free = runtime.kernels_of(BatchKernels, a.law, features, frozenset()).free
             out[self.derived[0].surface > 0] = NEAR if free.lane_groups else SPECIAL
         if features.motion:
             out[a.held] = SPECIAL
@@ -185,7 +224,7 @@ class BatchWorkspace:
     def kernels(self, features) -> BatchKernels | InnermostKernels:
         law = self.arrays.law
         if self.layout.in_lanes:
-            return batch_kernels(law, features, self.own)
+            return runtime.kernels_of(BatchKernels, law, features, self.own)
         return innermost_kernels(law, features, self.own, self.in_parallel > 1)
 
     @property

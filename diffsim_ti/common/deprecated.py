@@ -17,27 +17,12 @@ from diffsim_ti.common import answers
 from diffsim_ti.common.warn import warn as warn_user
 
 # modules at the top of version 0.2.0 -> where they are
-MODULES = {
-    "diffsim_ti.adaptive_run": "diffsim_ti.writers.adaptive_run",
-    "diffsim_ti.adaptive_steps": "diffsim_ti.rollout.adaptive_steps",
-    "diffsim_ti.checked": "diffsim_ti.common.checked",
-    "diffsim_ti.copies": "diffsim_ti.common.copies",
-    "diffsim_ti.differences": "diffsim_ti.common.differences",
-    "diffsim_ti.ensemble": "diffsim_ti.torch_bridge.ensemble",
-    "diffsim_ti.interrupts": "diffsim_ti.common.interrupts",
-    "diffsim_ti.locking": "diffsim_ti.scene.locking",
-    "diffsim_ti.mass_scaling": "diffsim_ti.terms.mass_scaling",
-    "diffsim_ti.modes": "diffsim_ti.outputs.modes",
-    "diffsim_ti.progress": "diffsim_ti.common.progress",
-    "diffsim_ti.ranks": "diffsim_ti.common.ranks",
-    "diffsim_ti.reduced": "diffsim_ti.terms.reduced",
-    "diffsim_ti.rotations": "diffsim_ti.common.rotations",
-    "diffsim_ti.rows": "diffsim_ti.common.rows",
-    "diffsim_ti.simulator": "diffsim_ti.rollout.simulator",
-    "diffsim_ti.slots": "diffsim_ti.runtime.slots",
-    "diffsim_ti.strength": "diffsim_ti.scene.strength",
-    "diffsim_ti.supports": "diffsim_ti.terms.supports",
-}
+_MOVED = """
+writers.adaptive_run rollout.adaptive_steps common.checked common.copies common.differences torch_bridge.ensemble
+common.interrupts scene.locking terms.mass_scaling outputs.modes common.progress common.ranks terms.reduced
+common.rotations common.rows rollout.simulator runtime.slots scene.strength terms.supports
+"""
+MODULES = {f"diffsim_ti.{place.rpartition('.')[2]}": f"diffsim_ti.{place}" for place in _MOVED.split()}
 # names of the package -> their new names there
 NAMES = {"TieLength": "Length", "TieTension": "Tension"}
 

@@ -4,62 +4,19 @@ from collections.abc import Iterable
 
 from diffsim_ti.common.answers import answer
 
-# words of other programs and of other ears, and what they may be called here
-ELSEWHERE = {
-    "arch": ("backend",),
-    "axis": ("normal", "direction"),
-    "body": ("mesh",),
-    "boundary_conditions": ("fixed",),
-    "bulk": ("bulk_modulus",),
-    "cells": ("tetrahedra",),
-    "centre": ("center",),
-    "color": ("colour",),
-    "colors": ("colours",),
-    "delta_t": ("dt",),
-    "device": ("backend",),
-    "dhat": ("width",),
-    "dirichlet": ("fixed",),
-    "dtype": ("precision",),
-    "elements": ("tetrahedra",),
-    "faces": ("triangles",),
-    "file": ("path",),
-    "filename": ("path",),
-    "fixed_vertices": ("fixed",),
-    "forces": ("terms",),
-    "g": ("gravity",),
-    "k": ("stiffness",),
-    "kappa": ("stiffness", "bulk_modulus"),
-    "lambda_": ("lam",),
-    "lame_lambda": ("lam",),
-    "lame_mu": ("mu",),
-    "law": ("material",),
-    "loads": ("terms",),
-    "margin": ("width",),
-    "max_iter": ("max_iterations",),
-    "maxiter": ("max_iterations",),
-    "mu": ("friction",),
-    "n_steps": ("steps",),
-    "nodes": ("vertices",),
-    "num_steps": ("steps",),
-    "pinned": ("fixed",),
-    "poisson": ("poissons_ratio",),
-    "r": ("radius",),
-    "rho": ("density",),
-    "shear_modulus": ("mu",),
-    "step_size": ("dt",),
-    "tets": ("tetrahedra",),
-    "thickness": ("width",),
-    "time_step": ("dt",),
-    "timestep": ("dt",),
-    "tol": ("tolerance",),
-    "trajectory": ("path",),
-    "v0": ("initial_velocities",),
-    "verts": ("vertices",),
-    "viscosity": ("shear_viscosity",),
-    "x0": ("initial_positions",),
-    "y": ("height",),
-    "young": ("youngs_modulus",),
-}
+# words of other programs and of other ears, each with what it may be called here
+_ELSEWHERE = """
+arch: backend; axis: normal direction; body: mesh; boundary_conditions: fixed; bulk: bulk_modulus; cells: tetrahedra;
+centre: center; color: colour; colors: colours; delta_t: dt; device: backend; dhat: width; dirichlet: fixed;
+dtype: precision; elements: tetrahedra; faces: triangles; file: path; filename: path; fixed_vertices: fixed;
+forces: terms; g: gravity; k: stiffness; kappa: stiffness bulk_modulus; lambda_: lam; lame_lambda: lam; lame_mu: mu;
+law: material; loads: terms; margin: width; max_iter: max_iterations; maxiter: max_iterations; mu: friction;
+n_steps: steps; nodes: vertices; num_steps: steps; pinned: fixed; poisson: poissons_ratio; r: radius; rho: density;
+shear_modulus: mu; step_size: dt; tets: tetrahedra; thickness: width; time_step: dt; timestep: dt; tol: tolerance;
+trajectory: path; v0: initial_velocities; verts: vertices; viscosity: shear_viscosity; x0: initial_positions;
+y: height; young: youngs_modulus
+"""
+ELSEWHERE = {word.strip(): names.split() for word, names in (x.split(":") for x in _ELSEWHERE.split(";"))}
 
 
 def edits(a: str, b: str) -> int:

@@ -165,8 +165,8 @@ class Workspace:
         self._launches.clear()
 
     def balance(self):
-        """What follows the drift of the energy from now on, by `begin` and `take` (monitor/own_work.py); None where that
-        cannot be told from what is done to the body."""
+        """What follows the drift of the energy from now on, by `begin` and `take` (monitor/energy_balance.py); None where
+        that cannot be told from what is done to the body."""
 
     def record_law_states(self) -> None:
         """From now on note what the law remembers in each frame; the frames are made."""

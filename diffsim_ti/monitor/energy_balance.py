@@ -1,4 +1,5 @@
-"""Energy that explicit steps add, against what is done on the body from outside."""
+"""Energy that steps add: of explicit ones against what is done on the body from outside, of others where they are too
+long."""
 
 import weakref
 from dataclasses import dataclass
@@ -7,10 +8,13 @@ from operator import is_
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.common.copies import CarriesMore
+from diffsim_ti.inputs import kinetic_energy
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities
 from diffsim_ti.state.history import History
+from diffsim_ti.terms import Growth
 
 
 @dataclass
@@ -189,3 +193,130 @@ class EnergyBalance:
             inverse = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)
             swapped = -0.125 * h * h * float((inverse * a.supports.free(forces) ** 2).sum())
         return kinetic + stored + swapped - float((weight * (values.rest + u)).sum())
+
+
+class EnergyGained(CarriesMore, UserWarning):
+    """Steps have added energy to the motion. Carries `gained` [J], `share` of the energy that moves, `step`, `time` [s] and
+    the `substep` [s] that is advised."""
+
+    def __init__(self, message: str, gained: float, share: float, step: int, time: float, substep: float):
+        super().__init__(message)
+        self.gained, self.share, self.step, self.time, self.substep = gained, share, step, time, substep
+
+
+class EnergyWatch:
+    """Sums what implicit midpoint and BDF2 steps add to the energy, against the largest energy that moved so far.
+
+    Between u and u' = 2 u* - u the forces f(u*) = -dE/du do the work f(u*) . (u' - u), and kinetic energy changes by just
+    that; the energy of strains and contacts changes by E(u') - E(u). The step has added
+
+        E(u') - E(u) + f(u*) . (u' - u)
+
+    which is of third order in u' - u, and none for a quadratic E. Loads, drag and prescribed motion do not enter it. Where
+    obstacles go from w by w* to w', E(u) and E(u') are taken with them at w and w', and what they do on the body in the
+    middle, dE/dw (w' - w), is none of the step's.
+    BDF2 does not keep kinetic energy either, so that of free vertices is added, less the work m (v* - y) / gamma . (u' - u)
+    of what accelerates them (solvers/implicit/solver.py). It gives back within a bounce a part of what it has just taken,
+    and loses on the whole: only a net gain counts.
+    Simo, Tarnow 1992, The discrete energy-momentum method, doi:10.1007/BF00913408.
+    """
+
+    def __init__(self, workspace: Workspace):
+        self.ws = weakref.proxy(workspace)  # which holds this: no circle
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what was seen."""
+        self.gained, self.moving = 0.0, 0.0  # [J]
+        self.begin()
+
+    def begin(self) -> None:
+        """Follow the drift from the present state on."""
+        self._begun = self.gained
+
+    def take(self) -> float:
+        """What steps have added [J] since the last call, or `begin`; below zero where they took some."""
+        added = self.gained - self._begun
+        self.begin()
+        return added
+
+    def note(self, u, u_star, u_next, v_next, places: tuple, kinetic: float = 0.0) -> None:
+        """A step went from u by u_star to u_next, obstacles from places[0] by places[1] to places[2] (displacements [m],
+        shape (num_obstacles, 3)); contacts are as in its pass. kinetic: what it has added to that energy [J]."""
+        potential, energies = self.ws.potential, []
+        drift = self.ws.arrays.poses.drift(places[0], places[2])
+        # what viscosity and friction take is no gain, and none of a step's making
+        with potential.without_viscosity(), potential.without_friction():
+            for displacement, place in ((u, places[0]), (u_next, places[2])):
+                self.ws.collisions.put(place)
+                potential.place(displacement)
+                energies.append(potential.energy()[0])
+            self.ws.collisions.put(places[1])
+            potential.place(u_star)
+            work = float((potential.forces()[0] * (u_next - u)).sum())
+            work -= self._work_of_obstacles(u_star, places[1], drift)
+        self.gained += energies[1] - energies[0] + work + kinetic
+        self.moving = max(self.moving, kinetic_energy(self.ws.mass, v_next) + energies[1])
+
+    def _work_of_obstacles(self, u_star: np.ndarray, places: np.ndarray, drift: np.ndarray) -> float:
+        """dE/dw (w' - w) [J], by differences over a hundredth of the smallest gap."""
+        if not drift.any():
+            return 0.0
+        detection = self.ws.collisions.detection
+        near = detection.nearest(u_star, places, detection.widest)
+        gap = detection.narrowest if near is None else min(near.value, detection.narrowest)
+        share, energies = min(0.5, 0.01 * gap / np.abs(drift).max()), []
+        for sign in (1, -1):
+            self.ws.collisions.put(self.ws.arrays.poses.moved(places, drift, sign * share))
+            self.ws.potential.place(u_star)
+            energies.append(self.ws.potential.energy()[0])
+        self.ws.collisions.put(places)
+        return (energies[0] - energies[1]) / (2 * share)
+
+    @property
+    def share(self) -> float:
+        """Energy gained, over the largest that moved: kinetic, of strains and of contacts."""
+        return self.gained / self.moving if self.moving > 0 else 0.0
+
+
+class OwnWork:
+    """Follows what explicit steps add to the energy of a run by themselves, apart from all that is done to it: the
+    drift of a scheme [J].
+
+    Kinetic energy T changes by the work W of the body's own forces, strains, weight and springs, and by that of all else:
+    loads, supports, friction, drag, contact stages. The own forces have an energy V, and dV + W, which vanishes as steps
+    become short, is the scheme's own. What is left of a change of the whole energy was done from outside, or taken.
+    """
+
+    def __init__(self, workspace: Workspace):
+        self.ws = weakref.proxy(workspace)  # which holds this: no circle
+        self.begin()
+
+    @staticmethod
+    def serves(workspace: Workspace) -> bool:
+        """Whether the forces of a scene are those of an energy that does not change with time, at each vertex by itself."""
+        scene, law = workspace.scene, workspace.arrays.law
+        energetic = law.reads == ("H",) and not law.state_names and not scene.term(Growth)
+        return energetic and not (scene.reduced or workspace.arrays.features().pressing or workspace.has_unnoted_work)
+
+    def begin(self) -> None:
+        """From the present state on."""
+        runtime.fill(self.ws.contact.own_work, 0)
+        self._energy = self._own_energy()
+
+    def take(self) -> float:
+        """The drift [J] since the last call, or `begin`."""
+        before, work = self._energy, float(runtime.fetch(self.ws.contact.own_work).astype(np.float64).sum())
+        self.begin()
+        return self._energy - before + work
+
+    def _own_energy(self) -> float:
+        """V [J]; the weight of fixed vertices is carried by what holds them."""
+        ws, a = self.ws, self.ws.arrays
+        out = quantities.elastic_energy(ws) + sum(quantities.stored_energies(ws).values())
+        at = a.features().gravity
+        if at >= 0:
+            mass = a.values.mass * (runtime.fetch(a.inverse_mass) > 0)
+            u = runtime.fetch_row(ws.state.u, 0).astype(np.float64)
+            out -= float((mass[:, None] * a.values.parameters[at:][:3] * (a.values.rest + u)).sum())
+        return out

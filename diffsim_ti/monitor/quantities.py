@@ -1,7 +1,7 @@
 """What can be read off a state: energies, stress, volume ratio."""
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +15,7 @@ from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.mechanics.workspace import Workspace
-from diffsim_ti.runtime import Kernel, assign, traced
+from diffsim_ti.runtime import Kernel, assign, kernels_of, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, needed, with_state
@@ -89,12 +89,6 @@ class ObserverKernels:
         return self._kernel("fields", self.observe, "energy", "von_mises", "J", **more)
 
 
-@lru_cache(maxsize=None)
-def observer_kernels(law, features: Features) -> ObserverKernels:
-    """Kernels for a law and a scene's features."""
-    return ObserverKernels(law, features)
-
-
 class Energy(float):
     """A total energy [J] that knows its parts: kinetic, elastic, gravity (zero at y = 0 for g along y), contact, springs,
     foundations (cables are loads, and have none); of plastic laws also what they have dissipated."""
@@ -129,7 +123,7 @@ def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
         room = a.points * a.num_places
         out = SimpleNamespace(**{name: runtime.array(a.fp, room) for name in ("energy", "von_mises", "J")})
         out.stress = runtime.array(a.vector, 3, room) if a.points > 1 else None
-        return out, observer_kernels(a.law, a.features()).fields.bind(scene=a, at=workspace.state, out=out)
+        return out, kernels_of(ObserverKernels, a.law, a.features()).fields.bind(scene=a, at=workspace.state, out=out)
 
     out, launch = workspace.kept("fields", bind)
     launch(num_places=a.num_places)
@@ -151,7 +145,7 @@ def elastic_energy(workspace: Workspace) -> float:
 
     def bind():
         out = SimpleNamespace(energy=runtime.array(a.fp, a.points * a.num_places))
-        return out, observer_kernels(a.law, a.features()).stored.bind(scene=a, at=workspace.state, out=out)
+        return out, kernels_of(ObserverKernels, a.law, a.features()).stored.bind(scene=a, at=workspace.state, out=out)
 
     out, launch = workspace.kept("stored", bind)
     launch(num_places=a.num_places)

@@ -10,10 +10,10 @@ from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.mesh.patches import volume_patches
-from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.scene import Scene
 from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.viscous_stages import ViscousStages
+from diffsim_ti.terms import Term
 from diffsim_ti.terms.mass_scaling import row_sums
 from diffsim_ti.terms.reduced import KINDS
 
@@ -54,7 +54,7 @@ def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages
     mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the
     assembled system never exceed the largest of its elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses
     are at least those of the element. With mass scaling another bound counts where it is lower (mass_scaling.py). Gases and
-    cables count with the largest they have over time (stiffest.py).
+    cables count with the largest they have over time (`stiffest`).
     """
     values, material = stiffest(scene, scene.inputs.values if values is None else values), scene.material
     mu, lam = material.lame({name: values[name] for name in material.inputs})
@@ -352,3 +352,27 @@ def lanczos_limit(workspace: Workspace, tolerance: float = 1e-3) -> StepLimit:
     if value <= 0:
         return StepLimit(np.inf, 0, "Lanczos")
     return StepLimit(float(2 / np.sqrt(value + residual)), stiffness.worst_tetrahedron(), "Lanczos")
+
+
+def over_time(scene: Scene) -> list[Term]:
+    """Terms whose stiffness may change over time."""
+    return [term for term in scene.terms if term.stiffest is not None]
+
+
+def stiffest(scene: Scene, values: dict) -> dict[str, np.ndarray]:
+    """Values in which gases have their largest pressure, cables their largest tension and least length, of all steps that
+    are given, of all keyframes, or of the times at which `values` sample a function; of one that they do not, at time 0."""
+    out = dict(values)
+    for term in over_time(scene):
+        name = scene.input_names(term)[term.plain]
+        rows = [np.ravel(values[name])] if name in values else []
+        if term.keyed:
+            rows.append(np.ravel(term.rows([0.0] if callable(term.given) else term.given[0])))
+        extreme = term.stiffest(np.concatenate(rows))
+        out[name] = np.array([extreme]) if term.keyed else np.array(extreme)
+    return out
+
+
+def sampled_by_runs(scene: Scene) -> bool:
+    """Whether some of them is a function of time, which a run alone samples."""
+    return any(term.keyed and callable(term.given) for term in over_time(scene))

@@ -68,8 +68,7 @@ def _film(scene: Scene, moments: Iterable, suffix: str) -> str:
 def _still(scene: Scene, positions: np.ndarray, at: float = 0.0, step: int = 0, values: dict | None = None) -> str:
     """A picture of a scene with the body at positions [m], coloured by displacement."""
     from diffsim_ti.obstacles import obstacle_surfaces
-    from diffsim_ti.visual.frame import Frame
-    from diffsim_ti.visual.scene_marks import marks_of
+    from diffsim_ti.visual.frame import Frame, marks_of
 
     u = positions - scene.inputs.values["rest_positions"]
     around = [points for points, _ in obstacle_surfaces(scene, at)] if scene.moving else None

@@ -1,18 +1,15 @@
 """Forces and moments of obstacles on the body."""
 
 from copy import copy
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Term
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
 
 PARTS = ("total", "normal", "friction")
 
@@ -67,7 +64,7 @@ class ContactForce(Output):
     def __repr__(self) -> str:
         return f"ContactForce({self.obstacle!r}, {self.part!r}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "ContactForce":
+    def settled(self, scene: Scene) -> "ContactForce":
         out = copy(self)
         out.place, out.num_vertices = scene.place_of(self.obstacle), scene.mesh.num_vertices
         n = out.num_vertices
@@ -82,13 +79,13 @@ class ContactForce(Output):
         """On each vertex that counts."""
         return forces[:, self.place, self.sides].sum(1)[:, self.vertices]
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         f = self._of(frames.contact_forces)
         if self.about is not None:
             return moments(frames.positions[:, self.vertices], self.about, f)
         return f if self.per_vertex else f.sum(1)
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         x, dx = frames.positions[:, self.vertices], change.positions
         df = np.zeros(x.shape) if change.contact_forces is None else self._of(change.contact_forces)
         if self.about is not None:
@@ -96,7 +93,7 @@ class ContactForce(Output):
             return moments_jvp(x, self.about, self._of(frames.contact_forces), dx, df)
         return df if self.per_vertex else df.sum(1)
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         by_forces, positions = np.zeros(frames.contact_forces.shape), None
         by_vertex = np.zeros(frames.positions.shape)
         by_vertex[:, self.vertices] = seed if self.per_vertex else seed[:, None]

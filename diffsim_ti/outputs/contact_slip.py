@@ -1,18 +1,15 @@
 """How a body slides along an obstacle: its velocity there, and how much of the friction that Coulomb allows it takes."""
 
 from copy import copy
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.outputs.contact_force import ContactForce
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Obstacle
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
 
 
 class ContactSlip(Output):
@@ -46,7 +43,7 @@ class ContactSlip(Output):
     def __repr__(self) -> str:
         return f"ContactSlip({self._force.obstacle!r}, {self.what!r}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "ContactSlip":
+    def settled(self, scene: Scene) -> "ContactSlip":
         out, force = copy(self), self._force.settled(scene)
         out.place, out.num_vertices, term = force.place, force.num_vertices, scene.obstacles[force.place]
         names = scene.input_names(term)
@@ -66,13 +63,13 @@ class ContactSlip(Output):
 
     # ---- the obstacle's velocity: u + w x (x - c), of its path's rows ----------------------------------------------------
 
-    def _at(self, frames: "Frames") -> tuple[np.ndarray, np.ndarray]:
+    def _at(self, frames: Frames) -> tuple[np.ndarray, np.ndarray]:
         """(row of the path at each frame, 1 at least; mean length of the steps since the frame before [s], as a column); a
         simulator's has rows of one step alone. At the start, where no contact is known, the length is 1."""
         dt = np.diff(frames.times, prepend=0.0) / np.maximum(np.diff(frames.steps, prepend=0), 1)
         return np.clip(frames.steps, 1, len(frames.inputs[self.path]) - 1), np.where(dt > 0, dt, 1.0)[:, None]
 
-    def _of_rows(self, frames: "Frames", columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _of_rows(self, frames: Frames, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of each frame (u, w, where the point that it turns about has gone), or their changes."""
         k, dt = self._at(frames)
         turned = columns[k - 1, 2] / dt if columns.shape[1] > 1 else np.zeros((len(k), 3))
@@ -81,7 +78,7 @@ class ContactSlip(Output):
     def _link(self) -> PoseColumns:
         return PoseColumns([self.path], "path")
 
-    def _sliding(self, frames: "Frames") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _sliding(self, frames: Frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(v - v_o, lever x - c, w) of each vertex in each frame."""
         x, v = frames.positions.astype(np.float64), frames.velocities.astype(np.float64)
         if self.path is None:
@@ -92,7 +89,7 @@ class ContactSlip(Output):
 
     # ---- value, tangent, adjoint -----------------------------------------------------------------------------------------
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         normal, friction = self._forces(frames.contact_forces)
         p = np.linalg.norm(normal, axis=-1, keepdims=True)
         if self.what == "share":
@@ -100,7 +97,7 @@ class ContactSlip(Output):
         n, s = _per(normal, p), self._sliding(frames)[0]
         return np.where(p > 0, s - _along(n, s), 0.0)
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         normal, friction = self._forces(frames.contact_forces)
         dnormal, dfriction = self._forces(change.contact_forces)
         p = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -126,7 +123,7 @@ class ContactSlip(Output):
             p > 0, ds - _along(n, ds) - dn * (n * s).sum(-1, keepdims=True) - n * (dn * s).sum(-1, keepdims=True), 0
         )
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         normal, friction = self._forces(frames.contact_forces)
         p, by_forces = np.linalg.norm(normal, axis=-1, keepdims=True), np.zeros(frames.contact_forces.shape)
         n = _per(normal, p)

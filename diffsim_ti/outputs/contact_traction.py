@@ -1,18 +1,15 @@
 """Traction of obstacles on the surface: contact force per area, vertex by vertex."""
 
 from copy import copy
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
 from diffsim_ti.outputs.contact_force import ContactForce
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Term
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
 
 # what each node of a face takes of its nodes' values, in stages: of three nodes the mean; of six the middles take over what
 # corners have, and corners then the mean of the middles beside them
@@ -55,7 +52,7 @@ class ContactTraction(Output):
     def __repr__(self) -> str:
         return f"ContactTraction({self._given.obstacle!r}, {self._given.part!r}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "ContactTraction":
+    def settled(self, scene: Scene) -> "ContactTraction":
         out, mesh = copy(self), scene.mesh
         out.scene, out.force = scene, self._given.settled(scene)
         out.push = ContactForce(self._given.obstacle, "normal", per_vertex=True).settled(scene)
@@ -97,12 +94,12 @@ class ContactTraction(Output):
             out.append(_per(self._sum(B[:, None, None] / 3 * (K @ out[-1][self.faces]), len(f)), D))
         return out
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         X, f, push = frames.inputs["rest_positions"], self.force.value(frames), self.push.value(frames)
         x = frames.positions.astype(np.float64)
         return np.stack([self._spread(self._slopes(X, *at)[0], f[k])[-1] for k, at in enumerate(zip(x, push))])
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         X, f, push = frames.inputs["rest_positions"], self.force.value(frames), self.push.value(frames)
         df, dpush, out = self.force.jvp(frames, change), self.push.jvp(frames, change), np.zeros(f.shape)
         dX, x = change.inputs.get("rest_positions", np.zeros_like(X)), frames.positions.astype(np.float64)
@@ -120,7 +117,7 @@ class ContactTraction(Output):
             out[k] = dt
         return out
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         X, f, push = frames.inputs["rest_positions"], self.force.value(frames), self.push.value(frames)
         (by_f, by_push, by_x), by_X = np.zeros((3, *f.shape)), np.zeros_like(X)
         x, per_face = frames.positions.astype(np.float64), len(self.triangles) // max(len(self.faces), 1)

@@ -12,8 +12,7 @@ from diffsim_ti.common.public import Public, public
 from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.energy.potential import Potential
-from diffsim_ti.outputs.applied_loads import AppliedLoads, at_end
-from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.outputs.forces_at_frames import AppliedLoads, BodyForces, at_end
 from diffsim_ti.outputs.modes import FOURTH_ORDER, free_directions
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import StaticSolver

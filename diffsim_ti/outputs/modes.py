@@ -12,7 +12,7 @@ from diffsim_ti.inputs import StressPoints
 from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
-from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.outputs.forces_at_frames import BodyForces
 from diffsim_ti.scene import Scene
 
 SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to which all of them are computed
@@ -153,8 +153,7 @@ def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> frequencies = ds.modes(scene, 7).frequencies  # six rigid motions, and the first that strains
     >>> print(abs(frequencies[:6]).max() < 1e-3, f"{frequencies[6]:.3f} Hz")
     True 2.282 Hz

@@ -1,4 +1,5 @@
-"""An output, which losses use like positions: a function of a run's frames and inputs, with its derivatives beside it."""
+"""An output, which losses use like positions: a function of a run's frames and inputs, with its derivatives beside it;
+and the states themselves as outputs, which every rollout has."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
@@ -6,12 +7,81 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import Public
+from diffsim_ti.scene import Scene
+from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import Growth
 
 if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+    from diffsim_ti.rollout.run import Run
+
+
+@dataclass(eq=False, repr=False)
+class Frames(metaclass=Public):
+    """Saved states of one run: positions [m] (far from the origin in float64), velocities [m/s], displacements from the rest
+    shape [m] (which keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
+
+    `outputs` has what the Rollout was asked to compute besides, by name; `frames["name"]` gives any of them.
+
+    `contact_resolution` says how near the body came to obstacles and how finely the steps resolve that (state/watch.py).
+
+    `contact_forces` [N], where an output reads them: what each obstacle did to each vertex, on average since the frame
+    before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
+    `scene.obstacles`. The first frame has none. In implicit runs of surfaces with friction a row more has that of each
+    other's friction, in the substep that ends in the frame.
+
+    `computed` are these outputs themselves, as settled for the scene; `sets`: those of inputs that were given by named sets.
+
+    `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is constrained, shape (frames,
+    chambers), of the substep that ends in the frame; others, and the first frame, have none (0).
+
+    `law_state`, where an output reads it: what the law remembers of each tetrahedron, shape (frames, num_tetrahedra, S), or
+    (frames, num_tetrahedra, 4, S) at the points of ten-node tetrahedra, in the order of the law's `state_names`.
+
+    `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
+    the last good one.
+
+    `scene`: of which they are.
+
+    `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    displacements: np.ndarray
+    times: np.ndarray
+    inputs: dict = field(repr=False)
+    contact_resolution: ContactResolution | None = field(default=None, repr=False)
+    outputs: dict[str, np.ndarray] = field(default_factory=dict)
+    contact_forces: np.ndarray | None = field(default=None, repr=False)
+    computed: dict = field(default_factory=dict, repr=False)
+    chamber_pressures: np.ndarray | None = field(default=None, repr=False)
+    sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
+    law_state: np.ndarray | None = field(default=None, repr=False)
+    steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
+    run: "Run | None" = field(default=None, repr=False)
+    error: FloatingPointError | None = None
+    scene: Scene | None = field(default=None, repr=False)
+
+    __repr__ = brief_fields
+
+    @property
+    def alive(self) -> bool:
+        """Whether the run came to its end."""
+        return self.error is None
+
+    def __getstate__(self) -> dict:
+        """Without the run, which lives on the device, and the scene: a copy by pickle has no gradient and no picture."""
+        return vars(self) | dict(run=None, scene=None)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name in ("positions", "velocities", "displacements"):
+            return getattr(self, name)
+        if name not in self.outputs:
+            known = ", ".join(("positions", "velocities", "displacements", *self.outputs))
+            raise KeyError(f"no output named {name!r}; there are {known}: pass others to Rollout(..., outputs=[...])")
+        return self.outputs[name]
 
 
 NOTED = ("contact_forces", "chamber_pressures", "law_state")  # what runs note besides states, where outputs read it
@@ -54,7 +124,7 @@ class Output(metaclass=Public):
 
     Write one outside the package by giving it `name`, `shape`, `value`, `jvp` and `vjp`, in NumPy and float64; it is then
     in `frames[name]` and `Rollout.tangents`, takes a seed in `Rollout.vjp(frames, name=...)`, and has a field under
-    `ti.ad.Tape` and a tensor in torch. `frames` (rollout/frames.py) holds the states and, in `frames.inputs`, the values of
+    `ti.ad.Tape` and a tensor in torch. `frames` (`Frames`) holds the states and, in `frames.inputs`, the values of
     all inputs. Rollout.tangents and Rollout.vjp must agree in <w, J d> = <J^T w, d>: check a new output by that and by
     differences.
     Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.
@@ -73,14 +143,14 @@ class Output(metaclass=Public):
         return self.reads_contact_forces
 
     @staticmethod
-    def refuse_growth(output: str, scene: "Scene") -> None:
+    def refuse_growth(output: str, scene: Scene) -> None:
         """Raise ValueError where tetrahedra grow over time: an output knows frames, not what they had grown by."""
         if scene.term(Growth):
             raise ValueError(
                 f"{output} evaluates the law and does not support Growth over time; take Grown(material, growth), or strains"
             )
 
-    def remembered(self, frames: "Frames", scene: "Scene") -> np.ndarray:
+    def remembered(self, frames: Frames, scene: Scene) -> np.ndarray:
         """What the law remembers at each point in frames, shape (frames, num_tetrahedra, points, S), S being 0 where it
         remembers nothing, or this output does not read it. Raises ValueError for frames of a run that did not note it."""
         law, mesh = scene.law, scene.mesh
@@ -101,11 +171,11 @@ class Output(metaclass=Public):
         return change.law_state.reshape(z.shape) if z.size and change.law_state is not None else np.zeros_like(z)
 
     @staticmethod
-    def remembered_vjp(frames: "Frames", z_adj: np.ndarray) -> np.ndarray | None:
+    def remembered_vjp(frames: Frames, z_adj: np.ndarray) -> np.ndarray | None:
         """The gradient by frames.law_state for that by the same, z."""
         return z_adj.reshape(frames.law_state.shape) if z_adj.size else None
 
-    def settled(self, scene: "Scene") -> "Output":
+    def settled(self, scene: Scene) -> "Output":
         """This output for a scene: checked, with what depends on the scene alone; raises ValueError if it does not fit."""
         return self
 
@@ -114,13 +184,63 @@ class Output(metaclass=Public):
         """Shape of the value; three numbers at the end make vectors of a Taichi field."""
 
     @abstractmethod
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         """y."""
 
     @abstractmethod
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         """Change of y for a change of frames and inputs, to first order."""
 
     @abstractmethod
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         """Gradient by frames and inputs of a loss whose gradient by y is `seed`."""
+
+
+class _States(Output):
+    """Vectors of all vertices in all frames."""
+
+    linear = True
+    num_vertices: int
+    part = "positions"  # of a Change
+
+    def settled(self, scene) -> "Output":
+        out = type(self)()
+        out.num_vertices = scene.mesh.num_vertices
+        return out
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        return num_frames, self.num_vertices, 3
+
+    def value(self, frames) -> np.ndarray:
+        return getattr(frames, self.name)
+
+    def jvp(self, frames, change: Change) -> np.ndarray:
+        change = getattr(change, self.part)
+        return np.zeros(frames.positions.shape) if change is None else change
+
+    def vjp(self, frames, seed: np.ndarray) -> Change:
+        return Change(**{self.part: seed})
+
+
+class Positions(_States):
+    """Where the vertices are [m]."""
+
+    name = "positions"
+
+
+class Velocities(_States):
+    """How fast they move [m/s]."""
+
+    name = part = "velocities"
+
+
+class Displacements(_States):
+    """Positions less the rest shape [m]."""
+
+    name = "displacements"
+
+    def jvp(self, frames, change: Change) -> np.ndarray:
+        return super().jvp(frames, change) - change.inputs.get("rest_positions", 0.0)
+
+    def vjp(self, frames, seed: np.ndarray) -> Change:
+        return Change(positions=seed, inputs={"rest_positions": -seed.sum(0)})

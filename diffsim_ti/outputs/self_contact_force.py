@@ -1,7 +1,7 @@
 """Forces of surfaces that press and slide on each other: what a soft hand does to what it holds."""
 
 from copy import copy
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,14 +11,11 @@ from diffsim_ti.mechanics.surfaces.curved_pairs import pairs_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.scene import Scene
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.numbers import Tangent
 from diffsim_ti.terms import SelfContact
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
 
 PARTS = ("normal", "friction", "total")
 
@@ -71,7 +68,7 @@ class SelfContactForce(Output):
     def __repr__(self) -> str:
         return f"SelfContactForce({self.on!r}, {self.part!r}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "SelfContactForce":
+    def settled(self, scene: Scene) -> "SelfContactForce":
         if scene.term(SelfContact) is None:
             raise ValueError(f"{self!r}: the scene has no SelfContact; add it to the scene's terms")
         out = copy(self)
@@ -136,12 +133,12 @@ class SelfContactForce(Output):
             return moments(frames.positions[:, self.vertices], self.about, f)
         return f if self.per_vertex else f.sum(1)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         return self._of(frames, self._all(frames))
 
     # ---- derivatives -------------------------------------------------------------------------------------------------
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         self.arrays.load(self.scene.inputs.derive(frames.inputs))
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         numbers, zero, out = Tangent(self.arrays, moved), np.zeros(frames.positions.shape), []
@@ -163,7 +160,7 @@ class SelfContactForce(Output):
         own, x = np.stack(out)[:, self.vertices], frames.positions[:, self.vertices]
         return moments_jvp(x, self.about, self._all(frames)[:, self.vertices], dx[:, self.vertices], own)
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         positions, velocities, w = np.zeros((3, *frames.positions.shape))
         derived = self.scene.inputs.derive(frames.inputs)
         if self.about is not None:

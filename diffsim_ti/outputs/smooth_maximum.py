@@ -1,16 +1,13 @@
 """One number for the greatest of many, such as the stress that a design is to keep below a limit."""
 
 from copy import copy
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from diffsim_ti.common.checked import number
-from diffsim_ti.outputs.output import Change, Output
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.scene import Scene
 
 
 class SmoothMaximum(Output):
@@ -65,7 +62,7 @@ class SmoothMaximum(Output):
     def needs_contact_forces(self, solver) -> bool:
         return self.of.needs_contact_forces(solver)
 
-    def settled(self, scene: "Scene") -> "SmoothMaximum":
+    def settled(self, scene: Scene) -> "SmoothMaximum":
         out = copy(self)
         out.of = self.of.settled(scene)
         return out
@@ -88,13 +85,13 @@ class SmoothMaximum(Output):
         norm = np.where(most > 0, total, 1.0) ** (1 / p)
         return (most * norm)[:, 0], (np.sign(y) * (part / norm) ** (p - 1)).reshape(given.shape)
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         return self._with_slope(frames)[0]
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         slope = self._with_slope(frames)[1]
         return (slope * self.of.jvp(frames, change)).reshape(len(slope), -1).sum(1)
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         slope = self._with_slope(frames)[1]
         return self.of.vjp(frames, slope * seed.reshape(-1, *[1] * (slope.ndim - 1)))

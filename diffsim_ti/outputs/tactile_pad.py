@@ -1,19 +1,15 @@
 """What a tactile sensor reads: pressure and shear on a grid of a surface, in axes that go with it."""
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.mesh.geometry import barycentric_in_plane, triangle_normals, triangle_normals_jvp, triangle_normals_vjp
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.contact_traction import ContactTraction
-from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Term
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
 
 
 class TactilePad(Output):
@@ -46,7 +42,7 @@ class TactilePad(Output):
     def __repr__(self) -> str:
         return f"TactilePad({self._given._given.obstacle!r}, {self.on!r}, {self.size}, name={self.name!r})"
 
-    def settled(self, scene: "Scene") -> "TactilePad":
+    def settled(self, scene: Scene) -> "TactilePad":
         out, mesh = copy(self), scene.mesh
         out.traction, rows = self._given.settled(scene), mesh.surface_indices(self.on)
         if not len(rows):
@@ -108,12 +104,12 @@ class TactilePad(Output):
         """Of vectors of vertices those of the grid's points."""
         return np.einsum("pc,fpcd->fpd", self.weights, t[:, self.corners])
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         t = self._sampled(self.traction.value(frames))
         axes = np.stack([self._axes(x)[0] for x in frames.positions.astype(np.float64)])
         return np.einsum("fpd,fkd->fpk", t, axes).reshape(self.shape(len(t)))
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         t, dt = (self._sampled(y) for y in (self.traction.value(frames), self.traction.jvp(frames, change)))
         x = frames.positions.astype(np.float64)
         dx = np.zeros(x.shape) if change.positions is None else change.positions
@@ -121,7 +117,7 @@ class TactilePad(Output):
         out = np.einsum("fpd,fkd->fpk", dt, axes) + np.einsum("fpd,fkd->fpk", t, daxes)
         return out.reshape(self.shape(len(t)))
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         t, x = self._sampled(self.traction.value(frames)), frames.positions.astype(np.float64)
         seed = np.reshape(seed, (len(x), -1, 3))
         axes = np.stack([self._axes(p)[0] for p in x])

@@ -2,25 +2,21 @@
 
 from abc import abstractmethod
 from copy import copy
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.named_sets import SetOrIndices
-from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointInterpolation, PointMeans
-from diffsim_ti.outputs.output import Change, Output
-from diffsim_ti.outputs.recovery import PatchRecovery
+from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PatchRecovery, PointInterpolation, PointMeans
+from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
-
-if TYPE_CHECKING:
-    from diffsim_ti.rollout.frames import Frames
-    from diffsim_ti.scene import Scene
+from diffsim_ti.scene import Scene
 
 
 class _Tensors(Output):
     """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means of what the tetrahedra around have there;
-    "recovered", at vertices, too, by superconvergent patches (recovery.py); or material points X [m], shape (k, 3), each
+    "recovered", at vertices, too, by superconvergent patches (`PatchRecovery`); or material points X [m], shape (k, 3), each
     with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is the mean over its points, by their volumes;
     at X and at its nodes it is the linear function of place that these four make, which is more accurate than the tensor of
     the displacements there. of: the tetrahedra that are meant: only these have a tensor, or count alone at their vertices.
@@ -48,7 +44,7 @@ class _Tensors(Output):
                 '"recovered"'
             )
 
-    def settled(self, scene: "Scene") -> "Output":
+    def settled(self, scene: Scene) -> "Output":
         out, mesh = copy(self), scene.mesh
         out.scene, out.num_vertices, out.means, out.points = scene, mesh.num_vertices, None, mesh.reference.num_points
         every, of = isinstance(self.at, str), [] if self.of is None else mesh.tetrahedron_indices(self.of)
@@ -106,11 +102,11 @@ class _Tensors(Output):
             return self.means.shares_jvp(derived.rest, moved.rest)
         return moved.volumes[self.chosen].ravel()
 
-    def value(self, frames: "Frames") -> np.ndarray:
+    def value(self, frames: Frames) -> np.ndarray:
         shown = self._start(frames)[-1]
         return NUMBERS[self.numbers][1](shown) if self.numbers else shown
 
-    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         derived, deformation, z, T, shown = self._start(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
@@ -120,7 +116,7 @@ class _Tensors(Output):
             dT = self.means.jvp(T, dT, self._shares(derived), self._shares_jvp(derived, moved))
         return NUMBERS[self.numbers][2](shown, dT) if self.numbers else dT
 
-    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         derived, deformation, z, T, shown = self._start(frames)
         by_rest = 0.0
         adjoint, seed = derived.zeros(), NUMBERS[self.numbers][3](shown, seed) if self.numbers else seed
@@ -203,8 +199,7 @@ class Stress(_Tensors):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], fixed="ymin", precision="f64")
     >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.Stress(von_mises=True)]).forward()
     >>> frames["stress"].shape, bool((frames["stress"][-1] > 0).all())
     ((2, 6), True)
@@ -228,7 +223,7 @@ class Stress(_Tensors):
         super().__init__(name, at, of, principal=principal, von_mises=von_mises)
         self.kind = kind
 
-    def settled(self, scene: "Scene") -> "Stress":
+    def settled(self, scene: Scene) -> "Stress":
         law = scene.law
         if law.in_steps().reads != ("H",):
             raise ValueError(
@@ -267,3 +262,43 @@ class Stress(_Tensors):
             F_adj = np.swapaxes(seed, -1, -2) @ P / J - shrunk * np.swapaxes(np.linalg.inv(F), -1, -2)
         by_H, by_z = self.stresses.vjp(deformation.H, z, P_adj, derived, adjoint)
         return by_H + self.stresses.chosen_vjp(F_adj), by_z
+
+
+class PlasticStrain(_Tensors):
+    """Equivalent plastic strain [-], the integral of sqrt(2/3) |D_p| over time, as the law remembers it in each frame:
+    after implicit and static steps that of the frame, after explicit ones that of the substep before.
+
+    at: "tetrahedra", (frames, num_tetrahedra), the means over their points; "vertices", (frames, num_vertices); or material
+    points X [m], shape (k, 3). of, name: as of `Stress`. In pictures colour="plastic_strain".
+    The gradient is exact by all inputs. Raises ValueError for laws without plastic flow.
+    Simo, Hughes, Computational Inelasticity, 1998, sec. 2.3.
+    """
+
+    reads_law_state = True
+
+    def __init__(
+        self, name: str = "plastic_strain", at: str | ArrayLike = "tetrahedra", of: SetOrIndices | None = None
+    ):
+        super().__init__(name, at, of)
+
+    def settled(self, scene: Scene) -> "PlasticStrain":
+        if not scene.law.plastic:
+            raise ValueError(f"PlasticStrain: {scene.law.title} has no plastic flow; take J2Plasticity as the material")
+        out = super().settled(scene)
+        out.place = scene.law.state_names.index("plastic_strain")
+        return out
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        return num_frames, self.count
+
+    def _tensors(self, deformation, z, derived):
+        return z[..., self.place][:, self.read].reshape(len(z), -1)
+
+    def _tensors_jvp(self, deformation, dH, z, dz, derived, change):
+        return self._tensors(deformation, dz, derived)
+
+    def _tensors_vjp(self, deformation, z, derived, seed, adjoint):
+        z_adj = np.zeros_like(z)
+        for into, rows in zip(z_adj, seed.reshape(len(z), len(self.read), -1)):
+            np.add.at(into[..., self.place], self.read, rows)
+        return np.zeros_like(deformation.H), z_adj

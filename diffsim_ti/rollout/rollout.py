@@ -18,11 +18,10 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import InputName, InputValue
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.checkpoints import Checkpoints
-from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite, warn_of_large_stretch
-from diffsim_ti.rollout.run import Run
-from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
-from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
+from diffsim_ti.rollout.run import HostSeed, Run, check_finite, warn_of_large_stretch
+from diffsim_ti.rollout.set_values import change_like, gathered, spread_all, spread_change, spread_shape, with_shape
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeAdapter
 from diffsim_ti.scene.scene import SceneArguments
@@ -77,8 +76,7 @@ class Rollout(metaclass=Public):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10)
     >>> frames = rollout.forward(gravity=(0.0, -1.62, 0.0))
     >>> gradients = rollout.vjp(frames, positions=frames.positions[-1:].repeat(2, 0) * 0 + 1)
@@ -218,7 +216,7 @@ class Rollout(metaclass=Public):
 
         A material's numbers and others per tetrahedron may be given by named sets, `youngs_modulus={"soft": 2e4}`; gradients
         by them have the same names, and so may tangents (set_values.py). `shape` [m], (num_vertices, 3), moves initial and
-        rest positions together, and supports with them (shape.py).
+        rest positions together, and supports with them.
         """
         values, sets = spread_all(self.scene, self.values, spread_shape(values, self.values))
         frames = self.frames_of(self.sweep.run(values, law_state=law_state))
@@ -306,12 +304,10 @@ class Rollout(metaclass=Public):
 
     def tangents(self, frames: Frames, **tangents: InputValue) -> dict[str, np.ndarray]:
         """Changes of all outputs, by name, for changes of inputs, to first order, float64."""
-        change = self._pushed_to_frames(frames, tangents)
-        return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
+        return self.changes_of(frames, self._pushed_to_frames(frames, tangents))
 
-    def changes_of(self, frames: Frames, positions: np.ndarray, velocities: np.ndarray, tangents: dict) -> dict:
+    def changes_of(self, frames: Frames, change: Change) -> dict[str, np.ndarray]:
         """Changes of all outputs from those of the frames' states and of inputs."""
-        change = Change(positions, velocities, tangents)
         return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
 
     def _pushed_to_frames(self, frames: Frames, tangents: dict) -> Change:

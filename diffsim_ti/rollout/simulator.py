@@ -19,7 +19,8 @@ from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
-from diffsim_ti.rollout.frames import Frames, warn_of_large_stretch
+from diffsim_ti.outputs.output import Frames
+from diffsim_ti.rollout.run import warn_of_large_stretch
 from diffsim_ti.solvers import SemiImplicitSolver
 from diffsim_ti.solvers.implicit.multigrid import Following
 from diffsim_ti.solvers.solver import Solver
@@ -43,8 +44,7 @@ class Simulator(metaclass=Public):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> simulator = ds.Simulator(ds.VelocityVerletSolver(scene, dt=1e-3))
     >>> simulator.step()
     >>> simulator.run(9)

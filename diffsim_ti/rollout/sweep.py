@@ -12,7 +12,7 @@ from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.outputs.output import NOTED
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.run import Run, Seed
-from diffsim_ti.rollout.shape import MOVED
+from diffsim_ti.rollout.set_values import MOVED
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.substeps import RunSubsteps
@@ -101,7 +101,7 @@ class Sweep:
                 self._plan()
 
     def _check_names(self, names) -> tuple[str, ...]:
-        self.wants_shape = False  # the sum of these by initial and by rest positions (shape.py)
+        self.wants_shape = False  # the sum of these by initial and by rest positions (set_values.py)
         if names is None:
             return tuple(name for name in self.inputs if name != "rest_positions")
         if isinstance(names, str):

@@ -11,8 +11,8 @@ from diffsim_ti.common.checked import whole
 from diffsim_ti.common.origin import warn_of_rounding
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.outputs import Change
-from diffsim_ti.rollout import field_copies
-from diffsim_ti.rollout.field_seed import STATES, field_seed
+from diffsim_ti.rollout import fields_on_device
+from diffsim_ti.rollout.fields_on_device import STATES, field_seed
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.set_values import gathered, per_tetrahedron, rows_of_sets, split_name, spread
 
@@ -153,9 +153,9 @@ class TapeAdapter:
         elif gradient.shape == (3,) and grad.shape == ():
             grad.from_numpy(grad.to_numpy() + gradient)
         elif isinstance(grad, ti.MatrixField):
-            field_copies.add_vectors(grad, gradient)
+            fields_on_device.add_vectors(grad, gradient)
         else:
-            field_copies.add_numbers(grad, gradient)
+            fields_on_device.add_numbers(grad, gradient)
 
     # ---- runs -------------------------------------------------------------------------------------------------------
 
@@ -209,13 +209,13 @@ class TapeAdapter:
         n = self.rollout.scene.mesh.num_vertices
         if "initial_positions" in fields:
             known = self._constant("initial_positions", None, lambda: self._loaded("initial_positions")[None])
-            field_copies.take_positions(fields["initial_positions"], known, state.u)
+            fields_on_device.take_positions(fields["initial_positions"], known, state.u)
         if "initial_displacements" in fields:
             nowhere = self._constant("nowhere", None, lambda: np.zeros(n), ti.i32)
-            field_copies.take_vectors(fields["initial_displacements"], nowhere, state.u)
+            fields_on_device.take_vectors(fields["initial_displacements"], nowhere, state.u)
         if "initial_velocities" in fields:
             fixed = self._constant("fixed", None, lambda: np.isin(np.arange(n), self.rollout.scene.fixed), ti.i32)
-            field_copies.take_vectors(fields["initial_velocities"], fixed, state.v)
+            fields_on_device.take_vectors(fields["initial_velocities"], fixed, state.v)
         bad = workspace.first_bad_vertex()
         if bad is not None:
             raise ValueError(f"initial_positions and initial_velocities must be finite: those of vertex {bad} are not")
@@ -225,7 +225,7 @@ class TapeAdapter:
         frames, rest = self.rollout.sweep.workspace.frames, run.values["rest_positions"]
         if runtime.arch_name() in ("cpu", "cuda"):
             exact = self._constant("rest", rest, lambda: rest, ti.types.vector(4, ti.f64))
-            field_copies.show_frames(*frames, exact, k or 0, *map(self.field, STATES))
+            fields_on_device.show_frames(*frames, exact, k or 0, *map(self.field, STATES))
         else:  # Vulkan may lack float64
             u, v = map(runtime.fetch, frames)
             for name, value in zip(STATES, (rest + u, v, u)):

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from taichi._lib import core as _core
 
-from diffsim_ti.runtime.current_program import current_program
+from diffsim_ti.runtime.threads import current_program
 
 _DRIVERS = ("libcuda.so", "libcuda.so.1", "/usr/lib/wsl/lib/libcuda.so", "nvcuda.dll")
 

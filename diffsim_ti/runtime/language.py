@@ -1,10 +1,14 @@
-"""What kernels are written with: plain Python that builds their code while they compile."""
+"""What kernels are written with: plain Python that builds their code while they compile; types of their numbers and
+vectors."""
 
 from types import SimpleNamespace
 
+import taichi as ti
 from taichi.lang import impl
 from taichi.lang.expr import Expr  # noqa: F401  what a number of a kernel is
 from taichi.types import vector
+
+from diffsim_ti.runtime.start import PRECISIONS
 
 made = {"variables": 0}  # in all of this process: what decides how long kernels take to compile (tracer.py counts)
 
@@ -73,3 +77,16 @@ class Bundle:
 
     def __init__(self, **parts):
         self.__dict__.update(parts)
+
+
+number_type = property(lambda self: PRECISIONS[self.precision], doc="Taichi's type of its numbers.")
+vector_type = property(
+    lambda self: ti.types.vector(4, PRECISIONS[self.precision]),
+    doc="Taichi's type of its vectors: four components, the last zero.",
+)
+
+
+@ti.func
+def cross(a, b):
+    """a x b of such vectors."""
+    return ti.Vector([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], a[3]])

@@ -1,6 +1,7 @@
 """Kernels with their arrays bound once, launched many times."""
 
 import contextlib
+import ctypes
 import logging
 import os
 import signal
@@ -13,13 +14,15 @@ from taichi.types import primitive_types
 
 from diffsim_ti.common import ranks
 from diffsim_ti.common.progress import LOG
-from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
 from diffsim_ti.runtime.arrays import check_owner, full_shape
 from diffsim_ti.runtime.language import made
 from diffsim_ti.runtime.quadrants import QUADRANTS
 from diffsim_ti.runtime.repeated_loops import RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
 from diffsim_ti.runtime.threads import LOCK, materialize, untaped
+
+PATIENCE, SHORT = 5, 500  # [s]; variables of kernels that take less than a second
+_WORD = ctypes.sizeof(ctypes.c_void_p)
 
 
 class Launch:
@@ -112,9 +115,6 @@ class Launch:
             self._owner().launch_kernel(self._code, self._context)
 
 
-PATIENCE, SHORT = 5, 500  # [s]; variables of kernels that take less than a second
-
-
 @contextlib.contextmanager
 def say_if_long(what: str):
     """Say so on stderr, once, if a `with` block of Taichi takes longer than PATIENCE [s] and the logger "diffsim_ti" shows
@@ -175,3 +175,34 @@ class TensorLaunch(Launch):
             size = tensor.numel() * tensor.element_size()
             self._context.set_arg_external_array_with_shape((k,), tensor.data_ptr(), size, tuple(tensor.shape), 0)
         self._owner().launch_kernel(self._code, self._context)
+
+
+def _word(address: int) -> ctypes.c_void_p:
+    return ctypes.c_void_p.from_address(address)
+
+
+class ArgumentBuffer:
+    """Gives a launch context its host buffer back, which Taichi's CUDA launcher replaces by a copy on the card.
+
+    The launcher frees that copy and leaves its address behind, so that the next number or tensor that is set would be
+    written to the card's memory by the host: a crash. A new context for each launch costs more than the launch itself.
+    Taichi has no door for this: the two pointers lie in its object, `ctx_` (whose first word is the buffer in use) and
+    `arg_buffer_` (the buffer it owns). In a context that was never launched they are the same, which is checked.
+    Source: Taichi 1.7.4, program/launch_context_builder.h and runtime/cuda/kernel_launcher.cpp.
+    """
+
+    def __init__(self, context):
+        builder = _word(
+            id(context) + object.__basicsize__
+        ).value  # pybind11 keeps the C++ object behind Python's header
+        self._own = _word(builder + 3 * _WORD).value
+        self._in_use = _word(_word(builder + 2 * _WORD).value)
+        if not self._own or self._in_use.value != self._own:
+            raise RuntimeError(
+                "this build of Taichi lays out its launch contexts in another way than version 1.7.4, "
+                "so that kernels cannot be launched twice on CUDA: install taichi==1.7.4"
+            )
+
+    def restore(self) -> None:
+        """Before anything is set for the next launch."""
+        self._in_use.value = self._own

@@ -19,7 +19,7 @@ from taichi.lang.expr import Expr
 from taichi.lang.util import cook_dtype
 from taichi.types import primitive_types
 
-from diffsim_ti.runtime import tracer, variables
+from diffsim_ti.runtime import tracer
 from diffsim_ti.runtime.language import traced
 from diffsim_ti.runtime.threads import LOCK
 
@@ -35,9 +35,9 @@ class _Source:
         self.file = kernel_impl.getsourcefile(function)
         self.lines = [textwrap.fill(line, tabsize=4, width=9999) for line in lines]
         self.free, self.changed = [], None
-        if variables.may_share(self.file):
+        if tracer.may_share(self.file):
             self.free.append(self.take())
-            self.changed = variables.changed_names(self.free[0].body[0])
+            self.changed = tracer.changed_names(self.free[0].body[0])
 
     def take(self) -> ast.Module:
         if self.free:
@@ -71,7 +71,7 @@ def _tree_and_context(function, *args, is_kernel: bool = True, is_real_function:
         global_vars=kernel_impl._get_global_vars(function.func),
         argument_data=more["args"]
         if source.changed is None
-        else variables.arguments(function, more["args"], source.changed),
+        else tracer.arguments(function, more["args"], source.changed),
         src=source.lines,
         start_lineno=source.start,
         file=source.file,
@@ -116,7 +116,6 @@ _CHANGES = {
     (ti, "cast"): _cast,
     (ops, "cast"): _cast,
     (ASTTransformerContext, "get_pos_info"): _place,
-    **variables.CHANGES,
     **tracer.CHANGES,
 }
 _INHERITED = object()

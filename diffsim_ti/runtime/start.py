@@ -21,9 +21,8 @@ from diffsim_ti.common import ranks
 from diffsim_ti.common.deprecated import renamed_arguments
 from diffsim_ti.common.names import nearest
 from diffsim_ti.common.warn import warn
-from diffsim_ti.runtime.current_program import current_program
 from diffsim_ti.runtime.device import count_cards
-from diffsim_ti.runtime.threads import LOCK, materialize
+from diffsim_ti.runtime.threads import LOCK, current_program, materialize
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 NUMPY = {"f32": np.float32, "f64": np.float64}

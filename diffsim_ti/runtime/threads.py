@@ -9,6 +9,8 @@ import threading
 
 from taichi.lang import impl, kernel_impl
 
+from diffsim_ti.runtime.quadrants import QUADRANTS
+
 LOCK = threading.RLock()
 
 
@@ -52,3 +54,8 @@ def materialize() -> None:
             "diffsim_ti.init() there, and use Rollout.run and tapes there; other threads can use Simulator and "
             "Rollout.forward"
         ) from error
+
+
+def current_program():
+    """The program that runs, or None; Quadrants' own property raises where there is none."""
+    return impl.get_runtime()._prog if QUADRANTS else impl.pytaichi.prog

@@ -2,11 +2,19 @@
 
 Taichi enters a context manager for each node, makes a record of its place in the file for each expression, and asks of each
 value which of a dozen types it has. Here what nodes of kernels are most often comes first; all else is left to Taichi.
+
+Taichi copies the value of an assignment, `x = f(y)`, twice, and each argument of a call once more. Half of the variables of
+a kernel were such copies, and the time of Taichi's first pass grows with their number squared. Here an assignment makes one
+variable, or none where its value is one that never changes, such as another function's `let`; and a function takes such an
+argument as it is, unless it changes its parameter. What functions change by reference must be a `variable`. Functions from
+elsewhere, of laws and obstacles that users write, keep Taichi's copies.
 """
 
 import ast
+import inspect
 import operator
 from functools import lru_cache
+from pathlib import Path
 
 from taichi._lib import core
 from taichi.lang import impl, ops
@@ -18,8 +26,9 @@ from taichi.lang.exception import TaichiTypeError
 from taichi.lang.expr import Expr
 from taichi.lang.matrix_ops import matmul
 from taichi.types import primitive_types
+from taichi.types.annotations import template
 
-from diffsim_ti.runtime.language import made
+from diffsim_ti.runtime.language import let, made
 
 _any_node, _any_expr, _any_binary = Builder.__call__, Expr.__init__, ops._binary_operation
 _any_subscript, _any_variable, _any_builtin = impl.subscript, impl.expr_init, ASTTransformer.build_call_if_is_builtin
@@ -46,6 +55,8 @@ _DECORATORS = {
     id(ast_transformer.ndrange): "ndrange",
 }
 _record_of = lru_cache(maxsize=None)(core.DebugInfo)  # of a place in a file
+_AS_IT_IS = template()  # Taichi copies no argument of a parameter with this annotation
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 class _Fails:
@@ -207,11 +218,95 @@ def _variable(value):
     return Expr(impl.pytaichi.compiling_callable.ast_builder().expr_var(value.ptr, _record()))
 
 
+def may_share(file: str) -> bool:
+    """Whether functions of a file are written for it: those of this package."""
+    return _PACKAGE in Path(file).resolve().parents
+
+
+def changed_names(function: ast.FunctionDef) -> set[str]:
+    """The names that a function stores more than once, parameters included, or changes in part."""
+    stored, changed = {argument.arg for argument in function.args.args}, set()
+    for node in ast.walk(function):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            changed |= stored & {node.id}
+            stored.add(node.id)
+        elif isinstance(node, (ast.Subscript, ast.Attribute)) and isinstance(node.ctx, ast.Store):
+            changed |= {name.id for name in ast.walk(node.value) if isinstance(name, ast.Name)}
+        elif isinstance(node, ast.Call):  # ti.atomic_add(x, y) changes x
+            named = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+            if named.startswith("atomic_"):
+                changed |= {name.id for name in ast.walk(node.args[0]) if isinstance(name, ast.Name)}
+    return changed
+
+
+def arguments(function, values: tuple, changed: set[str]) -> tuple:
+    """What a Taichi function is called with: what never changes as it is, all else in a variable of its own."""
+    passed = []
+    for parameter, value in zip(function.arguments, values):
+        if parameter.annotation is inspect.Parameter.empty and parameter.name not in changed:
+            parameter.annotation = _AS_IT_IS
+        if parameter.annotation is _AS_IT_IS:
+            value = let(value) if type(value) is Expr else impl.expr_init_func(value)
+        elif (
+            isinstance(parameter.annotation, template) and parameter.name in changed and getattr(value, "is_let", False)
+        ):
+            raise TypeError(f"{function.func.__qualname__} changes {parameter.name}: give it a variable()")
+        passed.append(value)
+    return tuple(passed)
+
+
+def _build_assign(context, node: ast.Assign) -> None:
+    """`x = y`, `x, y = z`, `x[i] = y`; what Taichi does, by fewer variables where x and y are new, or parts of arrays."""
+    build_stmt(context, node.value)
+    value, target = node.value.ptr, node.targets[0]
+    is_static = isinstance(node.value, ast.Call) and node.value.func.ptr is impl.static
+    if not is_static and len(node.targets) == 1 and vars(context).get("changed") is not None:
+        if type(value) is Expr and _is_new(context, target):
+            _store(context, target.id, value, may_share=not isinstance(node.value, ast.Name))
+            return
+        if type(value) is Expr and not isinstance(target, ast.Tuple):
+            ASTTransformer.build_assign_basic(context, target, value, False)
+            return
+        if _are_new(context, target, value):
+            for name, part in zip(target.elts, value):
+                _store(context, name.id, part, may_share=isinstance(node.value, ast.Call))
+            return
+    value = value if is_static else impl.expr_init(value)
+    for target in node.targets:
+        ASTTransformer.build_assign_unpack(context, target, value, is_static)
+
+
+def _is_new(context, target) -> bool:
+    return (
+        isinstance(target, ast.Name) and not context.is_var_declared(target.id) and target.id not in context.kernel_args
+    )
+
+
+def _are_new(context, target, values) -> bool:
+    """Whether `target = values` gives a number each to as many new names."""
+    if not isinstance(target, ast.Tuple) or type(values) not in (tuple, list) or len(values) != len(target.elts):
+        return False
+    if not all(type(v) is Expr for v in values) or not all(_is_new(context, name) for name in target.elts):
+        return False
+    return len({name.id for name in target.elts}) == len(values)
+
+
+def _store(context, name: str, value: Expr, may_share: bool) -> None:
+    """A new name for a value; what nobody changes is as good as a `let`, and stands for itself if a function made it."""
+    if name in context.changed:
+        own = impl.expr_init(value)
+    else:
+        own = let(value) if may_share else impl.expr_init(value)
+        own.is_let = True
+    context.create_variable(name, own)
+
+
 CHANGES = {  # (owner, name) of a function of Taichi's -> what sources.py puts in its place while a kernel of ours is traced
     (ASTTransformer, "__call__"): _node,
     (ASTTransformer, "build_BinOp"): staticmethod(_operation),
     (ASTTransformer, "get_decorator"): staticmethod(_decorator),
     (ASTTransformer, "build_call_if_is_builtin"): staticmethod(_builtin),
+    (ASTTransformer, "build_Assign"): staticmethod(_build_assign),
     (ast_transformer, "build_stmts"): _statements,
     (Expr, "__init__"): _expr,
     (ops, "_binary_operation"): _binary,

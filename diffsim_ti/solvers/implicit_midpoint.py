@@ -11,7 +11,7 @@ class ImplicitMidpointSolver(ImplicitSolver):
 
     Second order, no dissipation, keeps linear and angular momentum to the solver's tolerance. It is stable for linear
     motions only: what is stiff and nonlinear (omega h beyond about 10) rings on and can blow up, which raises NotConverged,
-    or gains energy, which warns once it is a tenth of what moves (energy_watch.py); use BDF2 or backward Euler there.
+    or gains energy, which warns once it is a tenth of what moves (energy_balance.py); use BDF2 or backward Euler there.
     Contact in the middle of a step is not contact at its end.
     Hairer, Lubich, Wanner, Geometric Numerical Integration, II.1.2, doi:10.1007/3-540-30666-8.
     """

@@ -13,8 +13,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.explicit.solver import CONTACT_DAMPING, ExplicitSolver, Weights
 from diffsim_ti.solvers.substeps import Substeps
-from diffsim_ti.state.schedule import Schedule
-from diffsim_ti.state.staged_steps import StagedSteps
+from diffsim_ti.state.schedule import Schedule, StagedSteps
 from diffsim_ti.state.viscous_stages import MOST, ViscousStages
 from diffsim_ti.terms import Drag, Gravity
 

@@ -15,7 +15,7 @@ from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.monitor import stability
-from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
+from diffsim_ti.monitor.stability import sampled_by_runs, stiffest
 from diffsim_ti.solvers.substeps import SHARE, Chosen, Substeps, checked, divided, needed
 from diffsim_ti.state.schedule import EqualSteps, Schedule, UnequalSteps
 

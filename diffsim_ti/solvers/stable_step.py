@@ -5,8 +5,7 @@ from collections.abc import Callable
 from diffsim_ti.common.checked import instance
 from diffsim_ti.common.public import public
 from diffsim_ti.mechanics.workspace import Workspace
-from diffsim_ti.monitor.stability import StepLimit, element_limit, lanczos_limit
-from diffsim_ti.monitor.stiffest import stiffest
+from diffsim_ti.monitor.stability import StepLimit, element_limit, lanczos_limit, stiffest
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.semi_implicit import SemiImplicitSolver
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from diffsim_ti.common.checked import shown, whole
-from diffsim_ti.monitor.stability import StepLimit, element_limit
-from diffsim_ti.monitor.stiffest import over_time, sampled_by_runs
+from diffsim_ti.monitor.stability import StepLimit, element_limit, over_time, sampled_by_runs
 
 if TYPE_CHECKING:
     from diffsim_ti.solvers.solver import Solver

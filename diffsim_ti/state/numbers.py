@@ -29,10 +29,6 @@ def _given(name: str) -> Callable:
     return lambda arrays, derived: getattr(derived, name)
 
 
-def _anchor(arrays, derived):
-    return None if derived.motion is None else derived.displacement[arrays.held]
-
-
 def _whole(arrays, x):
     return x.astype(np.float64)
 
@@ -58,7 +54,7 @@ PARTS = {
     "surface": Part("scalars", _given("surface")),
     "forces": Part("vectors2", _given("forces"), _whole),
     "motion": Part("vectors2", _given("motion"), _whole),
-    "anchor": Part("vectors", _anchor, _whole),
+    "anchor": Part("vectors", lambda a, d: None if d.motion is None else d.displacement[a.held], _whole),
     "path": Part("vectors2", _given("path"), _whole),
 }
 TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_slot"), "ints")

@@ -239,8 +239,7 @@ class UnequalSteps(Schedule):
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
-    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], precision="f64")
     >>> steps = ds.UnequalSteps([1e-3, 2e-3, 7e-3], substeps=[1, 2, 7])
     >>> frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), steps).forward()
     >>> print(f"{frames.times[-1]:.3f} s, {frames.displacements[-1, 0, 1]:.7f} m")
@@ -314,3 +313,31 @@ class UnequalSteps(Schedule):
         ends = np.flatnonzero(np.abs(np.diff(h)) > 1e-12 * h[1:]) + 1 + first if last > first else []
         bounds = [first, *(int(e) for e in ends), last]
         return [(a, b) for a, b in zip(bounds, bounds[1:]) if a < b]
+
+
+def _of_whole(method: str):
+    """A method of pass j: that of other steps for the pass which it is a part of."""
+    return lambda self, j: getattr(self.whole, method)(j // self.stages)
+
+
+@dataclass(frozen=True)
+class StagedSteps(Schedule):
+    """Every pass of other steps as `stages` passes, each of which has the length and the place in time of that pass: each
+    substep is kicked several times before it drifts."""
+
+    whole: Schedule
+    stages: int
+
+    row, step_length, length, begin, end = map(_of_whole, ("row", "step_length", "length", "begin", "end"))
+    varies, longest = (property(lambda self, name=name: getattr(self.whole, name)) for name in ("varies", "longest"))
+    substeps = property(lambda self: self.stages * self.whole.substeps)
+
+    def first(self, step):
+        return self.stages * self.whole.first(step)
+
+    def time(self, step):
+        return self.whole.time(step)
+
+    def stretches(self, first, last):
+        of_whole = self.whole.stretches(first // self.stages, -(-last // self.stages))
+        return [(max(first, a * self.stages), min(last, b * self.stages)) for a, b in of_whole]

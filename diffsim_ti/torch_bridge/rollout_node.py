@@ -1,4 +1,4 @@
-"""A rollout as a node of torch's graph, and each of its further outputs as another."""
+"""A rollout, or a batch, as a node of torch's graph, and each further output of a rollout as another."""
 
 from typing import NamedTuple
 
@@ -9,13 +9,12 @@ from diffsim_ti.common.brief import brief
 from diffsim_ti.common.origin import START_NEARER, warn_of_rounding
 from diffsim_ti.common.public import Public
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.rollout.shape import spread_shape
+from diffsim_ti.rollout.set_values import spread_shape
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
-from diffsim_ti.torch_bridge.batch_node import TorchBatchFrames, batch_frames
-from diffsim_ti.torch_bridge.set_tensors import as_tensors
-from diffsim_ti.torch_bridge.tensors import TensorRollout
+from diffsim_ti.torch_bridge.tensors import TensorRollout, as_tensors, on_host
 
 REMEDY = "use verify.hessian_product or verify.gauss_newton_product"
+STATES = "positions", "velocities", "displacements"
 
 
 class _States(NamedTuple):
@@ -100,6 +99,63 @@ def _as_tensors(gradients: dict, names, tensors, needed) -> list:
     return out
 
 
+class TorchBatchFrames(dict):
+    """Outputs of all scenes by name, tensors (scenes, ...): "positions", "velocities", "displacements" and the batch's own.
+
+    alive: (scenes,), whether each came to its end; the gradient of one that did not is zero.
+    """
+
+    def __init__(self, outputs: dict, alive: np.ndarray):
+        super().__init__(outputs)
+        self.alive = torch.from_numpy(alive.copy())
+
+    def __repr__(self) -> str:
+        return f"TorchBatchFrames({len(self.alive)} scenes, {brief(dict(self))[1:-1]})"
+
+    positions, velocities, displacements = (property(lambda self, name=name: self[name]) for name in STATES)
+
+
+class _BatchNode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, batch: Batch, names: tuple, kept: list, *tensors):
+        rest = batch.scene.inputs.values["rest_positions"]
+        frames = batch.forward(**dict(on_host(name, x, rest) for name, x in zip(names, tensors)))
+        kept.append(frames.alive)
+        ctx.batch, ctx.names, ctx.tensors, ctx.frames = batch, names, tensors, frames
+        like = tensors[0] if tensors else torch.empty(0, dtype=torch.float64)
+        return tuple(torch.from_numpy(np.array(frames[name])).to(like.device) for name in (*STATES, *frames.outputs))
+
+    @staticmethod
+    @first_order_only("take tangents of the batch, and reverse products along them")
+    def backward(ctx, *adjoints):
+        arrays = (x.detach().to("cpu", torch.float64).numpy() for x in adjoints)
+        seeds = dict(zip((*STATES, *ctx.frames.outputs), arrays))
+        by_displacements = seeds.pop("displacements")
+        seeds["positions"] = seeds["positions"] + by_displacements
+        gradients = ctx.batch.vjp(ctx.frames, **seeds)
+        if "rest_positions" in gradients:  # u = x - X
+            away = by_displacements.sum(1)
+            own = gradients["rest_positions"].ndim == 3
+            gradients["rest_positions"] = gradients["rest_positions"] - (away if own else away.sum(0))
+        gradients["initial_displacements"] = gradients.get("initial_positions")
+        out = []
+        for name, tensor, need in zip(ctx.names, ctx.tensors, ctx.needs_input_grad[3:]):
+            out.append(torch.tensor(gradients[name]).to(tensor.device, tensor.dtype) if need else None)
+        return None, None, None, *out
+
+
+def batch_frames(batch: Batch, tensors: dict) -> TorchBatchFrames:
+    """Run a batch with some inputs given as tensors, see `rollout_frames`."""
+    tensors = as_tensors(batch.scene, batch.one.values, tensors, batch.num_scenes)
+    for name, tensor in tensors.items():
+        known = "initial_positions" if name == "initial_displacements" else name
+        if tensor.requires_grad and known in batch.inputs and known not in batch.wanted:
+            raise ValueError(f"{name} requires a gradient: name it in Batch(gradients=[...]), or pass gradients='all'")
+    kept = []
+    outputs = _BatchNode.apply(batch, tuple(tensors), kept, *tensors.values())
+    return TorchBatchFrames(dict(zip((*STATES, *batch.one.computed), outputs)), kept[0])
+
+
 @uncompiled
 def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFrames | TorchBatchFrames:
     """Functional interface: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
@@ -117,7 +173,7 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
     Raises ValueError for unknown names, wrong shapes, types that are not floating point, and tensors that require a
     gradient by density or rest_positions which the Rollout was asked not to compute.
 
-    A `Batch` in place of the Rollout gives tensors of all its scenes (batch_node.py). `torch.compile` breaks its graph here.
+    A `Batch` in place of the Rollout gives tensors of all its scenes. `torch.compile` breaks its graph here.
     """
     refuse_transforms(tensors.values())
     tensors = spread_shape(tensors, (rollout.one if isinstance(rollout, Batch) else rollout).values)

@@ -1,22 +1,26 @@
 """A rollout between torch tensors and device arrays: start, frames and their adjoints are copied by one kernel each way.
 
 There is no NumPy between them, and on the GPU no host. What is small (moduli, also per tetrahedron, density, the terms'
-numbers) is still checked and prepared on the host by `Inputs`, and its gradients come from there.
+numbers, those of named sets spread over tetrahedra) is still checked and prepared on the host by `Inputs`, and its gradients
+come from there.
 """
 
 import weakref
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.batch.batch_inputs import own_sets
+from diffsim_ti.common.checked import numbers as as_array
 from diffsim_ti.outputs import Change
-from diffsim_ti.rollout.frames import HostSeed, check_finite
-from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.run import HostSeed, Run, check_finite
+from diffsim_ti.rollout.set_values import per_tetrahedron, rows_of_sets
 from diffsim_ti.runtime.slots import copy_slot
+from diffsim_ti.scene import Scene
 from diffsim_ti.torch_bridge.autograd import torch
-from diffsim_ti.torch_bridge.set_tensors import on_host
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
 START = ("initial_displacements", "initial_velocities")  # what can be copied; all else goes through Inputs
@@ -202,3 +206,49 @@ class TensorRollout:
                 seed.start[1][self._fixed.to(seed.start[1].device)] = 0
             out = out | dict(zip(START, seed.start))
         return out
+
+
+def as_tensors(scene: Scene, values: dict, given: dict, scenes: int | None = None) -> dict[str, torch.Tensor]:
+    """Inputs as tensors, those of named sets spread; scenes: as in `spread_tensors`.
+
+    Raises ValueError for what is no floating point number, and for displacements beside another rest shape.
+    """
+    if "rest_positions" in given and "initial_displacements" in given:
+        raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
+    out = {}
+    for name, x in given.items():
+        x = spread_tensors(scene, name, values.get(name), x, scenes) if isinstance(x, Mapping) else x
+        out[name] = x if isinstance(x, torch.Tensor) else torch.from_numpy(as_array(name, x))
+        if not out[name].is_floating_point():
+            raise ValueError(f"{name}: expected a floating point tensor, got {out[name].dtype}")
+    return out
+
+
+def on_host(name: str, tensor: torch.Tensor, rest: np.ndarray) -> tuple[str, np.ndarray]:
+    """(name of an input, its value) of a tensor; rest: places that "initial_displacements" are from."""
+    value = tensor.detach().to("cpu", torch.promote_types(tensor.dtype, torch.float32)).numpy()
+    return ("initial_positions", rest + value) if name == "initial_displacements" else (name, value)
+
+
+def spread_tensors(
+    scene: Scene, name: str, base: np.ndarray, numbers: Mapping, scenes: int | None = None
+) -> torch.Tensor:
+    """The values of all tetrahedra from tensors of named sets, whose gradients torch sums.
+
+    scenes: of a batch, where numbers of sets may have that axis in front; the values have it if one has.
+    """
+    rows = rows_of_sets(scene, name, numbers)
+    given = [x for x in numbers.values() if isinstance(x, torch.Tensor) and x.is_floating_point()]
+    like = given[0] if given else torch.zeros((), dtype=torch.float64)
+    numbers = {key: x if isinstance(x, torch.Tensor) else like.new_tensor(x) for key, x in numbers.items()}
+    own = own_sets(scene, name, base, numbers, scenes) if scenes else ()
+    out = torch.as_tensor(per_tetrahedron(scene, name, base)).to(like)
+    if own:
+        out = out.expand(scenes, *out.shape)
+    first = 1 if own else 0  # the axis of tetrahedra
+    for key, places in rows.items():
+        at = torch.tensor(places.tolist(), device=out.device)
+        number = numbers[key].to(out)
+        number = number.unsqueeze(1) if key in own else number
+        out = out.index_copy(first, at, number.expand(*out.shape[:first], len(at), *out.shape[first + 1 :]))
+    return out

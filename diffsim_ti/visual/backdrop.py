@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.camera import Camera
-from diffsim_ti.visual.rasteriser import covered
+from diffsim_ti.visual.painters import covered
 from diffsim_ti.visual.surface import LIGHT
 
 SKY, HORIZON, FLOOR, LINE = (np.array(c) for c in ([0.99] * 3, [0.93, 0.945, 0.96], [0.965] * 3, [0.80, 0.82, 0.85]))

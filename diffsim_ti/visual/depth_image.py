@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti.common.public import Public
 from diffsim_ti.visual.camera import NEAREST, Camera
 from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.visual.rasteriser import enumerated, planes_of, spans
+from diffsim_ti.visual.painters import enumerated, planes_of, spans
 
 
 @dataclass(eq=False, repr=False)

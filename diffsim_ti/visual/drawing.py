@@ -13,13 +13,21 @@ from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.backdrop import Backdrop
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.colouring import Colouring, to_vertices
-from diffsim_ti.visual.glyphs import COLOURS, arrow_length, cones, glyphs, key_lines, longest
-from diffsim_ti.visual.legend import legend, write_key, write_text
+from diffsim_ti.visual.glyphs import (
+    COLOURS,
+    arrow_length,
+    cones,
+    glyphs,
+    key_lines,
+    legend,
+    longest,
+    write_key,
+    write_text,
+)
 from diffsim_ti.visual.surface import OBSTACLE, PLAIN, Soup, Surface, marks, with_edges
 
 if TYPE_CHECKING:
-    from diffsim_ti.visual.rasteriser import SoftwarePainter
-    from diffsim_ti.visual.vulkan_painter import VulkanPainter
+    from diffsim_ti.visual.painters import SoftwarePainter, VulkanPainter
 
 
 BACKENDS = ("auto", "vulkan", "software")
@@ -27,8 +35,7 @@ BACKENDS = ("auto", "vulkan", "software")
 
 def painter(backend: str, size: tuple[int, int]) -> "SoftwarePainter | VulkanPainter":
     """What paints triangles: "vulkan", "software" (NumPy, needs no driver), or "auto": Vulkan where there is a driver."""
-    from diffsim_ti.visual.rasteriser import SoftwarePainter
-    from diffsim_ti.visual.vulkan_painter import VulkanPainter, has_vulkan
+    from diffsim_ti.visual.painters import SoftwarePainter, VulkanPainter, has_vulkan
 
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
@@ -178,7 +185,7 @@ class Drawing(metaclass=Public):
 
         values: one per vertex or per tetrahedron (averaged to vertices), shown in colours with the legend of the
         colouring; without a colouring the first frame's values set it. obstacles: points of each obstacle, if they moved.
-        drawn: arrows, lines and points (terms/marks.py), with a key; see `scene_marks.marks_of`.
+        drawn: arrows, lines and points (terms/marks.py), with a key; see `frame.marks_of`.
         Raises ValueError for shapes that do not fit and for numbers that are not finite.
         """
         soup, shapes = self.soup(positions, values, None, obstacles, drawn)

@@ -6,8 +6,7 @@ import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import Arrows, Mark
-from diffsim_ti.visual.colouring import Colouring, to_vertices
-from diffsim_ti.visual.fields import field_named
+from diffsim_ti.visual.colouring import Colouring, field_named, to_vertices
 from diffsim_ti.visual.glyphs import arrow_length, ends, longest
 
 

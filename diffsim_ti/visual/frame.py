@@ -1,27 +1,27 @@
-"""A moment of a run, and what all of its moments share: what writers, films and windows are given."""
+"""A moment of a run, what is drawn of it, and what all of its moments share: what writers, films and windows are given."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
-from diffsim_ti.common.public import Public
+from diffsim_ti.common.public import Public, public
 from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
 from diffsim_ti.outputs import Output, Stress
-from diffsim_ti.outputs.applied_loads import AppliedLoads
 from diffsim_ti.outputs.deformation import Deformation
-from diffsim_ti.rollout.frames import Frames
+from diffsim_ti.outputs.forces_at_frames import AppliedLoads
+from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Gravity
-from diffsim_ti.terms.marks import Mark
+from diffsim_ti.terms.marks import Arrows, Mark, Moment, arrows
 from diffsim_ti.terms.obstacles.shapes import Triangles
-from diffsim_ti.visual.colouring import measured_fields
-from diffsim_ti.visual.fields import FIELDS
-from diffsim_ti.visual.scene_marks import marks_of
+from diffsim_ti.visual.colouring import FIELDS, measured_fields
+
+OF_A_RESULT = 200  # arrows that are drawn of one
 
 
 @dataclass(repr=False)
@@ -55,12 +55,12 @@ class Frame(metaclass=Public):
     """A moment of a run.
 
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
-    fields: numbers to colour by, one per vertex or per tetrahedron, under the names in fields.py: "displacement" [m],
+    fields: numbers to colour by, one per vertex or per tetrahedron, under the names in colouring.py: "displacement" [m],
     "speed" [m/s], "von_mises" [Pa], "energy_density" [J/m^3], "J" [-] ...; where the scene has loads, "loads" [N]: what
     tractions, pressures, gases, body and external forces, springs, cables and foundations do to each vertex, shape
     (num_vertices, 3).
     obstacles: points of each obstacle [m], or None where the setting has them. marks: arrows, lines and points that show
-    the scene's terms (scene_marks.py). units: {name of a field: its unit}, where known.
+    the scene's terms (`marks_of`). units: {name of a field: its unit}, where known.
     """
 
     time: float
@@ -171,3 +171,46 @@ def _loads(scene: Scene, positions: np.ndarray, step: int, values: dict) -> dict
     if scene.holds_volumes or not loads.any:
         return {}
     return {"loads": loads.forces(scene.inputs.derive(values), positions.astype(np.float64), step)}
+
+
+@public
+def marks_of(
+    scene: Scene, positions: np.ndarray, time: float = 0.0, step: int = 0, values: Mapping | None = None
+) -> list[Mark]:
+    """What the terms of a scene say that is drawn of them (`Term.drawn`) at positions [m], shape (num_vertices, 3).
+
+    time [s]; step: how many steps were done, for what is given for each: it shows those of the step that ends there.
+    values: {name of an input: value} of the run, default the scene's own.
+    """
+    x = np.asarray(positions, np.float64)
+    known, out = scene.inputs.at_times([time]) if values is None else values, []
+    for k, term in enumerate(scene.terms):
+        now = {}
+        for plain, name in scene.inputs.names_of(k).items():
+            if name in known:
+                now[plain] = _at(np.asarray(known[name]), scene.inputs.described[name].shapes, step)
+        out += term.drawn(Moment(scene.mesh, x, float(time), now))
+    return [mark for mark in out if not isinstance(mark, Arrows) or len(mark.points)]
+
+
+def _at(value: np.ndarray, shapes, step: int) -> np.ndarray:
+    """What of a value holds after so many steps."""
+    for rule in shapes:
+        if len(rule) == value.ndim and rule and rule[0] in ("steps", "steps + 1"):
+            return value[min(max(step - (rule[0] == "steps"), 0), len(value) - 1)]
+    return value
+
+
+def results_as_arrows(frame: "Frame", mesh, names: Sequence[str]) -> list[Mark]:
+    """Arrows of some of a frame's fields, vectors of all vertices. Raises ValueError for another name or shape."""
+    vectors = [name for name, value in frame.fields.items() if np.shape(value) == (mesh.num_vertices, 3)]
+    out = []
+    for name in names:
+        if name not in vectors:
+            known = ", ".join(vectors) or "none: pass such outputs to the Rollout"
+            raise ValueError(f"arrows: {name!r} must be a vector of each vertex that frames hold; they hold {known}")
+        unit = frame.units.get(name)
+        label = name.replace("_", " ") + (f" [{unit}]" if unit else "")
+        x, each = np.asarray(frame.positions, np.float64), range(mesh.num_vertices)
+        out.append(replace(arrows(label, mesh, x, each, frame.fields[name], OF_A_RESULT), through=True))
+    return [mark for mark in out if len(mark.points)]

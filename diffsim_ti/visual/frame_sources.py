@@ -12,12 +12,11 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms import ExternalForce
-from diffsim_ti.visual.colouring import Colouring, field_of, to_vertices
-from diffsim_ti.visual.dragging import Grip
+from diffsim_ti.visual.colouring import Colouring, field_named, field_of, to_vertices
 from diffsim_ti.visual.extent import Extent
-from diffsim_ti.visual.fields import field_named
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.visual.series import SavedSeries
+from diffsim_ti.visual.viewer import Grip
 
 if TYPE_CHECKING:
     from diffsim_ti.writers.adaptive_run import ForwardRun

@@ -1,23 +1,27 @@
-"""Reading a run that was saved as a series: a .pvd that lists .vtu files with their times (writers/paraview.py).
+"""A run that was saved as a series: a .pvd that lists .vtu files with their times (writers/paraview.py).
 
-Part 0 of a moment is the body, part 1 the obstacles, part 2 marks (series_marks.py); the list's attribute `ground` is the
-floor's height [m], `marks` are labels, `units` those of fields.
+Part 0 of a moment is the body, part 1 the obstacles, part 2 marks (terms/marks.py), which ParaView shows as lines, and as
+arrows by its filter Glyph; the list's attribute `ground` is the floor's height [m], `marks` are labels, `units` those of
+fields. Part 2 is of lines and of vertices: point data "vector" and "onto" (of arrows; 0 elsewhere), cell data "mark", the
+number of the label, and "kind": 0 arrow, 1 line, 2 point.
 """
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.marks import Arrows, Lines, Mark, Points
 from diffsim_ti.terms.obstacles.shapes import Triangles
-from diffsim_ti.visual.fields import FIELDS
+from diffsim_ti.visual.colouring import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.visual.series_marks import read_marks, read_part
 
 REMEDY = "take the .pvd that a run of diffsim-ti wrote"
+ARROW, LINE, POINT = range(3)
 
 
 def text_of(name: str) -> str:
@@ -110,3 +114,61 @@ class SavedSeries:
                 out.append((surface.points[used], corners.reshape(-1, 3)))
             self._read = file, out
         return self._read[1]
+
+
+def write_marks(path: Path, drawn: Sequence[Mark], labels: list[str]) -> None:
+    """Write marks, adding labels that are new to the list."""
+    import meshio
+
+    points, vectors, onto, rows, count = [], [], [], {}, 0  # rows: (cells, numbers, kinds) of each form of cells
+    for mark in drawn:
+        if mark.label not in labels:
+            labels.append(mark.label)
+        kind = LINE if isinstance(mark, Lines) else ARROW if isinstance(mark, Arrows) else POINT
+        x = mark.ends.reshape(-1, 3) if kind == LINE else mark.points
+        points.append(x)
+        vectors.append(mark.vectors if kind == ARROW else np.zeros_like(x))
+        onto.append(mark.onto if kind == ARROW else np.zeros(len(x), bool))
+        cells = np.arange(count, count + len(x)).reshape(-1, 2 if kind == LINE else 1)
+        own = cells, np.full(len(cells), labels.index(mark.label)), np.full(len(cells), kind)
+        rows.setdefault("line" if kind == LINE else "vertex", []).append(own)
+        count += len(x)
+    joined = [[np.concatenate(part) for part in zip(*of)] for of in rows.values()]
+    cells, numbers, kinds = map(list, zip(*joined))
+    point_data = dict(vector=np.concatenate(vectors).astype(float), onto=np.concatenate(onto).astype(np.uint8))
+    saved = meshio.Mesh(np.concatenate(points), list(zip(rows, cells)), point_data, dict(mark=numbers, kind=kinds))
+    saved.write(path, file_format="vtu", binary=True)
+
+
+def read_part(path: Path, *names: str):
+    """The meshio mesh of one file of a series. Raises ValueError, with its name, if it is missing or damaged, or holds no
+    data of those names."""
+    import meshio
+
+    try:
+        saved = meshio.vtu.read(path)  # meshio.read prints and exits
+        for name in names:
+            if name not in saved.point_data and name not in saved.cell_data:
+                raise ValueError(f"must hold {name!r}, has {sorted([*saved.point_data, *saved.cell_data])}")
+        return saved
+    except Exception as error:  # meshio lets those of its parsers through
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path}, a file of the series, cannot be read: {reason}; write the series again") from error
+
+
+def read_marks(path: Path, labels: Sequence[str]) -> list[Mark]:
+    """What `write_marks` wrote; those of one label and kind are one."""
+    saved, out = read_part(path, "vector", "mark", "kind"), []
+    for block, number, kind in zip(saved.cells, saved.cell_data["mark"], saved.cell_data["kind"]):
+        for which, how in np.unique(np.stack([number, kind], 1), axis=0):
+            own = block.data[(number == which) & (kind == how)]
+            label, x = labels[which], saved.points[own]
+            if how == LINE:
+                out.append(Lines(label, x))
+            elif how == POINT:
+                out.append(Points(label, x[:, 0]))
+            else:
+                own = own[:, 0]
+                onto = saved.point_data["onto"][own].astype(bool)
+                out.append(Arrows(label, x[:, 0], saved.point_data["vector"][own], onto))
+    return out

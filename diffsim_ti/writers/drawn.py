@@ -1,16 +1,18 @@
-"""What pictures and films share: frames wait in a temporary file until the camera and the colours that fit all are known."""
+"""Pictures (PNG, JPEG) and films (MP4, GIF): frames wait in a temporary file until the camera and the colours that fit all
+are known."""
 
 import pickle
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.extent import Extent
-from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.visual.scene_marks import results_as_arrows
-from diffsim_ti.writers.writer import Writer
+from diffsim_ti.visual.frame import Frame, Setting, results_as_arrows
+from diffsim_ti.writers.writer import View, Writer, file_of, numbered, register
 
 
 class DrawnWriter(Writer):
@@ -52,3 +54,80 @@ class DrawnWriter(Writer):
                 marks = pickle.load(self._waiting)
                 title = f"{view.title}, " * bool(view.title) + f"t = {float(time):.3f} s"
                 yield drawing.image(positions, values, title, points, marks)
+
+
+@register
+class PictureWriter(DrawnWriter):
+    """Draws the last frame when it is closed, or, for a name such as "run_%04d.png", every frame, numbered from 0.
+
+    Raises ValueError for a name with a % that is no place for a number.
+    """
+
+    suffixes = (".png", ".jpg", ".jpeg")
+    usual_size = (1200, 900)
+
+    def __init__(self, path: str | Path, view: View | None = None):
+        super().__init__(path, view)
+        self.numbered = numbered(self.path)
+
+    def write(self, frame: Frame) -> None:
+        if not self.numbered:  # only the last one waits
+            self._waiting.seek(0)
+            self._waiting.truncate()
+            self.count = 0
+            if self.view.fit == "end":
+                self._extent = None
+        super().write(frame)
+
+    def close(self) -> None:
+        from PIL import Image
+
+        for k, image in enumerate(self.images() if self.count else ()):
+            Image.fromarray(image).save(file_of(self.path, k) if self.numbered else self.path)
+        self._waiting.close()
+
+    def describe(self) -> str:
+        return super().describe() if self.numbered else str(self.path)
+
+
+@register
+class FilmWriter(DrawnWriter):
+    """Draws a film when it is closed; a GIF keeps time in steps of 10 ms.
+
+    Raises ValueError for an odd size of an MP4, RuntimeError if its encoder is not installed.
+    """
+
+    suffixes = (".mp4", ".gif")
+
+    def __init__(self, path: str | Path, view: View | None = None):
+        super().__init__(path, view)
+        check_film(self.path, self.view.size or self.usual_size)
+
+    def close(self) -> None:
+        if self.count:
+            with encoder(self.path, self.view.fps) as film:
+                for image in self.images():
+                    film.append_data(image)
+        self._waiting.close()
+
+
+def check_film(path: Path, size: tuple[int, int]) -> None:
+    """Raise if a film of that size cannot be written there, before it is drawn."""
+    if path.suffix.lower() != ".mp4":
+        return
+    if size[0] % 2 or size[1] % 2:
+        raise ValueError(f"size: must be even for .mp4, got {tuple(size)}; try 640 480")
+    try:
+        import imageio_ffmpeg  # noqa: F401
+    except ImportError as error:
+        raise RuntimeError("MP4 needs imageio-ffmpeg: pip install 'diffsim-ti[film]', or write a .gif") from error
+
+
+def encoder(path: Path, fps: float) -> Any:
+    """What takes the pictures of a film, or one picture, through `append_data`."""
+    import imageio.v2 as imageio
+
+    suffix = path.suffix.lower()
+    if suffix == ".mp4":
+        return imageio.get_writer(path, format="FFMPEG", fps=fps, macro_block_size=2)
+    return imageio.get_writer(path, duration=1000 / fps, loop=0) if suffix == ".gif" else imageio.get_writer(path)

@@ -1,7 +1,7 @@
 """A series that ParaView opens: one .vtu per frame, and a .pvd that lists them with their times (visual/series.py reads it).
 
 Part 0 of a moment is the body, part 1 the obstacles, part 2 arrows and lines that show loads and the like
-(visual/series_marks.py); the list's attribute `ground` is the floor's height [m], `marks` are the labels of part 2.
+(visual/series.py); the list's attribute `ground` is the floor's height [m], `marks` are the labels of part 2.
 """
 
 import json
@@ -11,10 +11,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from diffsim_ti.visual.fields import FIELDS
+from diffsim_ti.visual.colouring import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.visual.series import listed, text_of
-from diffsim_ti.visual.series_marks import write_marks
+from diffsim_ti.visual.series import listed, text_of, write_marks
 from diffsim_ti.writers.writer import Writer, register
 
 PER_TETRAHEDRON = ("von_mises", "energy_density", "J")

@@ -9,8 +9,8 @@ from diffsim_ti.common.public import Public, public
 from diffsim_ti.rollout import Frames
 from diffsim_ti.scene import Scene
 from diffsim_ti.visual.camera import Camera
+from diffsim_ti.visual.colouring import field_named
 from diffsim_ti.visual.drawing import BACKENDS
-from diffsim_ti.visual.fields import field_named
 from diffsim_ti.visual.frame import Frame, Setting
 
 WRITERS: dict[str, type["Writer"]] = {}
@@ -20,7 +20,7 @@ WRITERS: dict[str, type["Writer"]] = {}
 class View(metaclass=Public):
     """How a run is shown, for formats that draw it.
 
-    colour: a name in visual/fields.py; None for von Mises stress where frames hold it, else displacement. fps: frames per
+    colour: a name in visual/colouring.py; None for von Mises stress where frames hold it, else displacement. fps: frames per
     second of a film; size: width and height [pixels], None for what suits the format. camera, or azimuth and elevation
     [degrees] of one that sees all; ground: height of a floor [m] instead of the setting's own; wireframe: draw edges;
     backend: "software", "vulkan" or "auto"; title: words before the time. arrows: names of fields that are vectors of

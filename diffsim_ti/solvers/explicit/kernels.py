@@ -9,8 +9,8 @@ from diffsim_ti.mechanics.obstacles.outside_work import with_drag
 from diffsim_ti.mechanics.reduced.body_adjoint import BodyStage
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
-from diffsim_ti.solvers.explicit.item_forces import ItemForces
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
+from diffsim_ti.solvers.explicit.vertex_parts import ItemForces
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, adjoints, needed, with_state
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
@@ -189,7 +189,8 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra(e, j, scene, state, table, plan)
             else:
-                self.act(e - plan.num_items, j, scene, state, table, plan)
+                i, b, now, own, at_ = self.scene_at(e - plan.num_items, j, scene, state, table, plan)
+                self.items.forces(i, now, own, at_, (j - plan.base) * plan.stride, plan)
         else:
             self.tetrahedra(e, j, scene, state, table, plan)
 
@@ -202,16 +203,6 @@ class ExplicitKernels:
             self.element.move_on(item, of, state, s, s + plan.stride, self.onwards(now))
 
     @ti.func
-    def act(self, k, j, scene: A, state: A, table: A, plan: A):
-        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
-        self.items.forces(i, now, own, at_, (j - plan.base) * plan.stride, plan)
-
-    @ti.func
-    def at_vertex(self, k, j, scene: A, state: A, table: A, plan: A):
-        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
-        self.vertex.step(i, j, self.on(now, own), own, at_, plan)
-
-    @ti.func
     def passes(self, scene: A, state: A, table: A, plan: A):
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
@@ -220,10 +211,12 @@ class ExplicitKernels:
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
                     self.elements(e, plan.first + turn, scene, state, table, plan)
-            for i in range(num_vertices):
-                turn = self.turn_of_second(i, table, plan)
+            for k in range(num_vertices):
+                turn = self.turn_of_second(k, table, plan)
                 if turn < plan.count:
-                    self.at_vertex(i, plan.first + turn, scene, state, table, plan)
+                    j = plan.first + turn
+                    i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+                    self.vertex.step(i, j, self.on(now, own), own, at_, plan)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
                     now = self.on(self.numbers_of(0, plan.first, table, plan), scene)
@@ -253,7 +246,8 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
             else:
-                self.act_jvp(e - plan.num_items, j, scene, state, tangent, table, plan)
+                i, b, now, own, at_ = self.scene_at(e - plan.num_items, j, scene, state, table, plan)
+                self.items.forces_jvp(i, now, own, at_, j - plan.base, self.record_of(b, tangent, plan), plan)
         else:
             self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
 
@@ -266,17 +260,6 @@ class ExplicitKernels:
             self.element.move_on_jvp(item, of, state, s, tangent, dots, self.onwards(now))
 
     @ti.func
-    def act_jvp(self, k, j, scene: A, state: A, tangent: A, table: A, plan: A):
-        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
-        self.items.forces_jvp(i, now, own, at_, j - plan.base, self.record_of(b, tangent, plan), plan)
-
-    @ti.func
-    def at_vertex_jvp(self, k, j, scene: A, state: A, tangent: A, table: A, plan: A):
-        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
-        change, rated = self.record_of(b, tangent, plan), self.rated(b, tangent, plan)
-        self.vertex.step_jvp(i, j, self.counted(now), own, at_, change, rated)
-
-    @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
         if ti.static(self.parallel):
             num_items, num_vertices = self.after(plan), self.num_vertices(plan)
@@ -284,10 +267,13 @@ class ExplicitKernels:
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
                     self.elements_jvp(e, plan.first + turn, scene, state, tangent, table, plan)
-            for i in range(num_vertices):
-                turn = self.turn_of_second(i, table, plan)
+            for k in range(num_vertices):
+                turn = self.turn_of_second(k, table, plan)
                 if turn < plan.count:
-                    self.at_vertex_jvp(i, plan.first + turn, scene, state, tangent, table, plan)
+                    j = plan.first + turn
+                    i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+                    change, rated = self.record_of(b, tangent, plan), self.rated(b, tangent, plan)
+                    self.vertex.step_jvp(i, j, self.counted(now), own, at_, change, rated)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
                     now = self.counted(self.numbers_of(0, plan.first, table, plan))
@@ -319,7 +305,8 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
             else:
-                self.act_vjp(e - plan.num_items, j, scene, state, adjoint, table, plan)
+                i, b, now, own, at_ = self.scene_at(e - plan.num_items, j, scene, state, table, plan)
+                self.items.forces_vjp(i, now, own, at_, j - plan.base, self.record_of(b, adjoint, plan), plan)
         else:
             self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
 
@@ -333,16 +320,6 @@ class ExplicitKernels:
         self.element.forces_vjp(
             item, of, state, s, adjoint.w, adjoint.corner, adjoint, self.vertex.features.shape, self.element.has_state
         )
-
-    @ti.func
-    def act_vjp(self, k, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
-        self.items.forces_vjp(i, now, own, at_, j - plan.base, self.record_of(b, adjoint, plan), plan)
-
-    @ti.func
-    def at_vertex_vjp(self, k, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
-        self.vertex.step_vjp(i, j, self.back(now, j, plan), own, at_, self.record_of(b, adjoint, plan), plan)
 
     @ti.func
     def fold(self, k, first, last, adjoint: A, table: A, plan: A):
@@ -361,10 +338,13 @@ class ExplicitKernels:
                 for b in range(plan.num_bodies):
                     now = self.back(self.numbers_of(0, plan.first, table, plan), plan.first, plan)
                     self.bodies.step_vjp(b, plan.first, now, scene, state, adjoint, plan)
-            for i in range(num_vertices):
-                turn = self.turn_of_first(i, table)
+            for k in range(num_vertices):
+                turn = self.turn_of_first(k, table)
                 if turn < plan.count:
-                    self.at_vertex_vjp(i, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
+                    j = plan.first + plan.count - 1 - turn
+                    i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
+                    by = self.record_of(b, adjoint, plan)
+                    self.vertex.step_vjp(i, j, self.back(now, j, plan), own, at_, by, plan)
             for e in range(num_items):
                 turn = self.turn_of_second(e, table, plan)
                 if turn < plan.count:

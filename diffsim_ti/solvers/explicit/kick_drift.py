@@ -107,6 +107,22 @@ class KickDrift(VertexParts):
             out = self.sliding_supports.held(i, u_prescribed - u, scene)
         return out
 
+    @ti.func
+    def driven(self, i, u, v, u_next, v_next, now: A, scene: A, of: A):
+        """(u', v') where motion is prescribed, or their changes; of: the scene, or its tangent."""
+        k = self.prescribed(i, scene)
+        if ti.static(self.features.partly_fixed):
+            u_prescribed, v_prescribed = self.sliding_supports.given(k, u, v, now, of)
+            u_next = self.sliding_supports.end(i, k, u_next, u_prescribed, scene)
+            v_next = self.sliding_supports.end(i, k, v_next, v_prescribed, scene)
+        elif k >= 0:
+            u_next, v_next = u, v
+            if now.alpha > 0:
+                change = of.motion[now.next, k] - of.motion[now.row, k]
+                u_next = of.anchor[k] + of.motion[now.row, k] + now.end * change
+                v_next = now.per_step * change
+        return u_next, v_next
+
     # ---- the pass ----------------------------------------------------------------------------------------------------
 
     @ti.func
@@ -149,22 +165,8 @@ class KickDrift(VertexParts):
         if ti.static(self.features.num_staged > 0):
             lead = self.lead(i, u, v, now, scene, scene)
             u_next, v_next = self.contact.advance(i, u, v_plus, lead, now, scene, state, plan)
-        # prescribed motion
-        if ti.static(self.features.partly_fixed):
-            k = self.prescribed(i, scene)
-            u_prescribed, v_prescribed = self.sliding_supports.given(k, u, v, now, scene)
-            u_next, v_next = (
-                self.sliding_supports.end(i, k, u_next, u_prescribed, scene),
-                self.sliding_supports.end(i, k, v_next, v_prescribed, scene),
-            )
-        elif ti.static(self.features.motion):
-            k = self.prescribed(i, scene)
-            if k >= 0:
-                u_next, v_next = u, v
-                if now.alpha > 0:
-                    change = scene.motion[now.next, k] - scene.motion[now.row, k]
-                    u_next = scene.anchor[k] + scene.motion[now.row, k] + now.end * change
-                    v_next = now.per_step * change
+        if ti.static(self.features.partly_fixed or self.features.motion):
+            u_next, v_next = self.driven(i, u, v, u_next, v_next, now, scene, scene)
         if ti.static(len(self.features.groups) > 0):
             if scene.surface[i] > 0:
                 self.obstacles.note(i, u, u_next, now, scene, state)
@@ -232,20 +234,8 @@ class KickDrift(VertexParts):
             du_next, dv_next = self.contact.advance_jvp(
                 i, u, state.u[t, i] - u, before, du, dv_plus, lead, dlead, now, scene, state, tangent, plan
             )
-        # prescribed motion
-        if ti.static(self.features.partly_fixed):
-            k = self.prescribed(i, scene)
-            u_prescribed, v_prescribed = self.sliding_supports.given(k, du, dv, now, tangent)
-            du_next = self.sliding_supports.end(i, k, du_next, u_prescribed, scene)
-            dv_next = self.sliding_supports.end(i, k, dv_next, v_prescribed, scene)
-        elif ti.static(self.features.motion):
-            k = self.prescribed(i, scene)
-            if k >= 0:
-                du_next, dv_next = du, dv
-                if now.alpha > 0:
-                    change = tangent.motion[now.next, k] - tangent.motion[now.row, k]
-                    du_next = tangent.anchor[k] + tangent.motion[now.row, k] + now.end * change
-                    dv_next = now.per_step * change
+        if ti.static(self.features.partly_fixed or self.features.motion):
+            du_next, dv_next = self.driven(i, du, dv, du_next, dv_next, now, scene, tangent)
         tangent.u[0, i] = du_next
         tangent.v[0, i] = dv_next
 

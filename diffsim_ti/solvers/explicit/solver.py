@@ -22,12 +22,10 @@ from diffsim_ti.mechanics.reduced.body_checks import check_bodies, meets_between
 from diffsim_ti.mechanics.reduced.projected_sets import ProjectedSets
 from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import Workspace
-from diffsim_ti.monitor.energy_balance import EnergyBalance
-from diffsim_ti.monitor.own_work import OwnWork
-from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
+from diffsim_ti.monitor.energy_balance import EnergyBalance, OwnWork
+from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.explicit.stages import stages_of
-from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.pass_table import PassTable

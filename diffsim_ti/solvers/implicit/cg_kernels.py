@@ -143,10 +143,10 @@ class CGKernels:
         return out
 
     @ti.func
-    def multiply(self, c, cg: A, at: A, plan: A):
-        """A p, and p . A p, p . p, A p . A p of a chunk."""
+    def multiply(self, c, begin, end, cg: A, at: A):
+        """A p, and p . A p, p . p, A p . A p of chunk c, which has the vertices from `begin` up to `end`."""
         curvature, pp, qq = ti.cast(0, self.fp), ti.cast(0, self.fp), ti.cast(0, self.fp)
-        for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
+        for i in range(begin, end):
             p = cg.p[0, i]
             q = p * cg.mass[i] + self.to(self.fp, at.y[0, i]) * ti.cast(-1, self.fp)
             if ti.static(self.more):
@@ -176,7 +176,7 @@ class CGKernels:
     def advance(self, cg: A, at: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
-            self.multiply(c, cg, at, plan)
+            self.multiply(c, c * plan.length, ti.min((c + 1) * plan.length, plan.nodes), cg, at)
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.choose(cg, plan)

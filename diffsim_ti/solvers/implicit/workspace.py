@@ -19,7 +19,7 @@ from diffsim_ti.mechanics.stress.law_state import LawStateKernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
 from diffsim_ti.mechanics.surfaces.pair_shares import PairShares
-from diffsim_ti.monitor.energy_watch import EnergyWatch
+from diffsim_ti.monitor.energy_balance import EnergyWatch
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.implicit.closing import Closing

@@ -1,0 +1,162 @@
+"""The pressure in a chamber, and how much a surface of the body encloses."""
+
+from copy import copy
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.common.checked import wholes
+from diffsim_ti.mechanics.chambers.pressures import law_of, rows_of
+from diffsim_ti.mesh.enclosure import Enclosure, open_edges
+from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.scene import Scene
+from diffsim_ti.terms import Chamber
+
+
+class ChamberPressure(Output):
+    """Pressure [Pa] of a chamber on the body, shape (frames,): of a gas p - p_out, of an incompressible fluid the
+    multiplier of its volume.
+
+    chamber: its name, or the term as the scene lists it. name: how a loss calls it.
+
+    That of a gas is at the frame's positions, its amount that of the step that ends there. That of a `FilledChamber` is of
+    the last substep before the frame, and 0 in the first one.
+    The gradient is exact by all inputs.
+
+    Raises ValueError for a chamber that the scene has not.
+    Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 8.5.2,
+    doi:10.1017/CBO9780511755446.
+    """
+
+    reads_chamber_pressures = True
+
+    def __init__(self, chamber: Chamber | str, name: str = "chamber_pressure"):
+        self.chamber, self.name = chamber, name
+
+    def __repr__(self) -> str:
+        return f"ChamberPressure({self.chamber!r}, name={self.name!r})"
+
+    def settled(self, scene: Scene) -> "ChamberPressure":
+        out = copy(self)
+        chambers = scene.terms_of(Chamber)
+        out.place, out.inputs = scene.place_among(chambers, self.chamber, "chamber"), scene.inputs
+        chamber = chambers[out.place]
+        out.law, out.enclosure, (out.rows,) = law_of(chamber), chamber.enclosure, rows_of(scene, [chamber])
+        return out
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        return (num_frames,)
+
+    @staticmethod
+    def _at(step: int, rows: np.ndarray) -> tuple[int, int]:
+        """Of rows of numbers, which one and which end of its step a frame shows."""
+        return min(max(step - 1, 0), len(rows) - 1), 1 if step else 0
+
+    def _numbers(self, step: int, follower: np.ndarray) -> np.ndarray:
+        row, end = self._at(step, follower)
+        return follower[row, self.rows, end]
+
+    def _volumes(self, frames) -> list[float]:
+        return [self.enclosure.volume(x.astype(np.float64)) for x in frames.positions]
+
+    def value(self, frames: Frames) -> np.ndarray:
+        if self.law.holds:
+            return frames.chamber_pressures[:, self.place].copy()
+        follower, out = self.inputs.derive(frames.inputs).follower, []
+        for step, V in zip(frames.steps, self._volumes(frames)):
+            self.law.at(self._numbers(int(step), follower), 1.0)
+            out.append(self.law.pressure(V))
+        return np.array(out)
+
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
+        if self.law.holds:
+            zero = np.zeros(len(frames.positions))
+            return zero if change.chamber_pressures is None else change.chamber_pressures[:, self.place]
+        follower = self.inputs.derive(frames.inputs).follower
+        moved = self.inputs.derive_jvp(frames.inputs, change.inputs).follower
+        out = []
+        for k, (step, V) in enumerate(zip(frames.steps, self._volumes(frames))):
+            self.law.at(self._numbers(int(step), follower), 1.0)
+            out.append(self.law.by_numbers(V) @ self._numbers(int(step), moved))
+            if change.positions is not None:
+                G = self.enclosure.gradient(frames.positions[k].astype(np.float64))
+                out[-1] += self.law.slope(V) * (G * change.positions[k]).sum()
+        return np.array(out)
+
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
+        if self.law.holds:
+            out = np.zeros(frames.chamber_pressures.shape)
+            out[:, self.place] = seed
+            return Change(chamber_pressures=out)
+        derived, positions = self.inputs.derive(frames.inputs), np.zeros(frames.positions.shape)
+        adj = derived.zeros()
+        for k, (step, V) in enumerate(zip(frames.steps, self._volumes(frames))):
+            self.law.at(self._numbers(int(step), derived.follower), 1.0)
+            row, end = self._at(int(step), adj.follower)
+            adj.follower[row, self.rows, end] += seed[k] * self.law.by_numbers(V)
+            G = self.enclosure.gradient(frames.positions[k].astype(np.float64))
+            positions[k] = seed[k] * self.law.slope(V) * G
+        return Change(positions=positions, inputs=self.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs)))
+
+
+class EnclosedVolume(Output):
+    """Volume [m^3] within a closed surface of the body, shape (frames,), positive where its normals point outwards.
+
+        V = 1/6 sum over triangles of a . (b x c),        a, b, c the corners, counted from the first vertex
+
+    and with ten-node tetrahedra what curved faces enclose (mesh/enclosure.py).
+
+    triangles: vertex indices, shape (k, 3), or (k, 6) of whole faces with ten-node tetrahedra (`mesh.surface_faces`), of a
+        surface that is closed and turned one way, such as that of a cavity, whose normals then point into the body and V is
+        negative unless they are turned; None: the body's whole surface, so that V is the volume of the body itself.
+    name: how a loss calls it.
+    Raises ValueError for a surface with an open edge, or one whose triangles are not turned one way.
+    Mirtich 1996, Fast and accurate computation of polyhedral mass properties, doi:10.1080/10867651.1996.10487458.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.EnclosedVolume()]).forward()
+    >>> frames["volume"].round(4).tolist()  # before and under its weight
+    [1.0, 0.9691]
+    """
+
+    def __init__(self, triangles: ArrayLike | None = None, name: str = "volume"):
+        self.triangles, self.name = None if triangles is None else wholes("EnclosedVolume: triangles", triangles), name
+        if self.triangles is not None and (self.triangles.ndim != 2 or self.triangles.shape[1] not in (3, 6)):
+            raise ValueError(f"EnclosedVolume: triangles must have shape (k, 3) or (k, 6), got {self.triangles.shape}")
+
+    def settled(self, scene: Scene) -> "EnclosedVolume":
+        out, n = copy(self), scene.mesh.num_vertices
+        faces = scene.mesh.surface_faces if self.triangles is None else self.triangles
+        if faces.size == 0 or faces.min() < 0 or faces.max() >= n:
+            raise ValueError(f"EnclosedVolume: triangles must name vertices 0 .. {n - 1}")
+        if faces.shape[1] != scene.mesh.surface_faces.shape[1]:
+            raise ValueError(
+                f"EnclosedVolume: faces of this mesh have {scene.mesh.surface_faces.shape[1]} vertices, got "
+                f"{faces.shape[1]}: take whole faces, as mesh.surface_faces and mesh.faces_of(...) give them; columns "
+                "[0, 2, 1, 5, 4, 3] turn one of six round"
+            )
+        out.enclosure, rim = Enclosure(faces, [], None), open_edges(faces[:, :3], n)
+        if len(rim):
+            raise ValueError(
+                f"EnclosedVolume: the surface is open, or turned two ways, at the edge of vertices {rim[0].min()} and "
+                f"{rim[0].max()}: each edge must belong to two triangles, once in each direction"
+            )
+        return out
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        return (num_frames,)
+
+    def value(self, frames: Frames) -> np.ndarray:
+        return np.array([-self.enclosure.volume(x) for x in frames.positions.astype(np.float64)])
+
+    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
+        if change.positions is None:
+            return np.zeros(len(frames.positions))
+        by = self.vjp(frames, np.ones(len(frames.positions))).positions
+        return (by * change.positions).sum((1, 2))
+
+    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
+        gradients = [-s * self.enclosure.gradient(x) for s, x in zip(seed, frames.positions.astype(np.float64))]
+        return Change(positions=np.stack(gradients))  # a closed surface: where it counts from adds nothing

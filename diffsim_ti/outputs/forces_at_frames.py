@@ -1,0 +1,259 @@
+"""Forces at the states that frames show, with derivatives, for outputs: of loads, and of the body's own stress."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
+from diffsim_ti.mechanics.host_force import HostForces, Instant
+from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
+from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.runtime import Kernel
+from diffsim_ti.state.arrays import SceneArrays
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, Adjoint, Tangent, with_state
+from diffsim_ti.state.schedule import EqualSteps
+from diffsim_ti.terms import Chamber, Gravity, Growth
+
+STEPS = EqualSteps(1.0, 1)  # a pass for each step
+A = ti.template()
+STATE = dict(u="vectors2", v="vectors2")
+CORNERS = dict(corner="vectors", rate_corner="vectors")
+
+
+def at_end(step: int, begins: bool = False) -> Instant:
+    """That of a frame after so many steps."""
+    return Instant(STEPS, max(step - 1, 0), float(step > 0 and not begins))
+
+
+class AppliedLoads:
+    """Forces [N], shape (num_vertices, 3): weight, dead loads and those of interactions, after so many steps: those of the
+    last of these as it ends; with `begins`, as it begins.
+
+    moving: with those that read velocities v [m/s], which `forces`, `jvp` and `vjp` then are to be told.
+    held: the pressures [Pa] of the scene's chambers in a frame, of which those are taken that hold a volume.
+    """
+
+    def __init__(self, scene, weight: bool = True, moving: bool = False):
+        self.elements, self.num_chambers = scene.mesh.elements, len(scene.terms_of(Chamber))
+        self.hosts = HostForces(force for force in host_forces(scene) if moving or not force.reads_velocities)
+        self.filled = self.hosts.only(HeldPressure)
+        gravity = scene.term(Gravity) if weight else None
+        self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
+        self.dead = scene.interaction(DeadLoads)
+
+    @property
+    def any(self) -> bool:
+        """Whether there is one."""
+        return bool(self.hosts) or self.gravity is not None or self.dead is not None
+
+    @staticmethod
+    def _row(step: int, rows: np.ndarray) -> np.ndarray:
+        return rows[min(max(step - 1, 0), len(rows) - 1)]
+
+    def _dead(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
+        """Of rows of loads, or of their adjoints, those that a frame shows (inputs/loads.py), as a view."""
+        row = self._row(step, rows)
+        return row[1 if step and not begins else 0 :: 2] if self.dead.keyed else row
+
+    def _masses(self, derived: Derived) -> np.ndarray:
+        """What gravity acts on, shape (num_vertices,), or its change."""
+        if derived.element_masses is None:
+            return derived.mass
+        return np.bincount(self.elements.ravel(), derived.element_masses.sum(2).ravel(), len(derived.mass))
+
+    def _hosts(self, derived: Derived, x, step: int, begins: bool, held, v) -> HostForces:
+        """As they are in a frame."""
+        instant = at_end(step, begins)
+        if v is not None:
+            instant = replace(instant, origin=x - derived.rest - v, gamma=1.0)
+        hosts = self.hosts.take(derived, instant)
+        if self.filled and held is not None:
+            for law, k in zip(self.filled.laws, self.filled.places):
+                law.multiplier = float(held[k])  # without a penalty, gamma: the pressure whatever the volume
+        return hosts
+
+    def held_jvp(self, x: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Change of the forces for that of the pressures of constrained volumes."""
+        return sum(change[k] * push for k, push in self._unit_forces(x))
+
+    def held_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Adjoint of the pressures of all chambers, zero of gases, for that of the forces."""
+        out = np.zeros(self.num_chambers)
+        for k, push in self._unit_forces(x):
+            out[k] = float((push * w).sum())
+        return out
+
+    def _unit_forces(self, x: np.ndarray) -> list:
+        """(place of a chamber that holds a volume, forces of 1 Pa in it) of each."""
+        places = self.filled.places if self.filled else []
+        return [(place, self.filled.unit_forces(x - self.filled.rest, k)) for k, place in enumerate(places)]
+
+    def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False, held=None, v=None) -> np.ndarray:
+        """At places x [m] after so many steps."""
+        out = np.zeros(x.shape)
+        if self.gravity is not None:
+            out += self._masses(derived)[:, None] * derived.parameters[self.gravity][:3]
+        if self.dead:
+            out[self.dead.acts_at] += self._dead(step, derived.forces, begins)
+        return out + self._hosts(derived, x, step, begins, held, v).forces(x - derived.rest)
+
+    def jvp(self, derived, moved, x, dx, step: int, begins: bool = False, held=None, v=None, dv=0.0) -> np.ndarray:
+        """Their change, at frozen pressures."""
+        out = np.zeros(x.shape)
+        if self.gravity is not None:
+            g, dg = (of.parameters[self.gravity][:3] for of in (derived, moved))
+            out += self._masses(moved)[:, None] * g + self._masses(derived)[:, None] * dg
+        if self.dead:
+            out[self.dead.acts_at] += self._dead(step, moved.forces, begins)
+        hosts = self._hosts(derived, x, step, begins, held, v)
+        return out + hosts.jvp(x - derived.rest, dx - moved.rest, dv + np.zeros_like(dx), moved)
+
+    def vjp(self, derived, x, w, step: int, adj: Derived, begins: bool = False, held=None, v=None) -> tuple:
+        """Adjoints of x and v for that of the forces; adds those of all else, but for held pressures, to `adj`."""
+        if self.gravity is not None:
+            by_mass = w @ derived.parameters[self.gravity][:3]
+            if derived.element_masses is None:
+                adj.mass += by_mass
+            else:
+                adj.element_masses += by_mass[self.elements][:, :, None]
+            adj.parameters[self.gravity.start : self.gravity.start + 3] += self._masses(derived) @ w
+        if self.dead:
+            self._dead(step, adj.forces, begins)[:] += w[self.dead.acts_at]
+        by_u, by_v = self._hosts(derived, x, step, begins, held, v).vjp(x - derived.rest, w, adj)
+        adj.rest -= by_u
+        return by_u, by_v
+
+
+@dataclass(frozen=True)
+class BodyForceKernels:
+    """At the displacement and velocity in slot 0 of `at`."""
+
+    law: object
+    features: Features
+    lanes: bool
+
+    @cached_property
+    def element(self):
+        return functions_of(self.law, self.features, self.lanes)
+
+    def _kernel(self, name: str, body, **arrays) -> Kernel:
+        own = (
+            dict(scene=SCENE, at=with_state(STATE, self.law), out=CORNERS | dict(y="vectors2", y_rate="vectors2"))
+            | arrays
+        )
+        return Kernel(name, body, self.law.precision, own, dict(num_items="int", num_vertices="int"))
+
+    @ti.func
+    def all_forces(self, scene: A, at: A, out: A, plan: A):
+        for e in range(plan.num_items):
+            self.element.forces(e, scene, at, 0, out.corner)
+        for i in range(plan.num_vertices):
+            out.y[0, i] = self.element.gather(i, scene, out.corner)
+
+    @cached_property
+    def forces(self) -> Kernel:
+        return self._kernel("body_forces", self.all_forces)
+
+    @ti.func
+    def all_jvp(self, scene: A, at: A, out: A, change: A, tangent: A, plan: A):
+        for e in range(plan.num_items):
+            self.element.forces_jvp(e, scene, at, 0, change, out.corner, tangent)
+        for i in range(plan.num_vertices):
+            out.y[0, i] = self.element.gather(i, scene, out.corner)
+
+    @cached_property
+    def jvp(self) -> Kernel:
+        change = with_state(STATE, self.law)
+        return self._kernel("body_forces_jvp", self.all_jvp, change=change, tangent=TANGENT)
+
+    @ti.func
+    def all_vjp(self, scene: A, at: A, out: A, seed: A, adjoint: A, plan: A):
+        for e in range(plan.num_items):
+            self.element.forces_vjp(e, scene, at, 0, seed.w, out.corner, adjoint, True)
+        for i in range(plan.num_vertices):
+            out.y[0, i] = self.element.gather(i, scene, out.corner)
+            if ti.static(self.element.reads_rates):
+                out.y_rate[0, i] = self.element.gather(i, scene, out.rate_corner)
+
+    @cached_property
+    def vjp(self) -> Kernel:
+        own = with_state(ADJOINT | dict(rate_corner="vectors"), self.law)
+        return self._kernel("body_forces_vjp", self.all_vjp, seed=dict(w="vectors2"), adjoint=own)
+
+
+class BodyForces:
+    """Forces -dE/du [N] of stress, shape (num_vertices, 3), at the states that frames show, for outputs of any law."""
+
+    def __init__(self, scene):
+        if scene.term(Growth):
+            raise ValueError(
+                "forces of the body at frames do not support Growth over time; take Grown(material, growth)"
+            )
+        self.scene, self.arrays = scene, SceneArrays(scene)
+        a = self.arrays
+        self.at, self.change, self.out = (
+            SimpleNamespace(**{name: runtime.array(a.vector, 1, a.num_vertices) for name in names})
+            for names in (("u", "v", "w"), ("u", "v"), ("y", "y_rate"))
+        )
+        self.at.z, self.change.z, self.out.z = (a.law_states(1) for _ in range(3))
+        self.out.corner, self.out.rate_corner = (runtime.array(a.vector, *a.corner.shape) for _ in range(2))
+
+    def load(self, values: dict) -> Derived:
+        """The numbers of a run; what kernels read of them."""
+        derived = self.scene.inputs.derive(values)
+        self.arrays.load(derived)
+        a = self.arrays
+        self.kernels = runtime.kernels_of(BodyForceKernels, a.law, a.features(True, True), a.in_lanes)
+        return derived
+
+    def _run(self, name: str, **records) -> np.ndarray:
+        a = self.arrays
+        launch = getattr(self.kernels, name).bind(a.in_vectors, scene=a, at=self.at, out=self.out, **records)
+        launch(num_items=a.num_items, num_vertices=a.num_vertices)
+        return runtime.fetch_row(self.out.y, 0)
+
+    def place(self, u: np.ndarray, v: np.ndarray, law_state: np.ndarray | None = None) -> None:
+        """Go to a displacement [m] and a velocity [m/s], and to what the law remembers."""
+        if self.at.z is not None:
+            runtime.fill(self.at.z, self.arrays.to_blocks(law_state)[None])
+        runtime.fill(self.at.u, u[None])
+        runtime.fill(self.at.v, v[None])
+
+    def forces(self) -> np.ndarray:
+        """f."""
+        return self._run("forces")
+
+    def jvp(self, du: np.ndarray, dv: np.ndarray, tangent: Tangent, dz: np.ndarray | None = None) -> np.ndarray:
+        """Its change; dz: of what the law remembers."""
+        if self.change.z is not None:
+            runtime.fill(self.change.z, self.arrays.to_blocks(dz)[None])
+        runtime.fill(self.change.u, du[None])
+        runtime.fill(self.change.v, dv[None])
+        return self._run("jvp", change=self.change, tangent=tangent)
+
+    def tangent(self, change: Derived) -> Tangent:
+        """Changes of the scene's numbers, for `jvp`."""
+        return Tangent(self.arrays, change)
+
+    def adjoint(self) -> Adjoint:
+        """Room for the adjoints of the scene's numbers, for `vjp`; `collect()` gives them."""
+        out = Adjoint(self.arrays, self.arrays.features(True, True))
+        out.clear()
+        return out
+
+    def vjp(self, w: np.ndarray, adjoint: Adjoint) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """(adjoint of u, of v, of what the law remembers) for that of f; adds those of coefficients, grad N and V."""
+        runtime.fill(self.at.w, w[None])
+        if self.out.z is not None:
+            runtime.fill(self.out.z, 0)
+        runtime.fill(self.out.y_rate, 0)
+        by_u = self._run("vjp", seed=self.at, adjoint=(adjoint, self.out))
+        by_z = None if self.out.z is None else self.arrays.law_state_of(runtime.fetch(self.out.z)[0])
+        return by_u, runtime.fetch_row(self.out.y_rate, 0), by_z
