@@ -64,6 +64,8 @@ from diffsim_ti.outputs import (
     KineticEnergy,
     Length,
     MaterialPoints,
+    JointPositions,
+    JointVelocities,
     PixelTracks,
     PlasticStrain,
     Reaction,
@@ -117,6 +119,7 @@ from diffsim_ti.terms import (
     Pose,
     Pressure,
     RemoteLoad,
+    Robot,
     RotatingFrame,
     SelfContact,
     Sphere,
@@ -133,7 +136,7 @@ __all__ = ["init", "TetrahedralMesh", "StableNeoHookean", "SmithNeoHookean", "Li
 __all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "InitialStress"]
 __all__ += ["Ogden", "Orthotropic", "FibreReinforced", "KelvinVoigt", "J2Plasticity"]
 __all__ += ["Prony", "Gravity", "Drag", "ExternalForce", "Traction", "Pressure", "GasChamber", "FilledChamber"]
-__all__ += ["BodyForce", "Spring", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
+__all__ += ["BodyForce", "Spring", "Robot", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
 __all__ += ["Growth", "Muscle", "Tie", "Dissipation", "PlasticStrain"]
 __all__ += ["SelfContact", "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "Pose"]
 __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", "ImplicitEulerSolver"]
@@ -142,7 +145,7 @@ __all__ += ["BatchFrames", "Ensemble", "UnequalSteps", "adaptive_steps", "SolveR
 __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPoints", "ContactForce"]
 __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactSlip", "ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
-__all__ += ["PixelTracks", "TactilePad"]
+__all__ += ["JointPositions", "JointVelocities", "PixelTracks", "TactilePad"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["load_path", "LoadPath", "CriticalPoint", "SectionForce", "SmoothMaximum"]
 __all__ += ["RemoteLoad", "MultiPointConstraint"]

@@ -10,6 +10,7 @@ from diffsim_ti.outputs.energies import Dissipation, ElasticEnergy, KineticEnerg
 from diffsim_ti.outputs.lines import Length, Tension
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.joint_motion import JointPositions, JointVelocities
 from diffsim_ti.outputs.pixel_tracks import PixelTracks
 from diffsim_ti.outputs.plastic_strain import PlasticStrain
 from diffsim_ti.outputs.reaction import Reaction
@@ -30,7 +31,7 @@ __all__ = [
     "ContactTraction",
     "Displacements",
 ]
-__all__ += ["Dissipation", "PixelTracks", "PlasticStrain", "SectionForce", "SmoothMaximum"]
+__all__ += ["Dissipation", "JointPositions", "JointVelocities", "PixelTracks", "PlasticStrain", "SectionForce", "SmoothMaximum"]
 __all__ += [
     "ElasticEnergy",
     "EnclosedVolume",

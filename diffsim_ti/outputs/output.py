@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-NOTED = ("contact_forces", "chamber_pressures", "law_state")  # what runs note besides states, where outputs read it
+NOTED = ("contact_forces", "chamber_pressures", "law_state", "joint_states")  # what runs note besides states, where outputs read it
 
 
 @dataclass
@@ -22,7 +22,7 @@ class Change:
     """A change of frames and inputs, or the gradient of a loss by them; None, and inputs left out, are zero.
 
     positions [m], velocities [m/s]: shape (frames, num_vertices, 3); inputs: name -> array of the input's shape.
-    contact_forces [N], chamber_pressures [Pa], law_state: of the frames' arrays of that name, where an output says that it
+    contact_forces [N], chamber_pressures [Pa], law_state, joint_states: of the frames' arrays of that name, where an output says that it
     reads them.
     positions are those of the frames, which move with rest_positions where displacements are kept, and the other way
     round: they are the variable of the chain rule, and displacements are positions less rest_positions.
@@ -34,6 +34,7 @@ class Change:
     contact_forces: np.ndarray | None = None
     chamber_pressures: np.ndarray | None = None
     law_state: np.ndarray | None = None
+    joint_states: np.ndarray | None = None
 
     @property
     def noted(self) -> dict[str, np.ndarray | None]:
@@ -67,6 +68,7 @@ class Output(metaclass=Public):
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
     reads_law_state = False  # the same of frames.law_state, where the law remembers
+    reads_joint_states = False  # whether it reads frames.joint_states, which runs of robots note
 
     def needs_contact_forces(self, solver) -> bool:
         """Whether runs of this solver must; here, whether it reads them in all."""

@@ -59,7 +59,7 @@ class SmoothMaximum(Output):
             raise ValueError(
                 f"SmoothMaximum: sharpness must be at least 1 and scale above zero, got {sharpness}, {scale}"
             )
-        for flag in ("unit", "cumulative", "reads_contact_forces", "reads_chamber_pressures", "reads_law_state"):
+        for flag in ("unit", "cumulative", "reads_contact_forces", "reads_chamber_pressures", "reads_law_state", "reads_joint_states"):
             setattr(self, flag, getattr(of, flag))
 
     def needs_contact_forces(self, solver) -> bool:

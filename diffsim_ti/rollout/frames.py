@@ -36,6 +36,8 @@ class Frames(metaclass=Public):
     `law_state`, where an output reads it: what the law remembers of each tetrahedron, shape (frames, num_tetrahedra, S), or
     (frames, num_tetrahedra, 4, S) at the points of ten-node tetrahedra, in the order of the law's `state_names`.
 
+    `joint_states`, of scenes with robots: joint positions and velocities, shape (frames, joints of all robots, 2).
+
     `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
     the last good one.
 
@@ -56,6 +58,7 @@ class Frames(metaclass=Public):
     chamber_pressures: np.ndarray | None = field(default=None, repr=False)
     sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
     law_state: np.ndarray | None = field(default=None, repr=False)
+    joint_states: np.ndarray | None = field(default=None, repr=False)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
     error: FloatingPointError | None = None
