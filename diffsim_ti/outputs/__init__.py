@@ -7,10 +7,10 @@ from diffsim_ti.outputs.contact_slip import ContactSlip
 from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.enclosed_volume import EnclosedVolume
 from diffsim_ti.outputs.energies import Dissipation, ElasticEnergy, KineticEnergy
+from diffsim_ti.outputs.joint_motion import JointPositions, JointVelocities
 from diffsim_ti.outputs.lines import Length, Tension
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
-from diffsim_ti.outputs.joint_motion import JointPositions, JointVelocities
 from diffsim_ti.outputs.pixel_tracks import PixelTracks
 from diffsim_ti.outputs.plastic_strain import PlasticStrain
 from diffsim_ti.outputs.reaction import Reaction
@@ -31,7 +31,15 @@ __all__ = [
     "ContactTraction",
     "Displacements",
 ]
-__all__ += ["Dissipation", "JointPositions", "JointVelocities", "PixelTracks", "PlasticStrain", "SectionForce", "SmoothMaximum"]
+__all__ += [
+    "Dissipation",
+    "JointPositions",
+    "JointVelocities",
+    "PixelTracks",
+    "PlasticStrain",
+    "SectionForce",
+    "SmoothMaximum",
+]
 __all__ += [
     "ElasticEnergy",
     "EnclosedVolume",

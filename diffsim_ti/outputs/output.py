@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-NOTED = ("contact_forces", "chamber_pressures", "law_state", "joint_states")  # what runs note besides states, where outputs read it
+# what runs note besides states, where outputs read it
+NOTED = ("contact_forces", "chamber_pressures", "law_state", "joint_states")
 
 
 @dataclass
@@ -22,8 +23,8 @@ class Change:
     """A change of frames and inputs, or the gradient of a loss by them; None, and inputs left out, are zero.
 
     positions [m], velocities [m/s]: shape (frames, num_vertices, 3); inputs: name -> array of the input's shape.
-    contact_forces [N], chamber_pressures [Pa], law_state, joint_states: of the frames' arrays of that name, where an output says that it
-    reads them.
+    contact_forces [N], chamber_pressures [Pa], law_state, joint_states: of the frames' arrays of that name, where an output
+    says that it reads them.
     positions are those of the frames, which move with rest_positions where displacements are kept, and the other way
     round: they are the variable of the chain rule, and displacements are positions less rest_positions.
     """

@@ -126,7 +126,9 @@ class Sweep:
     @property
     def noted(self) -> tuple[str, ...]:
         """What frames hold besides states, by name."""
-        return tuple(n for n, asked in zip(NOTED, (self.contacts, self.chambers, self.law_states, self.joints)) if asked)
+        return tuple(
+            n for n, asked in zip(NOTED, (self.contacts, self.chambers, self.law_states, self.joints)) if asked
+        )
 
     def noted_values(self) -> dict[str, np.ndarray]:
         """The same of the last run."""

@@ -148,7 +148,9 @@ class Scene(MadeAgain):
             raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
         self.volume = volume
         density = _density(density, mesh, self.material)
-        self.terms = _with_parts([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
+        self.terms = _with_parts(
+            [terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()")
+        )
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
         self.motion, (self.posed_supports, self.translates) = motion, self.supports.parts_of(motion)

@@ -12,9 +12,11 @@ class JointRows(_Together):
     shape (rows, joints of all, 3)."""
 
     def value(self, *x):
-        rows = self.rows(x)
-        parts = [(a[0, :rows], a[1, :rows], b[0, :rows]) for a, b in zip(x[::2], x[1::2])]
-        return (np.concatenate([np.stack(np.broadcast_arrays(*(p + np.zeros((rows, 1)) for p in part)), -1) for part in parts], 1),)
+        rows, out = self.rows(x), []
+        for targets, torques in zip(x[::2], x[1::2]):
+            columns = (np.broadcast_to(part[:rows], (rows, part.shape[-1])) for part in (*targets, torques[0]))
+            out.append(np.stack(list(columns), -1))
+        return (np.concatenate(out, 1),)
 
     def vjp(self, x, y_adj):
         out, at = [], 0

@@ -15,6 +15,7 @@ J' being taken at the place where the step begins, from which friction takes its
 
 import weakref
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,14 +33,15 @@ STIFF = 1e6  # of a prescribed joint's drive, over inertia / h^2
 
 def moved(S: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Velocities at points of twists S, shape (..., joints, 3), of points of shape (..., 3)."""
-    return S[:, :3] + np.cross(S[:, 3:], x[..., None, :])
+    return S[:, :3] + np.tensordot(x, rotations.skew(S[:, 3:]), (-1, 2))
 
 
-class Pushed:
-    """What a link does to the vertices that it touches."""
+class Pushed(NamedTuple):
+    """What a link does to the vertices that it touches, by its barrier and by friction, shape (k, 3) [N]."""
 
-    def __init__(self, at, f, drag, H, F):
-        self.at, self.f, self.drag, self.H, self.F = at, f, drag, H, F
+    at: np.ndarray
+    f: np.ndarray
+    drag: np.ndarray
 
 
 class Joints:
@@ -53,16 +55,16 @@ class Joints:
         self.robots = robots = workspace.scene.interaction(Robots)
         self.slices, self.count = robots.slices(), robots.count
         self.above = np.zeros((self.count, self.count), bool)
-        names, self.links = [term.name for term in self.a.contacts], []  # (obstacle, robot, part, joints that move it)
-        for r, (robot, own) in enumerate(zip(robots.terms, self.slices)):
+        names, self.links = [term.name for term in self.a.contacts], []  # (obstacle, joints that move it)
+        for robot, own in zip(robots.terms, self.slices):
             self.above[own, own] = robot.model.above
-            for k, (name, joint, _) in enumerate(robot.places):
+            for name, joint, _ in robot.places:
                 carried = np.zeros(self.count, bool)
                 carried[own] = robot.model.carries(joint)
-                self.links.append((names.index(name), r, k, carried))
+                self.links.append((names.index(name), carried))
         self.shares = Shares(workspace) if self.links else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
-        self._zero, self._held, self._placed, self._anchor = None, None, None, None
+        self._known, self._zero, self._held, self._placed, self._anchor = None, None, None, None, None
         self.now = self.start()
 
     def start(self) -> tuple[np.ndarray, np.ndarray]:
@@ -74,22 +76,23 @@ class Joints:
 
     def _kinematics(self, q: np.ndarray) -> tuple[list, np.ndarray]:
         """(pose of each link's obstacle, twists of all joints)"""
-        twists, poses = np.zeros((self.count, 6)), {}
-        for r, (robot, own) in enumerate(zip(self.robots.terms, self.slices)):
-            for k, pose in enumerate(robot.poses(q[own])):
-                poses[r, k] = pose
-            twists[own] = robot.model.kinematics(q[own])[1]
-        return [poses[r, k] for _, r, k, _ in self.links], twists
+        if self._known is None or not np.array_equal(q, self._known[0]):
+            twists, poses = np.zeros((self.count, 6)), []
+            for robot, own in zip(self.robots.terms, self.slices):
+                frames, twists[own] = robot.model.kinematics(q[own])
+                poses += robot.poses_of(frames)
+            self._known = q.copy(), poses, twists
+        return self._known[1:]
 
     def put(self, rows: np.ndarray, q: np.ndarray, moments=(AT_STAGE,)) -> None:
         """Write the poses of links at q to rows of obstacles."""
-        for (k, *_), (turn, t) in zip(self.links, self._kinematics(q)[0]):
+        for (k, _), (turn, t) in zip(self.links, self._kinematics(q)[0]):
             for m in moments:
                 rows[3 * k + m] = t
                 rows[3 * self.a.poses.place_of[k] + m] = rotations.rodrigues(turn)
 
     def _put_rates(self, rows: np.ndarray, rate: np.ndarray) -> None:
-        for (k, _, _, carried), (_, t) in zip(self.links, self.poses_n):
+        for (k, carried), (_, t) in zip(self.links, self.poses_n):
             J = moved(self.S_n, t)
             rows[3 * k + RATE] = (rate * carried) @ J
             rows[3 * self.a.poses.place_of[k] + RATE] = (rate * carried) @ self.S_n[:, 3:]
@@ -125,7 +128,10 @@ class Joints:
     def end(self) -> None:
         """The pass is over. Raises NotConverged where the joints are not in balance."""
         if not self.left <= max(self.ws.solver.tolerance, 1e-6):
-            raise NotConverged(f"the joints of robots are out of balance by {self.left:.2g} of their forces: take smaller steps", [])
+            raise NotConverged(
+                f"the joints of robots are out of balance by {self.left:.2g} of their forces: take smaller steps",
+                [self.left],
+            )
         self.now = self.q.copy(), (self.q - self.q_n) / self.h
 
     def forget(self) -> None:
@@ -160,10 +166,10 @@ class Joints:
         _, self.S = self._kinematics(q)
         self.pushed = []
         forces = self.shares.forces() if self.links else np.zeros((0, 2, *u.shape))
-        for k, _, _, carried in self.links:
+        for k, carried in self.links:
             f, drag = forces[k]
             at = np.flatnonzero(f.any(1) | drag.any(1))
-            self.pushed.append(Pushed(at, f[at], drag[at], None, None))
+            self.pushed.append(Pushed(at, f[at], drag[at]))
             if len(at):
                 J, J_n = (carried[:, None] * moved(S, y[at]) for S, y in ((self.S, x), (self.S_n, x_n)))
                 work = np.einsum("iad,id->ia", J, f[at]) + np.einsum("iad,id->ia", J_n, drag[at])
@@ -225,12 +231,12 @@ class Joints:
             blocks = self._blocks()
             x, x_n = self._places(self.p.held_at)
             turns = bracket(self.S[:, None], self.S[None]) * self.above[..., None]  # [b, a]
-            for (k, _, _, carried), part in zip(self.links, self.pushed):
+            for (k, carried), part in zip(self.links, self.pushed):
                 at, f = part.at, part.f
                 H, F = blocks[:, k, 0, at], blocks[:, k, 1, at]  # (3, k, 3)
                 J, J_n = (carried[:, None] * moved(S, y[at]) for S, y in ((self.S, x), (self.S_n, x_n)))
                 w = carried[:, None] * self.S[:, 3:]
-                turned = np.cross(w[None], f[:, None])  # (k, joints, 3), of f as the link turns
+                turned = np.tensordot(f, rotations.skew(w), (1, 2))  # (k, joints, 3), of f as the link turns
                 HJ, FJ = np.einsum("jid,iaj->iad", H, J), np.einsum("jid,iaj->iad", F, J_n)
                 columns.append((at, -np.swapaxes(turned + HJ + FJ, 1, 2)))
                 force, moment = f.sum(0), np.cross(x[at], f).sum(0)
@@ -240,10 +246,11 @@ class Joints:
         return columns, 0.5 * (K + K.T)
 
     def _blocks(self) -> np.ndarray:
-        """-df/du of barriers and of friction of each obstacle at each vertex, shape (3, obstacles, 2, n, 3), columns first."""
+        """-df/du of barriers and of friction, a column each, shape (3, obstacles, 2, n, 3)."""
         if self._zero is None:
             numbers = Tangent(self.a, self.a.values.zeros())
-            still = SimpleNamespace(**{name: runtime.array(self.a.vector, *getattr(self.p, name).shape) for name in ("lag", "poses")})
+            arrays = {name: runtime.array(self.a.vector, *getattr(self.p, name).shape) for name in ("lag", "poses")}
+            still = SimpleNamespace(**arrays)
             for array in vars(still).values():
                 runtime.fill(array, 0)
             self._zero = still, numbers

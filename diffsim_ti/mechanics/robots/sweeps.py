@@ -30,9 +30,7 @@ class JointSweep:
         """(rows of translation and of rotation, joints that move it, its points at the pass's end and beginning) of links"""
         J, place = self.joints, self.joints.a.poses.place_of
         now, before = J._kinematics(J.q)[0], J.poses_n
-        return [
-            (3 * k, 3 * place[k], carried, t[1], t_n[1]) for (k, _, _, carried), t, t_n in zip(J.links, now, before)
-        ]
+        return [(3 * k, 3 * place[k], carried, t[1], t_n[1]) for (k, carried), t, t_n in zip(J.links, now, before)]
 
     def _rate_by_place(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Change of velocity of a link's own point t, and of its spin, by q_n at a constant rate, shape (joints, joints, 3)
@@ -85,7 +83,7 @@ class JointSweep:
         J, out = self.joints, []
         _, x_n = J._places(J.p.held_at)
         turns = bracket(J.S_n[:, None], J.S_n[None]) * J.above[..., None]
-        for (_, _, _, carried), part in zip(J.links, J.pushed):
+        for (_, carried), part in zip(J.links, J.pushed):
             force, moment = part.drag.sum(0), np.cross(x_n[part.at], part.drag).sum(0)
             bent = (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
             out.append((part.at, carried, part.f, part.drag, bent))
@@ -195,8 +193,8 @@ class JointAdjoint(JointSweep):
         return self._turned
 
     def end(self, rows: np.ndarray, adj) -> np.ndarray:
-        """Go to where the pass begins; adj: takes adjoints of numbers; returns that of gravity. rows: adjoint of the obstacles'
-        rows by the equations of body and joints."""
+        """Go to where the pass begins. rows: adjoint of the obstacles' rows by the equations of body and joints; adj: takes
+        adjoints of numbers. Returns that of gravity."""
         J, w = self.joints, self.w
         by_q_n = self._to_q_n + self.rows_vjp(rows)[1] - self.by_v / J.h
         by_q_n = by_q_n + J.M @ w / J.h**2 + J.c * w / J.h

@@ -74,8 +74,8 @@ class RobotModel:
         """Of Pinocchio, whose joints without limits take cosine and sine of the angle."""
         out = np.zeros(self.model.nq)
         for j, angle in enumerate(q, 1):
-            at = self.model.joints[j].idx_q
-            out[at : at + self.model.joints[j].nq] = angle if self.model.joints[j].nq == 1 else (np.cos(angle), np.sin(angle))
+            joint = self.model.joints[j]
+            out[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
         return out
 
     def carries(self, joint: int) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Articulated robots, whose joints are unknowns of implicit steps together with the body."""
 
 from collections.abc import Sequence
-from copy import copy
 from pathlib import Path
 from typing import TypedDict
 
@@ -97,24 +96,36 @@ class Robot(GivenOverTime, Term):
         m = model.size
         for joint, mass in zip(model.joints, model.masses):
             if not mass > 0:
-                raise ValueError(f"Robot.from_urdf: joint {joint!r} carries no mass: give its link an <inertial> element")
+                raise ValueError(
+                    f"Robot.from_urdf: joint {joint!r} carries no mass: give its link an <inertial> element"
+                )
         if m == 0:
             raise ValueError("Robot.from_urdf: the robot has no joint that moves; take obstacles such as MeshObstacle")
         start = np.zeros(m) if positions is None else positions
         every = lambda x: np.full(m, x, np.float64) if np.ndim(x) == 0 else x  # noqa: E731
-        own, per = (m,), dict(label="")
+        own, zeros = (m,), np.zeros(m)
         inputs = [
             Input("positions", start, (own,), "rad, m", plain="joint_positions"),
-            Input("velocities", np.zeros(m) if velocities is None else velocities, (own,), "rad/s, m/s", plain="joint_velocities"),
+            Input(
+                "velocities",
+                zeros if velocities is None else velocities,
+                (own,),
+                "rad/s, m/s",
+                plain="joint_velocities",
+            ),
             Input("drive_stiffness", every(drive_stiffness), (own,), "N m/rad, N/m", AT_LEAST_0),
             Input("drive_damping", every(drive_damping), (own,), "N m s/rad, N s/m", AT_LEAST_0),
             Input("masses", model.masses, (own,), "kg", POSITIVE, plain="link_masses"),
-            Input("torques", np.zeros(m) if torques is None else torques, (own, ("steps", m)), "N m, N", plain="joint_torques"),
+            Input(
+                "torques", zeros if torques is None else torques, (own, ("steps", m)), "N m, N", plain="joint_torques"
+            ),
         ]
         out = cls(model, inputs, start if targets is None else targets, name)
         for joint in prescribed:
             if joint not in model.joints:
-                raise ValueError(f"Robot.from_urdf: no joint {joint!r} to prescribe; there are {', '.join(model.joints)}")
+                raise ValueError(
+                    f"Robot.from_urdf: no joint {joint!r} to prescribe; there are {', '.join(model.joints)}"
+                )
             out.prescribed[model.joints.index(joint)] = True
         out.damping = urdf.dampings(model.joints)
         M, _ = model.dynamics(out.values["joint_positions"], np.zeros(m), model.masses, np.zeros(3))
@@ -146,7 +157,10 @@ class Robot(GivenOverTime, Term):
 
     def poses(self, q: ArrayLike) -> list[tuple[np.ndarray, np.ndarray]]:
         """(unit quaternion, position [m]) of each of `parts` at joint positions."""
-        frames, _ = self.model.kinematics(np.asarray(q, np.float64))
+        return self.poses_of(self.model.kinematics(np.asarray(q, np.float64))[0])
+
+    def poses_of(self, frames: list) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The same of the joints' frames."""
         base = np.array([1.0, 0, 0, 0]), np.zeros(3)
         return [joined(base if joint < 0 else frames[joint], pose) for _, joint, pose in self.places]
 

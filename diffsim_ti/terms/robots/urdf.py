@@ -72,7 +72,7 @@ class Urdf:
             children[child] = name
             if float(numbers_of(joint.find("dynamics"), "friction", "0")[0]):
                 raise ValueError(
-                    f"Robot.from_urdf: joint {name!r} has dry friction, which is not supported: set friction=\"0\" in its "
+                    f'Robot.from_urdf: joint {name!r} has dry friction, which is not supported: set friction="0" in its '
                     "<dynamics>, and damping in its place"
                 )
 
@@ -118,7 +118,9 @@ class Urdf:
     def _file(self, name: str, link: str) -> Path:
         """Where a mesh lies: beside the file, and of package://name/path in the nearest folder above that has `path`."""
         folder = Path.cwd() if self.folder is None else self.folder.resolve()
-        inner = name.split("//", 1)[1].split("/", 1)[1] if name.startswith("package://") else name.removeprefix("file://")
+        inner = (
+            name.split("//", 1)[1].split("/", 1)[1] if name.startswith("package://") else name.removeprefix("file://")
+        )
         tried = [above / inner for above in ([folder, *folder.parents] if name.startswith("package://") else [folder])]
         for path in tried:
             if path.is_file():
