@@ -114,12 +114,13 @@ class Potential:
     def at_rest(self):
         """At rest, and then back to where it was."""
         u, kept = self.held_at, [(x, runtime.fetch(x)) for x in (self.z, self.held) if x is not None]
-        self.place(np.zeros_like(u))
-        if self.z is not None:
-            runtime.fill(self.z, self.arrays.initial_state_blocks())
-        if self.held is not None:
-            runtime.fill(self.held, 0)
-        yield
+        with self.joints.still() if self.joints else nullcontext():
+            self.place(np.zeros_like(u))
+            if self.z is not None:
+                runtime.fill(self.z, self.arrays.initial_state_blocks())
+            if self.held is not None:
+                runtime.fill(self.held, 0)
+            yield
         self.place(u)
         for array, numbers in kept:
             runtime.fill(array, numbers)

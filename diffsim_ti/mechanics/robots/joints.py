@@ -14,6 +14,7 @@ J' being taken at the place where the step begins, from which friction takes its
 """
 
 import weakref
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -65,7 +66,7 @@ class Joints:
         self.shares = Shares(workspace) if self.links else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
         self._known, self._zero, self._held, self._placed, self._anchor = None, None, None, None, None
-        self.now = self.start()
+        self.q, self.left, self.now = None, 0.0, self.start()
 
     def start(self) -> tuple[np.ndarray, np.ndarray]:
         """(positions, velocities) where a run begins."""
@@ -125,6 +126,14 @@ class Joints:
         """Stand at q wherever the body is, as a recorded pass does."""
         self._held, self._placed = q, None
 
+    @contextmanager
+    def still(self):
+        """Stand where they are while the body is placed elsewhere."""
+        kept = self._held
+        self.hold(self.q)
+        yield
+        self._held, self._placed = kept, None
+
     def end(self) -> None:
         """The pass is over. Raises NotConverged where the joints are not in balance."""
         if not self.left <= max(self.ws.solver.tolerance, 1e-6):
@@ -150,6 +159,8 @@ class Joints:
 
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
+        if self.q is None:
+            return np.zeros(1)
         a, d = self._acceleration, self.q - self.q_n
         inertia = 0.5 * self.h**2 * a @ self.M @ a
         drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * d**2 / self.h
@@ -160,7 +171,8 @@ class Joints:
         self.q, self._linear = q, None
         self.put(self.rows, q)
         self._put_rates(self.rows, (q - self.q_n) / self.h)
-        runtime.fill(self.p.poses, self.rows)
+        if len(self.rows):
+            runtime.fill(self.p.poses, self.rows)
         R, size = self._own_forces()
         x, x_n = self._places(u)
         _, self.S = self._kinematics(q)
@@ -182,8 +194,8 @@ class Joints:
         return rest + u, rest + self.u_n
 
     def settle(self, u: np.ndarray) -> None:
-        """Find q(u). The potential is placed at u."""
-        if self._placed is not None and np.array_equal(u, self._placed):
+        """Find q(u). The potential is placed at u; before the first pass there is nothing to find."""
+        if self.q is None or (self._placed is not None and np.array_equal(u, self._placed)):
             return
         self._placed = u.copy()
         if self._held is not None:
@@ -279,7 +291,9 @@ class Joints:
 
     def product(self, w: np.ndarray) -> np.ndarray:
         """What the joints that give way take from d2E/du2 w."""
-        return self.of_joints(self.follow(self.of_body(w)), w.shape) if self.linear[0] else np.zeros(w.shape)
+        if self.q is None or not self.linear[0]:
+            return np.zeros(w.shape)
+        return self.of_joints(self.follow(self.of_body(w)), w.shape)
 
     def anchor(self, u: np.ndarray) -> None:
         """From here on predict q from where it is at u."""

@@ -120,6 +120,8 @@ class Robot(GivenOverTime, Term):
                 "torques", zeros if torques is None else torques, (own, ("steps", m)), "N m, N", plain="joint_torques"
             ),
         ]
+        for given in inputs:
+            given.check_value("Robot")  # before the targets, which may be the positions
         out = cls(model, inputs, start if targets is None else targets, name)
         for joint in prescribed:
             if joint not in model.joints:

@@ -66,8 +66,8 @@ class Urdf:
                 )
             if child in children:
                 raise ValueError(
-                    f"Robot.from_urdf: link {child!r} hangs on joints {children[child]!r} and {name!r}, a closed loop, which "
-                    "is not supported: cut the loop by taking one of them out"
+                    f"Robot.from_urdf: link {child!r} hangs on joints {children[child]!r} and {name!r}, a closed loop, "
+                    "which is not supported: cut the loop by taking one of them out"
                 )
             children[child] = name
             if float(numbers_of(joint.find("dynamics"), "friction", "0")[0]):
