@@ -157,6 +157,11 @@ class Joints:
         parts += -self.k * (self.q - self.targets), -self.c * (self.q - self.q_n) / self.h
         return sum(parts), sum(np.abs(part) for part in parts)
 
+    def _rounding(self) -> float:
+        """Of the joints' own forces, by the digits of their positions."""
+        reach = np.abs(self.q) + np.abs(self.q_n) + self.h * np.abs(self.v_n)
+        return 1e-15 * float(np.linalg.norm(np.abs(self.M) @ reach / self.h**2 + self.k * reach)) + 1e-300
+
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
         if self.q is None:
@@ -206,7 +211,8 @@ class Joints:
         for _ in range(self.most):
             left, scale = np.linalg.norm(R), np.linalg.norm(size)
             stalled = 0 if left < 0.5 * best else stalled + 1
-            if not left > max(1e-13, 4 * self.eps) * scale or (stalled > 3 and left <= 1e-6 * scale):  # rounding
+            known = max(1e-13, 4 * self.eps) * scale + self._rounding()
+            if not left > known or (stalled > 3 and left <= 1e-6 * scale):
                 break
             best = min(best, left)
             _, K = self.linear
@@ -220,7 +226,7 @@ class Joints:
                 if float(R @ step) >= -self.falls * slope or t < 1e-12:
                     break
                 t *= 0.5
-        self.left = float(np.linalg.norm(R) / max(np.linalg.norm(size), 1e-300))
+        self.left = float(np.linalg.norm(R)) / (float(np.linalg.norm(size)) + 1e6 * self._rounding())
 
     def _free_share(self, u, q: np.ndarray, step: np.ndarray) -> float:
         """How far links may go along a step of the joints."""
