@@ -81,6 +81,7 @@ def parts() -> int:
         ds.Pressure(([0.0, 1.0], [0.0, 5.0]), surface="ymax"),
         ds.BodyForce((0.0, 1.0, 0.0), per="mass"),
         ds.RotatingFrame((0.0, 1.0, 0.0)),
+        ds.Robot.from_urdf("arm.urdf", positions=(0.1, 0.2), drive_stiffness=50.0, friction=0.5, name="arm"),
         ds.SurfaceDrag(normal=1.2),
         ds.ElasticFoundation(1e3, surface="xmin"),
         ds.Growth(0.01),

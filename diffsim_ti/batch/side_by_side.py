@@ -4,7 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.interactions import host_forces
-from diffsim_ti.terms import SelfContact
+from diffsim_ti.terms import Robot, SelfContact
 
 
 def why_not(solver) -> str | None:
@@ -30,6 +30,7 @@ def _why_not_joined(solver) -> str | None:
     terms |= dict(
         mesh_obstacles=_tables(scene), reduced_sets_or_ties=scene.reduced, chambers_of_given_volume=scene.holds_volumes
     )
+    terms |= dict(robots=scene.terms_of(Robot))
     there = [name.replace("_", " ") for name, some in terms.items() if some]
     if there:
         return f"it has {' and '.join(there)}"

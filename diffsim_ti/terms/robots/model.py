@@ -86,7 +86,7 @@ class RobotModel:
 
     def kinematics(self, q: np.ndarray) -> tuple[list, np.ndarray]:
         """(pose of each joint's frame, twists of the joints about the world's origin, (v, w) each, shape (joints, 6))"""
-        S = self.pin.computeJointJacobians(self.model, self.data, self._place(q)).T.copy()
+        S = self.pin.computeJointJacobians(self.model, self.data, self._place(q)).reshape(6, -1).T.copy()
         return [self._pose(x) for x in list(self.data.oMi)[1:]], S
 
     def _load(self, masses: np.ndarray, gravity: np.ndarray) -> None:
@@ -99,7 +99,7 @@ class RobotModel:
         """(M(q), C(q, v) v + g(q)) [kg m^2 or kg, N m or N]"""
         self._load(masses, gravity)
         place = self._place(q)
-        M = self.pin.crba(self.model, self.data, place)
+        M = self.pin.crba(self.model, self.data, place).reshape(self.size, -1)
         M = np.triu(M) + np.triu(M, 1).T
         return M, self.pin.rnea(self.model, self.data, place, v, np.zeros(self.size)).copy()
 
@@ -107,8 +107,9 @@ class RobotModel:
         """Derivatives of M(q) a + C(q, v) v + g(q) by q, v, masses and gravity, a column each."""
         self._load(masses, gravity)
         place = self._place(q)
-        by_q, by_v, _ = (x.copy() for x in self.pin.computeRNEADerivatives(self.model, self.data, place, v, a))
-        Y = self.pin.computeJointTorqueRegressor(self.model, self.data, place, v, a)
+        found = self.pin.computeRNEADerivatives(self.model, self.data, place, v, a)[:2]  # of one joint: rows
+        by_q, by_v = (x.reshape(self.size, -1).copy() for x in found)
+        Y = self.pin.computeJointTorqueRegressor(self.model, self.data, place, v, a).reshape(self.size, -1)
         each = [x.toDynamicParameters() / x.mass for x in self.inertias]
         by_masses = np.stack([Y[:, 10 * j : 10 * j + 10] @ x for j, x in enumerate(each)], 1)
         at = lambda g: self._weight(place, g)  # noqa: E731
