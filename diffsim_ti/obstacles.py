@@ -24,7 +24,7 @@ def link_rows(scene: Scene, joint_states: np.ndarray | None) -> dict[str, np.nda
     out, at = {}, 0
     for robot in scene.terms_of(Robot) if joint_states is not None else ():
         poses = robot.poses(joint_states[at : at + robot.model.size, 0])
-        out |= {part.name: np.concatenate([t, q]) for part, (q, t) in zip(robot.parts, poses)}
+        out |= {part.name: np.concatenate([t, q]) for part, (q, t) in zip(robot.companions, poses)}
         at += robot.model.size
     return out
 

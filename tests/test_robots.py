@@ -105,6 +105,18 @@ def test_other_solvers_refuse_and_say_which_takes_robots(monkeypatch):
         ds.Robot.from_urdf(ARM)
 
 
+def test_advice_works_when_it_is_followed(pressing):
+    text, _ = WRONG["has dry friction"]
+    assert ds.Robot.from_urdf(text.replace('friction="1"', 'friction="0" damping="2"')).damping == [2.0]
+    with pytest.raises(ValueError, match="take what='share'"):
+        ds.ContactSlip("arm_tip").settled(pressing)
+    assert ds.ContactSlip("arm_tip", what="share").settled(pressing).what == "share"
+    far = dict(mesh=moved([1e5, 0, 0]), terms=[ds.Robot.from_urdf(ARM, links=())], fixed="ymin")
+    with pytest.raises(ValueError, match='pass precision="f64"'):
+        ds.ImplicitEulerSolver(pressing.replace(**far, precision="f32"))
+    ds.ImplicitEulerSolver(pressing.replace(**far, precision="f64"))
+
+
 def test_a_pendulum_swings_as_its_equation_says():
     """Against scipy at 1e-10; backward Euler with what is frozen at the start of each step is of first order."""
     from scipy.integrate import solve_ivp

@@ -8,7 +8,7 @@ from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.lines.interaction import Foundations, SpringsAndCables
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.pressure.interaction import Pressures
-from diffsim_ti.mechanics.robots.interaction import Robots
+from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.mechanics.rotating_frame import InertialForces
 from diffsim_ti.mechanics.stress.interaction import Growths
 

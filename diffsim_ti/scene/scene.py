@@ -40,10 +40,10 @@ def _kind(term) -> tuple:
     return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
 
 
-def _with_parts(terms: Iterable) -> tuple:
+def _with_companions(terms: Iterable) -> tuple:
     """Terms and what comes with them, each once."""
     out = list(terms)
-    out += [part for term in out for part in getattr(term, "parts", ()) if not any(part is other for other in out)]
+    out += [part for term in out for part in getattr(term, "companions", ()) if not any(part is other for other in out)]
     return tuple(out)
 
 
@@ -148,7 +148,7 @@ class Scene(MadeAgain):
             raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
         self.volume = volume
         density = _density(density, mesh, self.material)
-        self.terms = _with_parts(
+        self.terms = _with_companions(
             [terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()")
         )
         self.supports = Supports(mesh, fixed)

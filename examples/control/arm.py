@@ -48,7 +48,7 @@ def arm() -> pin.Model:
 
 
 class Flange(torch.autograd.Function):
-    """(rotations, positions [m]) of the flange for joint angles, shape (n, 3); dR = [w]x R and dp by Pinocchio's Jacobian."""
+    """(rotations, positions [m]) of the flange for joint angles, shape (n, 3), with Pinocchio's Jacobian."""
 
     @staticmethod
     def forward(ctx, angles, model):

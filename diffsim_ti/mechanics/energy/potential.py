@@ -41,7 +41,7 @@ class Potential:
         # [1/s], of changes in a pass; zero in static solves
         self.rate = runtime.array(a.fp, 1) if a.law.viscous else None
         self.hosts = NONE  # host forces that have an energy: set by whom a time is known
-        self.joints = None  # of robots (mechanics/robots/joints.py): set by whom passes are known
+        self.joints = None  # of robots (mechanics/joints/joints.py): set by whom passes are known
         self.rigid: RigidSets | None = None  # sets that do not deform: set by whom passes are known
 
     kernels_kind = PotentialKernels

@@ -12,8 +12,8 @@ from diffsim_ti import runtime
 from diffsim_ti.common.blas_threads import one_blas_thread
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.record import ChamberRecord
+from diffsim_ti.mechanics.joints.sweeps import JointAdjoint
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, SharesAdjoint
-from diffsim_ti.mechanics.robots.sweeps import JointAdjoint
 from diffsim_ti.mechanics.stress.law_frames import LawFrames
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.state.numbers import Adjoint

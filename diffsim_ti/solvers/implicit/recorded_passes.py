@@ -11,7 +11,7 @@ from diffsim_ti.solvers.implicit.multigrid import Following
 class RecordedPasses:
     """What tangent and reverse sweep share: a recorded pass with everything that its equation names."""
 
-    joints = None  # derivatives of those of robots (mechanics/robots/sweeps.py)
+    joints = None  # derivatives of those of robots (mechanics/joints/sweeps.py)
     transposed = False  # whether equations are solved with the transposed operator
 
     def __init__(self, workspace):

@@ -10,12 +10,12 @@ from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.joints.joints import Joints
 from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
-from diffsim_ti.mechanics.robots.interaction import Robots
-from diffsim_ti.mechanics.robots.joints import Joints
+from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.mechanics.stress.frozen_strains import FrozenStrains
 from diffsim_ti.mechanics.stress.law_state import law_state_kernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of

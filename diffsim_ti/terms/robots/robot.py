@@ -34,8 +34,8 @@ class LinkContact(TypedDict, total=False):
 class Robot(GivenOverTime, Term):
     """A tree of rigid links and joints, on a base that stands, with the joint positions q as unknowns of implicit steps.
 
-    `Robot.from_urdf(path)` makes one. A backward Euler step of length h from (x_n, q_n, v_n) is a stationary point, found by
-    descent, of one incremental potential of body and joints,
+    `Robot.from_urdf(path)` makes one of the model, inputs, targets and name that it finds. A backward Euler step of length h
+    from (x_n, q_n, v_n) is a stationary point, found by descent, of one incremental potential of body and joints,
 
         Phi(x) + E_contact(x, links(q)) + 1/2 (q - p)^T M (q - p) / h^2 + b . q
           + 1/2 k (q - q_target)^2 + 1/2 c (q - q_n)^2 / h - tau . q,    p = q_n + h v_n,
@@ -58,8 +58,10 @@ class Robot(GivenOverTime, Term):
     def __init__(self, model: RobotModel, inputs: Sequence[Input], targets: OverTime, name: str):
         self.model, self.shape = model, (model.size,)
         self.prescribed, self.damping = np.zeros(model.size, bool), np.zeros(model.size)
-        self.parts: tuple[Obstacle, ...] = ()
-        self.places: tuple[tuple[str, int, tuple], ...] = ()  # (name of a part, joint that carries it, its pose there)
+        self.companions: tuple[Obstacle, ...] = ()
+        self.places: tuple[
+            tuple[str, int, tuple], ...
+        ] = ()  # (name of an obstacle, joint that carries it, its pose there)
         super().__init__(amount("targets", targets, self.shape, "rad, m", "joint_targets"), *inputs, name=name)
         self._give(targets)
 
@@ -148,7 +150,7 @@ class Robot(GivenOverTime, Term):
             obstacle.path = None
             parts.append(obstacle)
             places.append((obstacle.name, joint, pose))
-        self.parts, self.places = tuple(parts), tuple(places)
+        self.companions, self.places = tuple(parts), tuple(places)
         for obstacle, (q, t) in zip(parts, self.poses(self.values["joint_positions"])):
             obstacle.led = np.concatenate([t, q])
 
@@ -158,7 +160,7 @@ class Robot(GivenOverTime, Term):
         return self.model.joints
 
     def poses(self, q: ArrayLike) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(unit quaternion, position [m]) of each of `parts` at joint positions."""
+        """(unit quaternion, position [m]) of each of `companions` at joint positions."""
         return self.poses_of(self.model.kinematics(np.asarray(q, np.float64))[0])
 
     def poses_of(self, frames: list) -> list[tuple[np.ndarray, np.ndarray]]:

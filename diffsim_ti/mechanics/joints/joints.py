@@ -24,7 +24,7 @@ from diffsim_ti import runtime
 from diffsim_ti.common import rotations
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mechanics.obstacles.contact_record import Shares
-from diffsim_ti.mechanics.robots.interaction import Robots
+from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.state.numbers import Tangent
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
 from diffsim_ti.terms.robots.model import bracket
@@ -75,7 +75,7 @@ class Joints:
 
     # ---- kinematics --------------------------------------------------------------------------------------------------
 
-    def _kinematics(self, q: np.ndarray) -> tuple[list, np.ndarray]:
+    def kinematics(self, q: np.ndarray) -> tuple[list, np.ndarray]:
         """(pose of each link's obstacle, twists of all joints)"""
         if self._known is None or not np.array_equal(q, self._known[0]):
             twists, poses = np.zeros((self.count, 6)), []
@@ -87,7 +87,7 @@ class Joints:
 
     def put(self, rows: np.ndarray, q: np.ndarray, moments=(AT_STAGE,)) -> None:
         """Write the poses of links at q to rows of obstacles."""
-        for (k, _), (turn, t) in zip(self.links, self._kinematics(q)[0]):
+        for (k, _), (turn, t) in zip(self.links, self.kinematics(q)[0]):
             for m in moments:
                 rows[3 * k + m] = t
                 rows[3 * self.a.poses.place_of[k] + m] = rotations.rodrigues(turn)
@@ -103,7 +103,7 @@ class Joints:
     def begin(self, j: int, stage, rows: np.ndarray) -> None:
         """Pass j from `now`; rows: of obstacles, which links write into."""
         (self.q_n, self.v_n), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
-        self.poses_n, self.S_n = self._kinematics(self.q_n)
+        self.poses_n, self.S_n = self.kinematics(self.q_n)
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
         at = a.features().gravity
         self.gravity = a.values.parameters[at : at + 3].copy() if at >= 0 else np.zeros(3)
@@ -148,12 +148,13 @@ class Joints:
         self._placed = None
 
     @property
-    def _acceleration(self) -> np.ndarray:
+    def acceleration(self) -> np.ndarray:
+        """Of the joints in the pass."""
         return (self.q - self.q_n - self.h * self.v_n) / self.h**2
 
     def _own_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(-dPhi/dq but for contact, sizes of what it adds up)"""
-        parts = -self.M @ self._acceleration, -self.bias, self.torques
+        parts = -self.M @ self.acceleration, -self.bias, self.torques
         parts += -self.k * (self.q - self.targets), -self.c * (self.q - self.q_n) / self.h
         return sum(parts), sum(np.abs(part) for part in parts)
 
@@ -166,7 +167,7 @@ class Joints:
         """What the joints add to Phi [J]."""
         if self.q is None:
             return np.zeros(1)
-        a, d = self._acceleration, self.q - self.q_n
+        a, d = self.acceleration, self.q - self.q_n
         inertia = 0.5 * self.h**2 * a @ self.M @ a
         drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * d**2 / self.h
         return np.array([inertia, self.bias @ d, drives.sum(), -self.torques @ d])
@@ -179,8 +180,8 @@ class Joints:
         if len(self.rows):
             runtime.fill(self.p.poses, self.rows)
         R, size = self._own_forces()
-        x, x_n = self._places(u)
-        _, self.S = self._kinematics(q)
+        x, x_n = self.places(u)
+        _, self.S = self.kinematics(q)
         self.pushed = []
         forces = self.shares.forces() if self.links else np.zeros((0, 2, *u.shape))
         for k, carried in self.links:
@@ -193,7 +194,7 @@ class Joints:
                 R, size = R - work.sum(0), size + np.abs(work).sum(0)
         return R, size
 
-    def _places(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def places(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions of vertices where forces are taken, and where the pass begins [m]."""
         rest = self.a.values.rest
         return rest + u, rest + self.u_n
@@ -247,7 +248,7 @@ class Joints:
         K, columns = self.M / self.h**2 + np.diag(self.k + self.c / self.h), []
         if any(len(part.at) for part in self.pushed):
             blocks = self._blocks()
-            x, x_n = self._places(self.p.held_at)
+            x, x_n = self.places(self.p.held_at)
             turns = bracket(self.S[:, None], self.S[None]) * self.above[..., None]  # [b, a]
             for (k, carried), part in zip(self.links, self.pushed):
                 at, f = part.at, part.f

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.mechanics.joints.joints import moved
 from diffsim_ti.mechanics.obstacles.contact_record import SharesAdjoint
-from diffsim_ti.mechanics.robots.joints import moved
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
 from diffsim_ti.terms.robots.model import bracket
 
@@ -29,7 +29,7 @@ class JointSweep:
     def _moments(self) -> list:
         """(rows of translation and of rotation, joints that move it, its points at the pass's end and beginning) of links"""
         J, place = self.joints, self.joints.a.poses.place_of
-        now, before = J._kinematics(J.q)[0], J.poses_n
+        now, before = J.kinematics(J.q)[0], J.poses_n
         return [(3 * k, 3 * place[k], carried, t[1], t_n[1]) for (k, carried), t, t_n in zip(J.links, now, before)]
 
     def _rate_by_place(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,12 +76,12 @@ class JointSweep:
 
     def _derivatives(self, robot, own: slice) -> tuple[np.ndarray, ...]:
         J = self.joints
-        return robot.model.derivatives(J.q_n[own], J.v_n[own], J._acceleration[own], J.masses[own], J.gravity)
+        return robot.model.derivatives(J.q_n[own], J.v_n[own], J.acceleration[own], J.masses[own], J.gravity)
 
     def _of_friction(self) -> list:
         """(vertices, joints that move the link, f, f', sum over vertices of f' . change of J' by q_b, [b, a])"""
         J, out = self.joints, []
-        _, x_n = J._places(J.p.held_at)
+        _, x_n = J.places(J.p.held_at)
         turns = bracket(J.S_n[:, None], J.S_n[None]) * J.above[..., None]
         for (_, carried), part in zip(J.links, J.pushed):
             force, moment = part.drag.sum(0), np.cross(x_n[part.at], part.drag).sum(0)
@@ -125,7 +125,7 @@ class JointTangent(JointSweep):
         out += J.M @ (self.dq / J.h**2 + self.dv / J.h) + J.c * self.dq / J.h
         out += J.k * dtargets - dk * (J.q - J.targets) - dc * (J.q - J.q_n) / J.h
         out += rows[schedule.load_row(rows, J.j)][:, 2]
-        x, x_n = J._places(J.p.held_at)
+        x, x_n = J.places(J.p.held_at)
         dx, dx_n = held + moved_numbers.rest, du + moved_numbers.rest
         for (k, *_), (vertices, carried, f, drag, bent) in zip(J.links, self._of_friction()):
             both = ((J.S, x, shares[k, 0], f, dx), (J.S_n, x_n, shares[k, 1], drag, dx_n))
@@ -174,7 +174,7 @@ class JointAdjoint(JointSweep):
         if not J.links:
             return by_places, by_lag, np.zeros((J.a.poses.size, 3))
         seed = np.zeros((len(J.a.contacts), 2, n, 3))
-        x, x_n = J._places(J.p.held_at)
+        x, x_n = J.places(J.p.held_at)
         for (k, *_), (vertices, carried, f, drag, bent) in zip(J.links, self._of_friction()):
             own = self.w * carried
             for side, S, y in ((0, J.S, x), (1, J.S_n, x_n)):
