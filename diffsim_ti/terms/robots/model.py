@@ -34,7 +34,10 @@ class RobotModel:
 
     def __init__(self, text: str, base: np.ndarray):
         self.pin = pin = pinocchio()
-        self.model = model = pin.buildModelFromXML(text)
+        try:
+            self.model = model = pin.buildModelFromXML(text)
+        except ValueError as error:
+            raise ValueError(f"Robot.from_urdf: Pinocchio, which has written why, does not read it: {error}") from error
         placed = pin.SE3(rotations.turned(as_pose(base)[1], np.eye(3)).T, np.array(as_pose(base)[0]))
         for j in range(1, model.njoints):
             if model.parents[j] == 0:
