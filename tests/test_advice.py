@@ -342,6 +342,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("outputs/contact_slip.py", "pass friction= to it"): "test_contact_force.py",
     ("outputs/contact_slip.py", "a robot moves the obstacle"): "test_robots.py",
     ("mechanics/robots.py", "far from the origin in float32"): "test_robots.py",
+    ("mechanics/robots.py", "leave out reduced= and Tie"): "test_robots.py",
     ("terms/robots/urdf.py", "has dry friction"): "test_robots.py",
     ("outputs/pixel_tracks.py", "take frames.computed"): "test_camera.py",
     ("monitor/chatter.py", "vibrates at {} m/s"): "test_contact_friction.py",

@@ -115,6 +115,8 @@ def test_advice_works_when_it_is_followed(pressing):
     with pytest.raises(ValueError, match="take what='share'"):
         ds.ContactSlip("arm_tip").settled(pressing)
     assert ds.ContactSlip("arm_tip", what="share").settled(pressing).what == "share"
+    with pytest.raises(ValueError, match="leave out reduced= and Tie"):
+        ds.ImplicitEulerSolver(scene_of(ds.Robot.from_urdf(ARM, links=()), reduced={"ymin": "affine"}))
     far = dict(mesh=moved([1e5, 0, 0]), terms=[ds.Robot.from_urdf(ARM, links=())], fixed="ymin")
     with pytest.raises(ValueError, match='pass precision="f64"'):
         ds.ImplicitEulerSolver(pressing.replace(**far, precision="f32"))

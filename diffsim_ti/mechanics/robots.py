@@ -34,6 +34,8 @@ class Robots(Interaction):
             raise ValueError(
                 f"{type(solver).__name__}: robots are unknowns of backward Euler steps alone: take ImplicitEulerSolver"
             )
+        if self.scene.reduced:
+            raise ValueError("robots do not support reduced sets and ties beside them: leave out reduced= and Tie")
         if self.scene.origin.any():
             raise ValueError(
                 'robots do not support bodies far from the origin in float32: pass precision="f64", or move all nearer to it'

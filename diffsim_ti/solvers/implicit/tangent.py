@@ -104,12 +104,11 @@ class ImplicitTangent(RecordedPasses):
             push = self.joints.force(shares, held, self.du)
             dR = dR - ws.joints.of_joints(ws.joints.follow(push), dR.shape)
         d_star = self.solve(dR)
-        if self.joints:
-            dq = ws.joints.follow(push - ws.joints.of_body(d_star))
         if ws.volumes:
             targets = ws.volumes.targets_jvp(ws.potential.held_at, held, tangent)
             d_star, change = ws.volumes.tangent(ws.potential.held_at, d_star, targets, self.solve)
             self.chamber_record.note(j, save_every, change)
+        dq = ws.joints.follow(push - ws.joints.of_body(d_star)) if self.joints else None
         d_star = held + d_star
         if self.joints:
             poses = poses + self.joints.rows_jvp(dq, np.zeros_like(dq))
