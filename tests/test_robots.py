@@ -38,7 +38,7 @@ ARM = urdf(
     joint("elbow", "continuous", "upper", "fore", "0.3 0 0", more=""),
     joint("flange", "fixed", "fore", "tip", "0.2 0 0", more=""),
 )
-MESH = ds.TetrahedralMesh.create_box((3, 3, 3), 0.06)
+MESH = ds.TetrahedralMesh.create_box((3, 3, 3), 0.06).with_tetrahedron_set("all", np.arange(48))
 SOFT = ds.StableNeoHookean(3e4, 0.35)
 
 
@@ -116,7 +116,7 @@ def test_advice_works_when_it_is_followed(pressing):
         ds.ContactSlip("arm_tip").settled(pressing)
     assert ds.ContactSlip("arm_tip", what="share").settled(pressing).what == "share"
     with pytest.raises(ValueError, match="leave out reduced= and Tie"):
-        ds.ImplicitEulerSolver(scene_of(ds.Robot.from_urdf(ARM, links=()), reduced={"ymin": "affine"}))
+        ds.ImplicitEulerSolver(scene_of(ds.Robot.from_urdf(ARM, links=()), reduced={"all": "affine"}))
     far = dict(mesh=moved([1e5, 0, 0]), terms=[ds.Robot.from_urdf(ARM, links=())], fixed="ymin")
     with pytest.raises(ValueError, match='pass precision="f64"'):
         ds.ImplicitEulerSolver(pressing.replace(**far, precision="f32"))

@@ -65,6 +65,7 @@ class Joints:
                 self.links.append((names.index(name), carried))
         self.shares = Shares(workspace) if self.links else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
+        self.loose = max(1e-6, 1e3 * self.eps)  # of their forces, what rounding of the vertices' places may leave
         self._known, self._zero, self._held, self._placed, self._anchor = None, None, None, None, None
         self.q, self.left, self.now = None, 0.0, self.start()
 
@@ -136,7 +137,7 @@ class Joints:
 
     def end(self) -> None:
         """The pass is over. Raises NotConverged where the joints are not in balance."""
-        if not self.left <= max(self.ws.solver.tolerance, 1e-6):
+        if not self.left <= max(self.ws.solver.tolerance, self.loose):
             raise NotConverged(
                 f"the joints of robots are out of balance by {self.left:.2g} of their forces: take smaller steps",
                 [self.left],
@@ -213,7 +214,7 @@ class Joints:
             left, scale = np.linalg.norm(R), np.linalg.norm(size)
             stalled = 0 if left < 0.5 * best else stalled + 1
             known = max(1e-13, 4 * self.eps) * scale + self._rounding()
-            if not left > known or (stalled > 3 and left <= 1e-6 * scale):
+            if not left > known or (stalled > 3 and left <= self.loose * scale) or stalled > 20:
                 break
             best = min(best, left)
             _, K = self.linear
