@@ -42,7 +42,7 @@ class Robot(GivenOverTime, Term):
 
     with friction by the velocities of body and links in the same step, so that no wrench lags. The inertia M(q_n), the bias
     b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and the arms of friction are those where the step begins:
-    they change by O(h) within it, which keeps the first order of backward Euler. What a link does to a vertex it feels
+    they change by O(h) within it, which keeps the first order of backward Euler. Action is reaction
     to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
 
     All inputs have a gradient, by names that begin with the robot's: "positions", "velocities", shape (joints,), where a
