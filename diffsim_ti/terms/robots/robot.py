@@ -41,9 +41,9 @@ class Robot(GivenOverTime, Term):
           + 1/2 k (q - q_target)^2 + 1/2 c (q - q_n)^2 / h - tau . q,    p = q_n + h v_n,
 
     with friction by the velocities of body and links in the same step, so that no wrench lags. The inertia M(q_n), the bias
-    b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and the arms of friction are those where the step begins:
-    they change by O(h) within it, which keeps the first order of backward Euler. Action is reaction
-    to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
+    b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and arms and normal forces of friction, as of every obstacle,
+    are those where the step begins: they change by O(h) within it, which keeps the first order of backward Euler. Action is
+    reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
 
     All inputs have a gradient, by names that begin with the robot's: "positions", "velocities", shape (joints,), where a
     run starts [rad or m, per s]; "torques", (joints,) or (steps, joints) [N m or N]; "targets", of shape (joints,),
