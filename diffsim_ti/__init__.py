@@ -26,9 +26,9 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.energy_balance import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import CenterOfMass, ChamberPressure, ContactForce, ContactSlip, ContactTraction, Dissipation
-from diffsim_ti.outputs import ElasticEnergy, EnclosedVolume, KineticEnergy, Length, MaterialPoints, PixelTracks
-from diffsim_ti.outputs import PlasticStrain, Reaction, SectionForce, SelfContactForce, SmoothMaximum, Strain, Stress
-from diffsim_ti.outputs import TactilePad, Tension, WorkOfLoads
+from diffsim_ti.outputs import ElasticEnergy, EnclosedVolume, JointPositions, JointVelocities, KineticEnergy, Length
+from diffsim_ti.outputs import MaterialPoints, PixelTracks, PlasticStrain, Reaction, SectionForce, SelfContactForce
+from diffsim_ti.outputs import SmoothMaximum, Strain, Stress, TactilePad, Tension, WorkOfLoads
 from diffsim_ti.outputs.load_path import CriticalPoint, LoadPath, load_path
 from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.rollout import Frames, Rollout
@@ -42,7 +42,7 @@ from diffsim_ti.state.schedule import UnequalSteps
 from diffsim_ti.state.solve_report import Buckled, SolveReport
 from diffsim_ti.terms import Anchor, BodyForce, Box, Cable, Capsule, Cylinder, Drag, ElasticFoundation, ExternalForce
 from diffsim_ti.terms import FilledChamber, GasChamber, Gravity, Ground, Growth, HalfSpace, MeshObstacle
-from diffsim_ti.terms import MultiPointConstraint, Muscle, Pose, Pressure, RemoteLoad, RotatingFrame, SelfContact
+from diffsim_ti.terms import MultiPointConstraint, Muscle, Pose, Pressure, RemoteLoad, Robot, RotatingFrame, SelfContact
 from diffsim_ti.terms import Sphere, Spring, SurfaceDrag, Tie, Traction
 from diffsim_ti.torch_bridge.ensemble import Ensemble
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
@@ -52,7 +52,7 @@ __all__ = ["init", "TetrahedralMesh", "StableNeoHookean", "SmithNeoHookean", "Li
 __all__ += ["StVenantKirchhoff", "MooneyRivlin", "Yeoh", "Gent", "Grown", "InitialStress"]
 __all__ += ["Ogden", "Orthotropic", "FibreReinforced", "KelvinVoigt", "J2Plasticity"]
 __all__ += ["Prony", "Gravity", "Drag", "ExternalForce", "Traction", "Pressure", "GasChamber", "FilledChamber"]
-__all__ += ["BodyForce", "Spring", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
+__all__ += ["BodyForce", "Spring", "Robot", "RotatingFrame", "SurfaceDrag", "Cable", "Anchor", "ElasticFoundation"]
 __all__ += ["Growth", "Muscle", "Tie", "Dissipation", "PlasticStrain"]
 __all__ += ["SelfContact", "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "Pose"]
 __all__ += ["Scene", "stable_dt", "SemiImplicitSolver", "VelocityVerletSolver", "ImplicitEulerSolver"]
@@ -61,7 +61,7 @@ __all__ += ["BatchFrames", "Ensemble", "UnequalSteps", "adaptive_steps", "SolveR
 __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPoints", "ContactForce"]
 __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactSlip", "ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
-__all__ += ["PixelTracks", "TactilePad"]
+__all__ += ["JointPositions", "JointVelocities", "PixelTracks", "TactilePad"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["load_path", "LoadPath", "CriticalPoint", "SectionForce", "SmoothMaximum"]
 __all__ += ["RemoteLoad", "MultiPointConstraint"]

@@ -22,7 +22,7 @@ AREAS = {
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
     "quadratic_answers nafems curved_contact",
     "obstacles and friction": "contact mesh_obstacle contact_area contact_stage contact_rollers "
-    "contact_crossing contact_friction contact_gradients obstacle_pairs own_obstacle poses far_from_origin",
+    "contact_crossing contact_friction contact_gradients obstacle_pairs own_obstacle poses far_from_origin robots",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction "
     "contact_corpus",
     "PyTorch, optimisations": "ensemble torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",

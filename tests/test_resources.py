@@ -53,7 +53,8 @@ def test_import_is_light_and_quiet():
         import sys
         import diffsim_ti
         import taichi.lang.impl as impl
-        heavy = [name for name in ("torch", "matplotlib", "scipy", "meshio", "rich", "typer") if name in sys.modules]
+        names = ("torch", "matplotlib", "scipy", "meshio", "rich", "typer", "pinocchio")
+        heavy = [name for name in names if name in sys.modules]
         print(heavy, impl.get_runtime().prog is None)
     """)
     assert out.strip() == "[] True"  # nothing heavy, nothing printed, no runtime started

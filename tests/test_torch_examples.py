@@ -47,7 +47,7 @@ def test_resumed_controller_is_the_uninterrupted_one(tmp_path, monkeypatch):
 
 def test_arm(tmp_path, capsys):
     """Newton's method is quadratic with a right slope, which differences confirm; the wrench holds the finger."""
-    pytest.importorskip("pytorch_kinematics", reason='pip install "diffsim-ti[robots]"')
+    pytest.importorskip("pinocchio", reason='pip install "diffsim-ti[robots]"')
     arm = example("control/arm")
     numbers = arm.main(tmp_path, quick=True)
     history = numbers["history"]

@@ -11,6 +11,10 @@ from diffsim_ti.outputs import Output
 from diffsim_ti.picture import Camera
 from diffsim_ti.terms import Term
 
+SLIDER = """<robot name="slider"><link name="base"/><link name="head"><inertial><mass value="1"/><inertia ixx="1" iyy="1"
+izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="slide" type="prismatic"><parent link="base"/>
+<child link="head"/><axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
 
 def fall() -> float:
     """The height of a cube after a fall, and what one reads off on the way."""
@@ -81,6 +85,7 @@ def parts() -> int:
         ds.Pressure(([0.0, 1.0], [0.0, 5.0]), surface="ymax"),
         ds.BodyForce((0.0, 1.0, 0.0), per="mass"),
         ds.RotatingFrame((0.0, 1.0, 0.0)),
+        ds.Robot.from_urdf(SLIDER, positions=(0.1,), drive_stiffness=50.0, name="arm"),
         ds.SurfaceDrag(normal=1.2),
         ds.ElasticFoundation(1e3, surface="xmin"),
         ds.Growth(0.01),
@@ -118,6 +123,8 @@ def parts() -> int:
         ds.ContactSlip(ball, "share"),
         ds.PixelTracks(Camera.framing(mesh.vertices), [[0.0, 0.0, 0.0]]),
         ds.TactilePad(ball, "palm", size=(8, 8)),
+        ds.JointPositions("arm"),
+        ds.JointVelocities("arm"),
         ds.SelfContactForce("xmin", part="normal"),
         ds.Stress(kind="first_piola"),
         ds.Strain(principal=True),

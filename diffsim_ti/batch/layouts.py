@@ -13,7 +13,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.runtime import LANES, PRECISIONS, number_type, vector_type
-from diffsim_ti.terms import SelfContact
+from diffsim_ti.terms import Robot, SelfContact
 
 SPREAD = 1024  # items of a loop at least, for Taichi keeps fewer on one thread
 APART = 16  # numbers between what threads note, so that they do not wait for each other's cache lines
@@ -164,6 +164,7 @@ def why_not(solver) -> str | None:
         terms |= dict(reduced_sets=scene.reduced)
     else:
         terms |= dict(reduced_sets_or_ties=scene.reduced, chambers_of_given_volume=scene.holds_volumes)
+        terms |= dict(robots=scene.terms_of(Robot))
     if there := [name.replace("_", " ") for name, some in terms.items() if some]:
         return f"it has {' and '.join(there)}"
     return None if solver.explicit else _why_not_joined(solver)

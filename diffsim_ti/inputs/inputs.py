@@ -172,7 +172,7 @@ class Inputs:
     def _away(self) -> dict:
         """{moving obstacle: how far its path takes it from where it was made, if that is far} [m] (origin.py)."""
         known = self.scene.precision == "f32"
-        places = self.scene.places(0.0).items()
+        places = [(t, row) for t, row in self.scene.places(0.0).items() if t.path is not None]
         return {t: far_part(row[:3], self.length) if known and t.says_places else np.zeros(3) for t, row in places}
 
     def _origin(self, term) -> np.ndarray:

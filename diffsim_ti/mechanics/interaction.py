@@ -174,6 +174,9 @@ class Interaction:
         """Its host form, for implicit steps and statics, stable steps, energies and outputs."""
         raise ValueError(f"{type(self).__name__} has no `host`, which all solvers ask for: write it (host_force.py)")
 
+    def check_solver(self, solver) -> None:
+        """Raise ValueError where a solver does not support it."""
+
     def adjoints(self, values: Derived, shape: bool) -> dict[str, tuple[int, ...]]:
         """{array of vectors that adjoints are added to: its shape}"""
         return {}

@@ -8,12 +8,13 @@ from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.lines.interaction import Foundations, SpringsAndCables
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.pressure.interaction import Pressures
+from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.mechanics.rotating_frame import InertialForces
 from diffsim_ti.mechanics.stress.interaction import Growths
 
 # in the order in which vertices gather their corners: what is no load comes first
 KINDS: tuple[type[Interaction], ...] = (
-    *(SpringsAndCables, Pressures, Gases, FilledChambers, FluidDrag, Foundations, InertialForces, Constraints),
+    *(SpringsAndCables, Pressures, Gases, FilledChambers, FluidDrag, Foundations, InertialForces, Constraints, Robots),
     *(DeadLoads, Growths),  # which have parts of a step of their own
 )
 NUMBERS = {name: kind for each in KINDS for name, kind in each.derived.items()}  # arrays that some kind has of its own

@@ -47,6 +47,10 @@ class ContactSlip(Output):
         out, force = copy(self), self._force.settled(scene)
         out.place, out.num_vertices, term = force.place, force.num_vertices, scene.obstacles[force.place]
         names = scene.input_names(term)
+        if self.what == "velocity" and term.led is not None:
+            raise ValueError(
+                f"{self!r}: a robot moves the obstacle, whose velocity frames do not have; take what='share'"
+            )
         if self.what == "share" and not term.has_friction:
             raise ValueError(f"{self!r}: the obstacle has no friction; pass friction= to it")
         out.friction = names.get("friction")

@@ -39,6 +39,8 @@ class Frames(metaclass=Public):
     `law_state`, where an output reads it: what the law remembers of each tetrahedron, shape (frames, num_tetrahedra, S), or
     (frames, num_tetrahedra, 4, S) at the points of ten-node tetrahedra, in the order of the law's `state_names`.
 
+    `joint_states`, of scenes with robots: joint positions and velocities, shape (frames, joints of all robots, 2).
+
     `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
     the last good one.
 
@@ -59,6 +61,7 @@ class Frames(metaclass=Public):
     chamber_pressures: np.ndarray | None = field(default=None, repr=False)
     sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
     law_state: np.ndarray | None = field(default=None, repr=False)
+    joint_states: np.ndarray | None = field(default=None, repr=False)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: "Run | None" = field(default=None, repr=False)
     error: FloatingPointError | None = None
@@ -84,7 +87,8 @@ class Frames(metaclass=Public):
         return self.outputs[name]
 
 
-NOTED = ("contact_forces", "chamber_pressures", "law_state")  # what runs note besides states, where outputs read it
+# what runs note besides states, where outputs read it
+NOTED = ("contact_forces", "chamber_pressures", "law_state", "joint_states")
 
 
 @dataclass
@@ -92,8 +96,8 @@ class Change:
     """A change of frames and inputs, or the gradient of a loss by them; None, and inputs left out, are zero.
 
     positions [m], velocities [m/s]: shape (frames, num_vertices, 3); inputs: name -> array of the input's shape.
-    contact_forces [N], chamber_pressures [Pa], law_state: of the frames' arrays of that name, where an output says that it
-    reads them.
+    contact_forces [N], chamber_pressures [Pa], law_state, joint_states: of the frames' arrays of that name, where an output
+    says that it reads them.
     positions are those of the frames, which move with rest_positions where displacements are kept, and the other way
     round: they are the variable of the chain rule, and displacements are positions less rest_positions.
     """
@@ -104,6 +108,7 @@ class Change:
     contact_forces: np.ndarray | None = None
     chamber_pressures: np.ndarray | None = None
     law_state: np.ndarray | None = None
+    joint_states: np.ndarray | None = None
 
     @property
     def noted(self) -> dict[str, np.ndarray | None]:
@@ -137,6 +142,7 @@ class Output(metaclass=Public):
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
     reads_law_state = False  # the same of frames.law_state, where the law remembers
+    reads_joint_states = False  # whether it reads frames.joint_states, which runs of robots note
 
     def needs_contact_forces(self, solver) -> bool:
         """Whether runs of this solver must; here, whether it reads them in all."""

@@ -56,7 +56,8 @@ class SmoothMaximum(Output):
             raise ValueError(
                 f"SmoothMaximum: sharpness must be at least 1 and scale above zero, got {sharpness}, {scale}"
             )
-        for flag in ("unit", "cumulative", "reads_contact_forces", "reads_chamber_pressures", "reads_law_state"):
+        reads = "contact_forces", "chamber_pressures", "law_state", "joint_states"
+        for flag in ("unit", "cumulative", *(f"reads_{what}" for what in reads)):
             setattr(self, flag, getattr(of, flag))
 
     def needs_contact_forces(self, solver) -> bool:

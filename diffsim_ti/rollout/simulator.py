@@ -274,6 +274,8 @@ class Simulator(metaclass=Public):
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:
             out["law_state"] = self.law_state
+        if state.joints[0] is not None:
+            out["joint_states"] = np.stack(state.joints[0], 1)
         if self._has_before and not state.fresh[0]:
             before = (runtime.fetch(x)[0] for x in (state.before.u, state.before.v))
             out["displacements_before"], out["velocities_before"] = before
@@ -329,6 +331,8 @@ class Simulator(metaclass=Public):
             runtime.fill(now.before.v, given["velocities_before"][None])
             now.fresh[0] = False
         now.beside[0] = following
+        if "joint_states" in given:
+            now.joints[0] = tuple(given["joint_states"].T.astype(np.float64))
         self.step_count = int(count)
         if more_substeps & given.keys():
             self._take_solver(self.solver.with_substeps(whole("substeps", given["substeps"], 1)))
@@ -361,6 +365,8 @@ class Simulator(metaclass=Public):
             raise ValueError(f"{output!r} counts from the start of a run: pass it to Rollout(..., outputs=[...])")
         frames = self._frames()
         frames.law_state = self.law_state[None]
+        if output.reads_joint_states:
+            frames.joint_states = np.stack(self.workspace.state.joints[0], 1)[None]
         if self._notes:
             frames.contact_forces = self.workspace.contact_forces(self.solver.dt)[1:]
         if output.reads_chamber_pressures and self.scene.holds_volumes:

@@ -18,6 +18,7 @@ from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.substeps import RunSubsteps
 from diffsim_ti.state.bending import FacesBend
 from diffsim_ti.state.watch import ContactResolution
+from diffsim_ti.terms import Robot
 
 RECORD_BYTES = 200e6  # up to which the first run of implicit solvers is recorded
 
@@ -52,6 +53,7 @@ class Sweep:
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
         self.law_states = law_states and bool(solver.scene.law.state_names)  # whether what the law remembers is
+        self.joints = bool(solver.scene.terms_of(Robot))
         self.solver, self.scene, self.steps = solver, solver.scene, steps
         self.save_every = max(steps, 1) if save_every is None else whole("save_every", save_every, 0)
         if self.save_every < 1 or steps % self.save_every:
@@ -124,7 +126,9 @@ class Sweep:
     @property
     def noted(self) -> tuple[str, ...]:
         """What frames hold besides states, by name."""
-        return tuple(n for n, asked in zip(NOTED, (self.contacts, self.chambers, self.law_states)) if asked)
+        return tuple(
+            n for n, asked in zip(NOTED, (self.contacts, self.chambers, self.law_states, self.joints)) if asked
+        )
 
     def noted_values(self) -> dict[str, np.ndarray]:
         """The same of the last run."""
@@ -134,7 +138,8 @@ class Sweep:
     def _noted(self, of, chamber_pressures: Callable) -> dict[str, np.ndarray]:
         """What a workspace or a tangent has of what frames hold besides states."""
         contact_forces, law_state = lambda: of.contact_forces(self.frame_time), lambda: of.law_frames.values()
-        make = dict(zip(NOTED, (contact_forces, chamber_pressures, law_state)))
+        joint_states = lambda: np.array(of.joint_frames)  # noqa: E731
+        make = dict(zip(NOTED, (contact_forces, chamber_pressures, law_state, joint_states)))
         return {name: make[name]() for name in self.noted}
 
     @property
@@ -364,6 +369,8 @@ class Sweep:
             self._adjoint.law_frames.put(seed.noted["law_state"])
             if self.solver.last_frame_is_state:
                 self._adjoint.law_frames.add_to(self._adjoint.z, self.num_frames - 1)
+        if self.joints:
+            self._adjoint.joints.seed_frames(seed.noted["joint_states"], self.solver.last_frame_is_state)
         stop = 0 if self.truncate is None else self.solver.schedule.first(max(0, self.steps - self.truncate))
         kept, end = self._kept, checkpoints.num_segments
         self._kept = kept[:1]  # the sweep overwrites the others, also if it does not get to its end

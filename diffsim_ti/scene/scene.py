@@ -40,6 +40,13 @@ def _kind(term) -> tuple:
     return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
 
 
+def _with_companions(terms: Iterable) -> tuple:
+    """Terms and what comes with them, each once."""
+    out = list(terms)
+    out += [part for term in out for part in getattr(term, "companions", ()) if not any(part is other for other in out)]
+    return tuple(out)
+
+
 def _density(given: ArrayLike | Mapping[str, float] | None, mesh: TetrahedralMesh, material: Material) -> ArrayLike:
     """One number or one per tetrahedron, from those of sets too; the material's where none is given."""
     if given is None:
@@ -141,7 +148,9 @@ class Scene(MadeAgain):
             raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
         self.volume = volume
         density = _density(density, mesh, self.material)
-        self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
+        self.terms = _with_companions(
+            [terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()")
+        )
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
         self.motion, (self.posed_supports, self.translates) = motion, self.supports.parts_of(motion)
@@ -275,8 +284,10 @@ class Scene(MadeAgain):
         return {name: sampled_path(name, t.path, times) for name, t in zip(names, self.moving)}
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
-        """Displacement or pose of each moving obstacle at a time [s], shape (3,), (6,) or (7,) [m]."""
-        return {term: sampled_path(term.path_name, term.path, [time])[0] for term in self.moving}
+        """Displacement or pose of each moving obstacle at a time [s], shape (3,), (6,) or (7,) [m]; of those that a robot
+        moves that at the start."""
+        led = {term: term.led for term in self.ordered_terms if term.led is not None}
+        return led | {term: sampled_path(term.path_name, term.path, [time])[0] for term in self.moving}
 
     # ---- its terms, by kinds and by names ----------------------------------------------------------------------------
 

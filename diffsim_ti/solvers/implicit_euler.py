@@ -22,7 +22,7 @@ class ImplicitEulerSolver(ImplicitSolver):
     -0.981 m/s, -0.0981 m
     """
 
-    order = 1
+    order, moves_robots = 1, True
 
     def stage(self, rate, fresh, j):
         h = float(self.schedule.length(j))

@@ -64,6 +64,7 @@ class Solver(metaclass=Public):
     serial_limit_in_lanes = 10_000
     arguments = ("dt", "substeps", "parallel", "allow_unstable", "check_start")  # of the constructor, besides the scene
     kicks = stability.ONE  # of a substep
+    moves_robots = False  # whether the joints of robots are unknowns of its passes
     stages_contact = False  # whether obstacles act as a stage of its passes, not as a force
 
     def __init__(
@@ -78,6 +79,7 @@ class Solver(metaclass=Public):
         dt, substeps = number("dt", dt, unit="s"), checked(substeps, self.explicit)
         self.check_scene(scene)
         for x in scene.interactions:
+            x.check_solver(self)
             if self.explicit and x.in_kernels and type(x).kernel is Interaction.kernel:
                 raise ValueError(
                     f"{type(x).__name__} has no `kernel`, which explicit steps run: write it, or take an implicit solver"

@@ -17,6 +17,7 @@ class History:
         n = arrays.num_vertices
         self.num_slots = num_slots
         self.beside: list = [None] * num_slots  # what solvers keep with each state
+        self.joints: list = [None] * num_slots  # positions and velocities of the joints of robots
         self.u = runtime.array(arrays.vector, num_slots, n)
         self.v = runtime.array(arrays.vector, num_slots, n)
         self.f = runtime.array(arrays.vector, num_slots, n) if record else runtime.array(arrays.vector, 1, 1)
@@ -28,7 +29,7 @@ class History:
     def copy(self, slot: int, target: "History", to: int) -> None:
         """Copy the state in a slot to one of another history; on the CPU without the cost of launches."""
         runtime.check_alive(self.u.owner)
-        target.beside[to] = self.beside[slot]
+        target.beside[to], target.joints[to] = self.beside[slot], self.joints[slot]
         for k, view in enumerate(self._views):
             if view is None:
                 copy_slot(self._state[k], slot, target._state[k], to)

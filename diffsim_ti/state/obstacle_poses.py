@@ -43,9 +43,10 @@ class ObstaclePoses:
         self.away = away
         self.columns = [(k, c) for k, (_, _, c) in enumerate(obstacles) if c >= 0]
         turning = [(k, c) for k, (force, _, c) in enumerate(obstacles) if force.turns]
-        self.turning = [(3 * len(obstacles) + MORE * n, c) for n, (_, c) in enumerate(turning)]
+        rows = [3 * len(obstacles) + MORE * n for n in range(len(turning))]
+        self.turning = [(row, c) for row, (_, c) in zip(rows, turning) if c >= 0]  # robots write those of others
         self.size = 3 * len(obstacles) + MORE * len(turning)
-        self.place_of = {k: row // 3 for (k, _), (row, _) in zip(turning, self.turning)}  # of obstacle k among places
+        self.place_of = {k: row // 3 for (k, _), row in zip(turning, rows)}  # of obstacle k among places
 
     def check(self, path: np.ndarray | None, at: Moment) -> None:
         """Raise ValueError for a pass in which an obstacle turns farther than its motion is resolved."""

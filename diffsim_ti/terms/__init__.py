@@ -15,6 +15,7 @@ from diffsim_ti.terms.obstacles.half_space import HalfSpace
 from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.pose import Pose
+from diffsim_ti.terms.robots.robot import Robot
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.surface_drag import SurfaceDrag
 from diffsim_ti.terms.term import Term, VertexForce
@@ -23,9 +24,9 @@ from diffsim_ti.terms.tie import Tie
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
 LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, Muscle)
 LOADS += (Growth, ElasticFoundation, RemoteLoad, MultiPointConstraint)
-TERMS = (Gravity, Drag, RotatingFrame, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact, Tie)
+TERMS = (Gravity, Drag, RotatingFrame, Robot, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact, Tie)
 __all__ = ["Anchor", "BodyForce", "Box", "Cable", "Capsule", "Chamber", "Cylinder", "Drag", "ElasticFoundation"]
 __all__ += ["ExternalForce", "FilledChamber", "GasChamber", "Gravity", "Ground", "Growth", "HalfSpace", "Load"]
 __all__ += ["MeshObstacle", "Muscle", "OBSTACLES", "Obstacle", "Pose", "Pressure", "SelfContact", "Sphere", "Spring"]
-__all__ += ["RotatingFrame", "SurfaceDrag", "Term", "TERMS", "Tie", "Traction"]
+__all__ += ["Robot", "RotatingFrame", "SurfaceDrag", "Term", "TERMS", "Tie", "Traction"]
 __all__ += ["MultiPointConstraint", "RemoteLoad", "VertexForce"]

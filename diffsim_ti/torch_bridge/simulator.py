@@ -12,6 +12,7 @@ from diffsim_ti.inputs.step_values import StepValues
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.terms import Robot
 from diffsim_ti.torch_bridge.autograd import refuse_state, torch, uncompiled
 from diffsim_ti.torch_bridge.rollout_node import rollout_frames
 from diffsim_ti.torch_bridge.tensors import DTYPES
@@ -61,6 +62,8 @@ class TorchSimulator(metaclass=Public):
             raise ValueError(
                 f"TorchSimulator: {type(solver).__name__} looks back two steps, and {remedy}, or ImplicitEulerSolver"
             )
+        if self.scene.terms_of(Robot):
+            raise ValueError(f"TorchSimulator: its states have no joints of robots: {remedy}")
         if self.scene.posed_supports:
             raise ValueError("TorchSimulator: a motion by a Pose counts from the start of a run; give displacements")
         self._run = Rollout(solver, 1, outputs=outputs)

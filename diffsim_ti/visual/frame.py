@@ -9,7 +9,7 @@ from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.obstacles import floor_of, obstacle_surfaces
+from diffsim_ti.obstacles import floor_of, link_rows, obstacle_surfaces
 from diffsim_ti.outputs import Output, Stress
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads
@@ -104,8 +104,9 @@ class Frame(metaclass=Public):
         shown |= _loads(scene, frames.positions[k], step, frames.inputs)
         drawn = marks_of(scene, frames.positions[k], float(frames.times[k]), step, frames.inputs)
         rows = {name: frames.inputs[name][step] for name in scene.inputs.paths if name in frames.inputs}
-        surfaces = obstacle_surfaces(scene, float(frames.times[k]), rows)
-        moved = [points for points, _ in surfaces] if scene.moving else None
+        links = link_rows(scene, None if frames.joint_states is None else frames.joint_states[k])
+        surfaces = obstacle_surfaces(scene, float(frames.times[k]), rows | links)
+        moved = [points for points, _ in surfaces] if scene.moving or links else None
         return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
 
     @classmethod
@@ -119,7 +120,9 @@ class Frame(metaclass=Public):
         fields |= measured_fields(simulator)
         x, values = simulator.positions, simulator.values
         rows = {name: values[name][-1] for name in scene.inputs.paths}
-        moved = [points for points, _ in obstacle_surfaces(scene, simulator.time, rows)] if scene.moving else None
+        joints = simulator.workspace.state.joints[0]
+        rows |= link_rows(scene, None if joints is None else np.stack(joints, 1))
+        moved = [points for points, _ in obstacle_surfaces(scene, simulator.time, rows)] if rows else None
         drawn = marks_of(scene, x, simulator.time, simulator.step_count, values)
         by = last or simulator
         shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)

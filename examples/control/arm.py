@@ -1,6 +1,6 @@
 """A robot arm presses with a soft finger: which joint angles bring its tip to a place on a table with a given force?
 
-`pytorch_kinematics` (pip install "diffsim-ti[robots]") knows where three joints bring the flange. There the finger is
+Pinocchio (pip install "diffsim-ti[robots]") knows where three joints bring the flange. There the finger is
 clamped, and follows as `ds.Pose` says, here by a torch tensor of displacements and quaternions. Equilibria with friction
 tell the force on the table and where the tip is. One backward pass for each goes through contact, finger, clamp and
 kinematics down to the joints, so that Newton's method solves three equations for three angles. The wrench at the flange
@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytorch_kinematics as pk
+import pinocchio as pin
 import torch
 
 import diffsim_ti as ds
@@ -30,7 +30,7 @@ PLACE, FORCE = np.array([0.36, 0.03]), 2.0  # where the tip is to be (x, z) [m],
 TOLERANCE = 1e-6  # of the residuals: forces over FORCE, places over a centimetre
 
 
-def arm() -> pk.SerialChain:
+def arm() -> pin.Model:
     """A turning base, a shoulder and an elbow; y is up, links of 0.3, 0.25 and 0.2 m."""
     joints = [
         ("base", "turn", "0 0 0", "0 1 0"),
@@ -44,7 +44,31 @@ def arm() -> pk.SerialChain:
     )
     text += '<joint name="end" type="fixed"><parent link="fore"/><child link="flange"/><origin xyz="0.2 0 0"/></joint>'
     links = "".join(f'<link name="{name}"/>' for name in ("base", "turn", "upper", "fore", "flange"))
-    return pk.build_serial_chain_from_urdf(f'<robot name="arm">{links}{text}</robot>', "flange").to(dtype=torch.float64)
+    return pin.buildModelFromXML(f'<robot name="arm">{links}{text}</robot>')
+
+
+class Flange(torch.autograd.Function):
+    """(rotations, positions [m]) of the flange for joint angles, shape (n, 3), with Pinocchio's Jacobian."""
+
+    @staticmethod
+    def forward(ctx, angles, model):
+        data, frame = model.createData(), model.getFrameId("flange")
+        R, p, J = [], [], []
+        for q in angles.detach().numpy():
+            J.append(pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED))
+            placed = pin.updateFramePlacement(model, data, frame)
+            R.append(placed.rotation.copy())
+            p.append(placed.translation.copy())
+        R, p, J = (torch.tensor(np.array(x)) for x in (R, p, J))
+        ctx.save_for_backward(R, J)
+        return R, p
+
+    @staticmethod
+    def backward(ctx, by_R, by_p):
+        R, J = ctx.saved_tensors
+        M = by_R @ R.transpose(1, 2)
+        turn = torch.stack([M[:, 2, 1] - M[:, 1, 2], M[:, 0, 2] - M[:, 2, 0], M[:, 1, 0] - M[:, 0, 1]], 1)
+        return torch.einsum("nda,nd->na", J, torch.cat([by_p, turn], 1)), None
 
 
 def quaternions(R: torch.Tensor) -> torch.Tensor:
@@ -88,8 +112,7 @@ class Pressing:
 
     def places(self, angles: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(rotations, positions [m]) of the flange for joint angles, shape (n, 3)."""
-        matrices = self.chain.forward_kinematics(angles).get_matrix()
-        return matrices[:, :3, :3], matrices[:, :3, 3]
+        return Flange.apply(angles, self.chain)
 
     def frames(self, angles: torch.Tensor):
         """Equilibria as the joints go straight from HOME to these angles."""
@@ -169,8 +192,11 @@ def main(folder: str | None = None, quick: bool = False) -> dict:
 def draw(pressing: Pressing, angles: torch.Tensor, frames, path: Path) -> None:
     """Arm and finger, what the table does to the finger, and what the arm does to it."""
     x, mesh = frames.positions[-1].detach().numpy(), pressing.mesh
-    links = pressing.chain.forward_kinematics(angles[None], end_only=False)
-    ends = [links[name].get_matrix()[0, :3, 3].numpy() for name in ("base", "upper", "fore", "flange")]
+    model, data = pressing.chain, pressing.chain.createData()
+    pin.framesForwardKinematics(model, data, angles.numpy())
+    ends = [
+        data.oMf[model.getFrameId(name, pin.BODY)].translation.copy() for name in ("base", "upper", "fore", "flange")
+    ]
     force, forces = pressing.wrench(frames)[0], frames["table"][-1].detach().numpy()
     table = arrows("table on the finger, at each vertex [N]", mesh, x, np.arange(mesh.num_vertices), forces)
     hand = Arrows("arm on the finger, at the flange [N]", ends[-1][None], force[None], np.array([False]))

@@ -41,6 +41,7 @@ class Potential:
         # [1/s], of changes in a pass; zero in static solves
         self.rate = runtime.array(a.fp, 1) if a.law.viscous else None
         self.hosts = NONE  # host forces that have an energy: set by whom a time is known
+        self.joints = None  # of robots (mechanics/joints/joints.py): set by whom passes are known
         self.rigid: RigidSets | None = None  # sets that do not deform: set by whom passes are known
 
     kernels_kind = PotentialKernels
@@ -82,6 +83,8 @@ class Potential:
             runtime.fill(self.lag, np.stack([u, x]))
         if len(poses):
             runtime.fill(self.poses, poses)
+        if self.joints:
+            self.joints.u_n = u
         if self.pairs:
             self.pairs.follow(poses, AT_BEGIN)
             self.pairs.begin(u)
@@ -98,6 +101,8 @@ class Potential:
             self.pairs.place(self.u)
         if self.rigid:
             self.rigid.place(self.held_at)
+        if self.joints:
+            self.joints.settle(self.held_at)
         return self.held_at
 
     def hold(self, history, slot: int) -> None:
@@ -109,12 +114,13 @@ class Potential:
     def at_rest(self):
         """At rest, and then back to where it was."""
         u, kept = self.held_at, [(x, runtime.fetch(x)) for x in (self.z, self.held) if x is not None]
-        self.place(np.zeros_like(u))
-        if self.z is not None:
-            runtime.fill(self.z, self.arrays.initial_state_blocks())
-        if self.held is not None:
-            runtime.fill(self.held, 0)
-        yield
+        with self.joints.still() if self.joints else nullcontext():
+            self.place(np.zeros_like(u))
+            if self.z is not None:
+                runtime.fill(self.z, self.arrays.initial_state_blocks())
+            if self.held is not None:
+                runtime.fill(self.held, 0)
+            yield
         self.place(u)
         for array, numbers in kept:
             runtime.fill(array, numbers)
@@ -152,6 +158,8 @@ class Potential:
         if self.pairs:
             contact = np.concatenate([contact, self.pairs.energies()])
         contact = np.concatenate([contact, *(part.energies(self.held_at) for part in self._on_host())])
+        if self.joints:
+            contact = np.concatenate([contact, self.joints.energies()])
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
@@ -170,7 +178,8 @@ class Potential:
         runtime.fill(self.w, (w / scale)[None])
         self.multiply(convex)
         y = runtime.fetch(self.y)[0].astype(np.float64) * -scale
-        return y + self.hosts.product(self.held_at, w, convex) if self.hosts else y
+        y = y + self.hosts.product(self.held_at, w, convex) if self.hosts else y
+        return y - self.joints.product(w) if self.joints else y
 
     def multiply(self, convex: bool = False) -> None:
         """y = -d2E/du2 w on the device, without host forces."""

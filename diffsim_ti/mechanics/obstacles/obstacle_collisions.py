@@ -29,7 +29,9 @@ class ObstacleCollisions:
         """Pass j."""
         poses, path, moment = self.ws.arrays.poses, self.ws.arrays.rows["path"], self.moment(j, stage)
         poses.check(path, moment)
-        self.rows = poses.value(path, moment)
+        self.rows, joints = poses.value(path, moment), self.ws.joints
+        if joints:
+            joints.begin(j, stage, self.rows)
         self.at_stage, self.before = self.rows[::3].copy(), self.rows[1::3].copy()
 
     def moment(self, j: int, stage: Stage) -> Moment:
@@ -60,7 +62,8 @@ class ObstacleCollisions:
 
     def past(self, u, step, most: float = 1.0) -> tuple:
         """(how far along a step no obstacle is met where obstacles are in the pass, what would be met then)."""
-        share = self.detection.share(u, step, self.rows[::3], most=most)
+        drift = self.ws.joints.drift(u, step) if self.ws.joints else 0.0
+        share = self.detection.share(u, step, self.rows[::3], drift, most)
         return share, self.detection.met
 
     def pairs_share(self, u, step, places, drift, most: float) -> tuple[float, Met | None]:
@@ -83,6 +86,8 @@ class ObstacleCollisions:
     def put(self, places: np.ndarray) -> None:
         """Take forces with obstacles elsewhere."""
         self.rows[::3] = places
+        if self.ws.joints:
+            self.ws.joints.forget()
         if len(places):
             runtime.fill(self.ws.potential.poses, self.rows)
         if self.ws.pairs:

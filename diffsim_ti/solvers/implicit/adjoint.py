@@ -12,6 +12,7 @@ from diffsim_ti import runtime
 from diffsim_ti.common.blas_threads import one_blas_thread
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import ChamberRecord
+from diffsim_ti.mechanics.joints.sweeps import JointAdjoint
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, SharesAdjoint
 from diffsim_ti.mechanics.stress.law_state import LawFrames
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
@@ -45,6 +46,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.held = a.frozen_numbers()  # in a pass, by the law
         self._vjp = self.kernels.vjp.bind(a.in_vectors, **own)
         self.chamber_record = ChamberRecord(workspace.solver, workspace.constrained_chambers)
+        self.joints = JointAdjoint(workspace, self.features, self.numbers) if workspace.joints else None
         self.contacts = None
         if workspace.impulses:
             self.contacts = ContactRecord(workspace)
@@ -102,6 +104,8 @@ class ImplicitAdjoint(RecordedPasses):
                 self.q += self.frames[1][frame]
                 if self.law_frames:
                     self.law_frames.add_to(self.z, frame)
+                if self.joints:
+                    self.joints.add_frame(frame)
 
     def _pull_back_growth(self, j: int) -> None:
         """The adjoint of growth by tetrahedra in pass j goes to its step."""
@@ -143,6 +147,8 @@ class ImplicitAdjoint(RecordedPasses):
             initial=0.0
         ):  # rounding of what is held, no direction of ours
             seed = np.zeros_like(seed)
+        if self.joints:
+            seed = self.joints.begin(seed, 0.0 if seen is None else seen[2])
         by_star = self.solve(seed)
         if ws.volumes:
             by_pressure = self.chamber_record.adjoint(j, save_every)
@@ -163,6 +169,9 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.potential.surface_friction:
             by_place, by_friction, by_begin = ws.potential.surface_friction.vjp(ws.potential.held_at, by_star)
             reaction, by_x, by_lag = reaction + by_place, by_x + by_friction, by_lag + by_begin
+        by_joints = self.joints.pull_back(by_star) if self.joints else (0.0, 0.0, 0.0)
+        if self.joints:
+            reaction, self.rest_adj = reaction + by_joints[0], self.rest_adj + self.joints.by_rest
         share = ws.load_share(j, s)
         self.gravity = self.gravity + share * self._sum(ws.mass * by_star)
         self._add_mass(by_star, self.weight(share))
@@ -175,8 +184,12 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.potential.has_friction:
             by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
             by_lag, x_adj = by_lag + by_first, x_adj + by_first_x
+        if self.joints:
+            by_lag, x_adj = by_lag + by_joints[1][0], x_adj + by_joints[1][1]
+            by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64)) + by_joints[2]
+            self.gravity = self.gravity + self.joints.end(by_poses, self.by_hosts)
         if self.path is not None:
-            by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64))
+            by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64)) + by_joints[2]
             by_poses = by_poses + (0.0 if seen is None else seen[2])
             if ws.pairs and ws.pairs.obstacles:
                 by_poses = by_poses + ws.pairs.obstacles.take_rows()
@@ -253,6 +266,8 @@ class ImplicitAdjoint(RecordedPasses):
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint."""
         self.p, self.q, self.pending = factor * self.p, factor * self.q, [factor * x for x in self.pending]
+        if self.joints:
+            self.joints.by_q, self.joints.by_v = factor * self.joints.by_q, factor * self.joints.by_v
         if self.z is not None:
             runtime.fill(self.z, runtime.fetch(self.z) * factor)
 
@@ -274,6 +289,8 @@ class ImplicitAdjoint(RecordedPasses):
         out.growths = self.growth
         out.forces, out.motion, out.path = self.forces, self.motion, self.path
         out.add(self.by_hosts)
+        if self.joints:
+            self.joints.collect(out.parameters)
         if self.motion is not None:
             out.displacement[a.held] += self.anchor
         return out

@@ -37,7 +37,7 @@ class Operator:
         where a product needs the host."""
         potential, parts = self.potential, []
         plain = isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections
-        if not plain or self.others:
+        if not plain or self.others or potential.joints:
             return None
         if isinstance(self.mass, ConsistentMass):
             parts.append(self.mass.blocks())

@@ -185,7 +185,7 @@ class Newton:
         """What takes rounds without the host; None where that takes part in forces or in linear solves."""
         potential, preconditioner, static = self.potential, self.preconditioner, not diagonal_of(self.mass).any()
         plain = self.detection and (isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections)
-        on_host = potential.pairs or potential.hosts or self.others or self.volumes or self.rigid
+        on_host = potential.pairs or potential.hosts or self.others or self.volumes or self.rigid or potential.joints
         if not plain or on_host or isinstance(self.mass, ConsistentMass) or not preconditioner.solver.takes_rounds:
             return None
         if preconditioner.given_up or static and preconditioner.spent > 2 * preconditioner.patience:

@@ -11,6 +11,7 @@ from diffsim_ti.solvers.implicit.multigrid import Following
 class RecordedPasses:
     """What tangent and reverse sweep share: a recorded pass with everything that its equation names."""
 
+    joints = None  # derivatives of those of robots (mechanics/joints/sweeps.py)
     transposed = False  # whether equations are solved with the transposed operator
 
     def __init__(self, workspace):
@@ -27,7 +28,11 @@ class RecordedPasses:
         self.x, self.y = ws.inertial(stage, self.u, self.v, self.before)
         self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
         self.mass = stage.inertia * ws.mass
+        if self.joints:
+            self.joints.open(j - base)
         ws.begin(j, stage, self.u, self.x)
+        if self.joints:
+            self.joints.hold()
         ws.rigid.begin(self.u, stage.c0)
         if ws.strains:
             ws.strains.hold(stage, self.u, self.before)

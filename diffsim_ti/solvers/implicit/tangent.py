@@ -9,6 +9,7 @@ from diffsim_ti.common.blas_threads import one_blas_thread
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import ChamberRecord
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
+from diffsim_ti.mechanics.joints.sweeps import JointTangent
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.mechanics.stress.law_state import LawFrames
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
@@ -35,7 +36,8 @@ class ImplicitTangent(RecordedPasses):
         self.held = a.frozen_numbers()
         self._jvp = kernels.jvp.bind(a.in_vectors, **own)
         self.contacts = ContactRecord(workspace) if workspace.impulses else None
-        self._shares = Shares(workspace) if workspace.impulses and len(a.obstacles) else None
+        self.joints = JointTangent(workspace, tangent) if workspace.joints else None
+        self._shares = Shares(workspace) if (workspace.impulses or self.joints) and len(a.obstacles) else None
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
         self.frames, self.chamber_record = ([], []), ChamberRecord(workspace.solver, workspace.constrained_chambers)
 
@@ -66,6 +68,8 @@ class ImplicitTangent(RecordedPasses):
         if ws.rigid:
             held = ws.rigid.held_jvp(held, self.du, tangent.rest)
         poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
+        if self.joints:
+            poses = self.joints.rows() + (0.0 if poses is None else poses)
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
         of_obstacles = dict(poses_dot=poses) if ws.pairs and ws.pairs.obstacles else {}
         if surface_friction:
@@ -94,14 +98,25 @@ class ImplicitTangent(RecordedPasses):
         dR += ws.hosts.jvp(ws.potential.held_at, held, (held - dx) / self.gamma, tangent)
         if ws.rigid:
             dR += ws.rigid.turned(held + tangent.rest)
-        d_star = self.solve(dR + self.mass * (dx + s.gamma * dy - held))
+        dR += self.mass * (dx + s.gamma * dy - held)
+        if self.joints:
+            shares = self._shares.forces("jvp", **self._moved) if self._shares else None
+            push = self.joints.force(shares, held, self.du)
+            dR = dR - ws.joints.of_joints(ws.joints.follow(push), dR.shape)
+        d_star = self.solve(dR)
         if ws.volumes:
             targets = ws.volumes.targets_jvp(ws.potential.held_at, held, tangent)
             d_star, change = ws.volumes.tangent(ws.potential.held_at, d_star, targets, self.solve)
             self.chamber_record.note(j, save_every, change)
+        dq = ws.joints.follow(push - ws.joints.of_body(d_star)) if self.joints else None
         d_star = held + d_star
+        if self.joints:
+            poses = poses + self.joints.rows_jvp(dq, np.zeros_like(dq))
+            runtime.fill(self.poses, poses)
         if self.contacts:
             self._note_contacts(j, save_every, d_star, dx, poses)
+        if self.joints:
+            self.joints.step(dq)
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
@@ -111,20 +126,29 @@ class ImplicitTangent(RecordedPasses):
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before
 
+    @property
+    def _moved(self) -> dict:
+        """What the forces of obstacles change with, besides places."""
+        return dict(tangent=(SimpleNamespace(lag=self.lag, poses=self.poses), self.numbers))
+
     def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray, dx: np.ndarray, poses) -> None:
         """Change of the forces of obstacles, and of friction between surfaces, in pass j, u* changing by d_star."""
         p = self.ws.potential
         runtime.fill(p.w, d_star[None])
-        record = dict(tangent=(SimpleNamespace(lag=self.lag, poses=self.poses), self.numbers))
         along, by_pairs = (d_star, dx, self.du, self.numbers), self.ws.pair_shares
         of_bodies = dict(poses_dot=poses, only=0) if by_pairs else {}
 
         def change():
-            out = self._shares.forces("jvp", **record)
+            out = self._shares.forces("jvp", **self._moved)
             return out + by_pairs.jvp(*along, self.tangent.parameters, poses) if by_pairs else out
 
         friction = lambda: p.surface_friction.jvp(p.held_at, *along, **of_bodies)  # noqa: E731
         self.contacts.add(j, save_every, self.stage.static, change, friction)
+
+    @property
+    def joint_frames(self) -> list:
+        """Changes of the frames' joint positions and velocities."""
+        return self.joints.frames
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""
@@ -136,6 +160,8 @@ class ImplicitTangent(RecordedPasses):
             saved.append(now.copy())
         if self.law_frames:
             self.law_frames.note(frame, self.z)
+        if self.joints:
+            self.joints.note()
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities."""

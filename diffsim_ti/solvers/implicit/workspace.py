@@ -10,10 +10,12 @@ from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.joints.joints import Joints
 from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
+from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.mechanics.stress.frozen_strains import FrozenStrains
 from diffsim_ti.mechanics.stress.law_state import LawStateKernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
@@ -30,6 +32,7 @@ from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.solvers.implicit.prescribed import PrescribedInPasses
 from diffsim_ti.state.history import History
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms import Growth
 
@@ -46,6 +49,7 @@ class TwoStepHistory(History):
 class ImplicitWorkspace(PrescribedInPasses):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
+    joints: Joints | None = None  # of robots
     pairs_kind, potential_kind, newton_kind = ImplicitPairs, Potential, Newton
     collisions_kind, preconditioners_kind = ObstacleCollisions, Preconditioners
     enough = 20  # rounds with which a solution that was not found is found by load stepping
@@ -65,6 +69,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         if not self._launches.get("potential"):
             self.potential = self.potential_kind(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
+            self.joints = self.potential.joints = Joints(self) if self.scene.interaction(Robots) else None
+            self._start_joints()
             self.strains = FrozenStrains(self) if self.potential.held is not None else None
         a = self.arrays
         self._mass = self.mass_of(derived)
@@ -107,7 +113,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         return self.solver.stage(self.rate, True, 0).static
 
     def balance(self) -> EnergyWatch | None:
-        if self.scene.term(Growth) or self.scene.law.state_names or self.is_static:
+        if self.scene.term(Growth) or self.scene.law.state_names or self.is_static or self.joints:
             return None
         self.energy_watch = self.energy_watch or EnergyWatch(self)
         return self.energy_watch
@@ -115,9 +121,15 @@ class ImplicitWorkspace(PrescribedInPasses):
     def restart(self) -> None:
         super().restart()
         self.multipliers = {}
+        self._start_joints()
         self._restart()
         if self.energy_watch:
             self.energy_watch.clear()
+
+    def _start_joints(self) -> None:
+        if self.joints:
+            self.state.joints[0] = self.joints.start()
+            self.place_obstacles(0)
 
     def forget(self) -> None:
         """The state was set from outside: there is none before it."""
@@ -151,6 +163,22 @@ class ImplicitWorkspace(PrescribedInPasses):
         copy_slot(source.before.v, s, target.before.v, min(t, target.before.num_slots - 1))
         target.fresh[t] = source.fresh[s]
 
+    def make_frames(self, count: int) -> None:
+        super().make_frames(count)
+        self.joint_frames = [None] * count  # positions and velocities of joints, a column each
+
+    def save_frame(self, frame: int) -> None:
+        super().save_frame(frame)
+        if self.joints:
+            self.joint_frames[frame] = np.stack(self.state.joints[0], 1)
+
+    def place_obstacles(self, now: int) -> None:
+        super().place_obstacles(now)
+        if self.joints:
+            rows = runtime.fetch(self.arrays.offsets)[:, :3].astype(np.float64)
+            self.joints.put(rows, self.state.joints[0][0], (AT_STAGE, AT_BEGIN))
+            runtime.fill(self.arrays.offsets, rows)
+
     # ---- a pass -----------------------------------------------------------------------------------------------------
 
     @one_blas_thread
@@ -170,6 +198,8 @@ class ImplicitWorkspace(PrescribedInPasses):
             self.preconditioner.following = self.state.beside[0] or Following()
             begin, self.newton.reports = time.perf_counter(), []
             try:
+                if self.joints:
+                    self.joints.now = self.state.joints[0]
                 u_next, v_next = self._pass(j, u, v, before)
                 if self.bending:
                     self.bending.check(j + 1, u_next)
@@ -183,6 +213,8 @@ class ImplicitWorkspace(PrescribedInPasses):
                 self.state.fresh[0] = False
             runtime.fill(self.state.u, u_next[None])
             runtime.fill(self.state.v, v_next[None])
+            if self.joints:
+                self.state.joints[0] = self.joints.now
             if self.state.z is not None:
                 self.launch_law_state("forward", self.arrays.features(), j, 0, 0, at=self.state)
             self.state.beside[0] = self.preconditioner.following
@@ -238,6 +270,9 @@ class ImplicitWorkspace(PrescribedInPasses):
         except NotConverged as error:
             raise self.collisions.explained(error, u) from None
         self.u_star = u_star
+        if self.joints:
+            self.potential.place(u_star)
+            self.joints.end()
         self.keep_multipliers(j)
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
@@ -310,16 +345,16 @@ class ImplicitWorkspace(PrescribedInPasses):
         """Where Newton's method begins: u or, if Phi is lower there, one of `starts`, or less far where something would turn
         inside out or meet an obstacle. The solution of a pass is the minimum that descends from u: where inertia or loads
         would lead what is stiff or light there are others."""
-        best, least = u, 0.0
+        best, least, apart = u, 0.0, self.pairs or self.joints
         rise_of = self.newton.rises_from(u, problem) if starts else None
         for start in starts:
             # surfaces are looked at together where they have not passed through each other
-            rise = 0.0 if self.pairs else rise_of(start)
-            if not self.pairs and not rise < least:
+            rise = 0.0 if apart else rise_of(start)
+            if not apart and not rise < least:
                 continue
             longest = min(self.collisions.past(u, start - u)[0], self.pairs_share(u, start - u))
             at = self.rigid.nearest(u + longest * (start - u))
-            rise = rise_of(at) if self.pairs or longest < 1 else rise
+            rise = rise_of(at) if apart or longest < 1 else rise
             if rise < least and not (self.rigid and not self.newton.is_free(u, at - u)):  # it turns on another way
                 best, least = at, rise
         return best

@@ -199,7 +199,8 @@ class Obstacle(Term):
         pull = gravity.values["gravity"] if gravity else np.zeros(3)
         g, axis = float(np.linalg.norm(pull)), int(np.argmax(np.abs(pull) + [0, 1e-300, 0]))
         positions = scene.mesh.vertices if initial_positions is None else np.asarray(initial_positions, np.float64)
-        start = np.zeros(3) if self.path is None else sampled_path(self.path_name, self.path, [0.0])[0]
+        start = np.zeros(3) if self.led is None else self.led
+        start = start if self.path is None else sampled_path(self.path_name, self.path, [0.0])[0]
         fall = max(float(self.gap(positions, start).min()), 0.0)
         first = 0.0 if initial_velocities is None else np.linalg.norm(np.atleast_2d(initial_velocities), axis=1).max()
         led = own = 0.0
@@ -285,9 +286,10 @@ class Obstacle(Term):
     def surface_at(self, size: float, time: float, row: np.ndarray | None = None) -> Triangles | None:
         """`surface` where its path has taken it at a time [s], or at a keyframe of its path."""
         shape = self.surface(size)
-        if shape is None or self.path is None:
+        if shape is None or (self.path is None and self.led is None):
             return shape
-        row = sampled_path(self.path_name, self.path, [time])[0] if row is None else row
+        if row is None:
+            row = self.led if self.path is None else sampled_path(self.path_name, self.path, [time])[0]
         return carried(shape[0], row, self.about), shape[1]
 
     def floor_height(self) -> float | None:

@@ -1,0 +1,1 @@
+"""The joints of robots as unknowns of implicit steps."""

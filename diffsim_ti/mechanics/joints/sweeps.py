@@ -1,0 +1,218 @@
+"""What tangents and reverse sweeps of implicit passes do of the joints of robots (joints.py)."""
+
+import numpy as np
+
+from diffsim_ti.mechanics.joints.joints import moved
+from diffsim_ti.mechanics.obstacles.contact_record import SharesAdjoint
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
+from diffsim_ti.terms.robots.model import bracket
+
+
+class JointSweep:
+    """Derivatives of the rows of links, and of the joints' own equation, in the pass that the workspace stands in."""
+
+    def __init__(self, workspace):
+        self.ws, self.joints = workspace, workspace.joints
+
+    def open(self, slot: int) -> None:
+        """Stand in the pass whose states are in a slot of the record and in the next."""
+        record = self.ws.record
+        self.joints.now = record.joints[slot]
+        self._end = record.joints[slot + 1][0]
+
+    def hold(self) -> None:
+        """Stand where the pass ended; it has begun."""
+        self.joints.hold(self._end)
+
+    # ---- rows of links -----------------------------------------------------------------------------------------------
+
+    def _moments(self) -> list:
+        """(rows of translation and of rotation, joints that move it, its points at the pass's end and beginning) of links"""
+        J, place = self.joints, self.joints.a.poses.place_of
+        now, before = J.kinematics(J.q)[0], J.poses_n
+        return [(3 * k, 3 * place[k], carried, t[1], t_n[1]) for (k, carried), t, t_n in zip(J.links, now, before)]
+
+    def _rate_by_place(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Change of velocity of a link's own point t, and of its spin, by q_n at a constant rate, shape (joints, joints, 3)
+        each: [b, a] of joint a by q_b."""
+        J = self.joints
+        turns = bracket(J.S_n[:, None], J.S_n[None]) * J.above[..., None]
+        here = moved(J.S_n, t)
+        at = turns[..., :3] + np.cross(turns[..., 3:], t) + np.cross(J.S_n[None, :, 3:], here[:, None])
+        return at, turns[..., 3:]
+
+    def rows_jvp(self, dq: np.ndarray, dq_n: np.ndarray) -> np.ndarray:
+        """Change of the rows for changes of the joints where the pass ends, and where it begins."""
+        J, rate = self.joints, (self.joints.q - self.joints.q_n) / self.joints.h
+        out, drate = np.zeros((J.a.poses.size, 3)), (dq - dq_n) / J.h
+        for row, turn, carried, t, t_n in self._moments():
+            for m, S, at, by in ((AT_STAGE, J.S, t, dq), (AT_BEGIN, J.S_n, t_n, dq_n), (RATE, J.S_n, t_n, drate)):
+                out[row + m] += (by * carried) @ moved(S, at)
+                out[turn + m] += (by * carried) @ S[:, 3:]
+            by_point, by_spin = self._rate_by_place(t_n)
+            own = dq_n * carried, rate * carried
+            out[row + RATE] += np.einsum("bad,b,a->d", by_point, *own)
+            out[turn + RATE] += np.einsum("bad,b,a->d", by_spin, *own)
+        return out
+
+    def rows_vjp(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of the joints where the pass ends, and where it begins."""
+        J, rate = self.joints, (self.joints.q - self.joints.q_n) / self.joints.h
+        by_q, by_q_n = np.zeros((2, J.count))
+        for row, turn, carried, t, t_n in self._moments():
+            pulled = [
+                carried * (moved(S, at) @ rows[row + m] + S[:, 3:] @ rows[turn + m])
+                for m, S, at in ((AT_STAGE, J.S, t), (AT_BEGIN, J.S_n, t_n), (RATE, J.S_n, t_n))
+            ]
+            by_q += pulled[0] + pulled[2] / J.h
+            by_point, by_spin = self._rate_by_place(t_n)
+            bent = by_point @ rows[row + RATE] + by_spin @ rows[turn + RATE]
+            by_q_n += pulled[1] - pulled[2] / J.h + carried * (bent @ (rate * carried))
+        return by_q, by_q_n
+
+    def _each(self):
+        """(robot, its joints)"""
+        return zip(self.joints.robots.terms, self.joints.slices)
+
+    def _derivatives(self, robot, own: slice) -> tuple[np.ndarray, ...]:
+        J = self.joints
+        return robot.model.derivatives(J.q_n[own], J.v_n[own], J.acceleration[own], J.masses[own], J.gravity)
+
+    def _of_friction(self) -> list:
+        """(vertices, joints that move the link, f, f', sum over vertices of f' . change of J' by q_b, [b, a])"""
+        J, out = self.joints, []
+        _, x_n = J.places(J.p.held_at)
+        turns = bracket(J.S_n[:, None], J.S_n[None]) * J.above[..., None]
+        for (_, carried), part in zip(J.links, J.pushed):
+            force, moment = part.drag.sum(0), np.cross(x_n[part.at], part.drag).sum(0)
+            bent = (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
+            out.append((part.at, carried, part.f, part.drag, bent))
+        return out
+
+
+class JointTangent(JointSweep):
+    """Changes of the joints along a run."""
+
+    def __init__(self, workspace, tangent):
+        super().__init__(workspace)
+        self.tangent = tangent
+        self.dq, self.dv, *_ = self.joints.robots.numbers(tangent.parameters)
+        self.frames: list = []
+
+    def note(self) -> None:
+        """A frame has the change of the present state."""
+        self.frames.append(np.stack([self.dq, self.dv], 1))
+
+    def rows(self) -> np.ndarray:
+        """Change of the rows of links, the joints staying where the pass ends."""
+        return self.rows_jvp(np.zeros_like(self.dq), self.dq)
+
+    def force(self, shares: np.ndarray, held: np.ndarray, du: np.ndarray) -> np.ndarray:
+        """Change of -dPhi/dq, body and joints staying where the pass ends, but for its fixed vertices.
+
+        shares: change of what obstacles do to vertices; held: change of places; du: of those where the pass begins.
+        """
+        J, moved_numbers, out = self.joints, self.tangent, np.zeros(self.joints.count)
+        _, _, dk, dc, dm = J.robots.numbers(moved_numbers.parameters)
+        dk = np.where(J.robots.prescribed, 0.0, dk)
+        at = J.a.features().gravity
+        dg = moved_numbers.parameters[at : at + 3] if at >= 0 else np.zeros(3)
+        for robot, own in self._each():
+            by_q, by_v, by_m, by_g = self._derivatives(robot, own)
+            out[own] -= by_q @ self.dq[own] + by_v @ self.dv[own] + by_m @ dm[own] + by_g @ dg
+        schedule, rows = self.ws.solver.schedule, moved_numbers.joints
+        dtargets = schedule.pressure(rows, J.j, J.share)
+        out += J.M @ (self.dq / J.h**2 + self.dv / J.h) + J.c * self.dq / J.h
+        out += J.k * dtargets - dk * (J.q - J.targets) - dc * (J.q - J.q_n) / J.h
+        out += rows[schedule.load_row(rows, J.j)][:, 2]
+        x, x_n = J.places(J.p.held_at)
+        dx, dx_n = held + moved_numbers.rest, du + moved_numbers.rest
+        for (k, *_), (vertices, carried, f, drag, bent) in zip(J.links, self._of_friction()):
+            both = ((J.S, x, shares[k, 0], f, dx), (J.S_n, x_n, shares[k, 1], drag, dx_n))
+            for S, y, change, force, dy in both:
+                out -= carried * np.einsum("iad,id->a", moved(S, y[vertices]), change[vertices])
+                out -= carried * np.einsum("iad,id->a", np.cross(S[:, 3:], dy[vertices][:, None]), force)
+            out -= self.dq @ bent
+        return out
+
+    def step(self, dq: np.ndarray) -> None:
+        """The pass has changed the joints so."""
+        self.dq, self.dv = dq, (dq - self.dq) / self.joints.h
+
+
+class JointAdjoint(JointSweep):
+    """Adjoints of the joints in a reverse sweep."""
+
+    def __init__(self, workspace, features, numbers):
+        super().__init__(workspace)
+        self._shares = SharesAdjoint(workspace, features, numbers) if self.joints.links else None
+
+    def seed_frames(self, seeds: np.ndarray | None, last_is_state: bool) -> None:
+        """Begin with the adjoints of the frames, shape (frames, joints, 2)."""
+        frames = len(self.ws.joint_frames)
+        self.frames = np.zeros((frames, self.joints.count, 2)) if seeds is None else seeds
+        self.by_q, self.by_v = self.frames[-1].T.copy()
+        self.numbers = np.zeros((5, self.joints.count))
+
+    def add_frame(self, frame: int) -> None:
+        """Add the adjoints of a frame."""
+        self.by_q, self.by_v = self.by_q + self.frames[frame, :, 0], self.by_v + self.frames[frame, :, 1]
+
+    def begin(self, seed: np.ndarray, rows: np.ndarray | float) -> np.ndarray:
+        """What the body's equation is to be solved for; rows: adjoint of the obstacles' rows by what is seen of contacts."""
+        by_q, self._to_q_n = self.rows_vjp(rows) if np.ndim(rows) else np.zeros((2, self.joints.count))
+        self._seed = self.by_q + self.by_v / self.joints.h + by_q
+        return seed - self.joints.of_joints(self.joints.follow(self._seed), seed.shape)
+
+    def pull_back(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(adjoint of all places, of the two rows of lag, of the obstacles' rows) by the joints' equation, the body's having
+        the adjoint w; those of rest positions are added by the caller as those of places and of the first row."""
+        J, n = self.joints, len(w)
+        self.w = J.follow(self._seed - J.of_body(w))
+        by_places, by_lag = np.zeros((n, 3)), np.zeros((2, n, 3))
+        self._turned = np.zeros((n, 3))
+        if not J.links:
+            return by_places, by_lag, np.zeros((J.a.poses.size, 3))
+        seed = np.zeros((len(J.a.contacts), 2, n, 3))
+        x, x_n = J.places(J.p.held_at)
+        for (k, *_), (vertices, carried, f, drag, bent) in zip(J.links, self._of_friction()):
+            own = self.w * carried
+            for side, S, y in ((0, J.S, x), (1, J.S_n, x_n)):
+                seed[k, side, vertices] = -np.einsum("a,iad->id", own, moved(S, y[vertices]))
+            by_places[vertices] += np.cross(own @ J.S[:, 3:], f)
+            by_lag[0, vertices] += np.cross(own @ J.S_n[:, 3:], drag)
+            self._to_q_n = self._to_q_n - bent @ self.w
+        self._turned = by_places + by_lag[0]
+        by_u, lag, rows = self._shares.pull_back(seed)
+        by_lag[: len(lag)] += lag if self.ws.potential.has_friction else 0.0
+        return by_places + by_u, by_lag, rows
+
+    @property
+    def by_rest(self) -> np.ndarray:
+        """What comes to rest positions by the arms of forces."""
+        return self._turned
+
+    def end(self, rows: np.ndarray, adj) -> np.ndarray:
+        """Go to where the pass begins. rows: adjoint of the obstacles' rows by the equations of body and joints; adj: takes
+        adjoints of numbers. Returns that of gravity."""
+        J, w = self.joints, self.w
+        by_q_n = self._to_q_n + self.rows_vjp(rows)[1] - self.by_v / J.h
+        by_q_n = by_q_n + J.M @ w / J.h**2 + J.c * w / J.h
+        by_v_n, by_gravity = J.M @ w / J.h, np.zeros(3)
+        for robot, own in self._each():
+            by_q, by_v, by_m, by_g = self._derivatives(robot, own)
+            by_q_n[own] -= w[own] @ by_q
+            by_v_n[own] -= w[own] @ by_v
+            self.numbers[4, own] -= w[own] @ by_m
+            by_gravity -= w[own] @ by_g
+        self.numbers[2] -= np.where(J.robots.prescribed, 0.0, w * (J.q - J.targets))
+        self.numbers[3] -= w * (J.q - J.q_n) / J.h
+        schedule = self.ws.solver.schedule
+        schedule.add_pressure(adj.joints, J.j, J.share, J.k * w)
+        adj.joints[schedule.load_row(adj.joints, J.j)][:, 2] += w
+        self.by_q, self.by_v = by_q_n, by_v_n
+        return by_gravity
+
+    def collect(self, parameters: np.ndarray) -> None:
+        """Add the adjoints of the robots' numbers."""
+        self.joints.robots.add_numbers(parameters, np.concatenate([[self.by_q, self.by_v], self.numbers[2:]]))

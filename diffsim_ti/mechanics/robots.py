@@ -1,0 +1,52 @@
+"""Robots among a scene's interactions: their numbers over time, and which solvers take them."""
+
+import numpy as np
+
+from diffsim_ti.inputs.joints import JointRows
+from diffsim_ti.mechanics.interaction import Interaction
+from diffsim_ti.terms.robots.robot import Robot
+
+
+class Robots(Interaction):
+    """Their joints are unknowns of implicit steps (joints/joints.py), which no other solver has."""
+
+    name, kinds, works, on_host = "robots", (Robot,), "robots", False
+    derived = dict(joints="vectors2")
+
+    def __init__(self, scene, terms):
+        super().__init__(scene, terms)
+        self.count = sum(term.model.size for term in terms)
+        self.prescribed = np.concatenate([term.prescribed for term in terms])
+        self.damping = np.concatenate([term.damping for term in terms])
+        self.typical = np.concatenate([term.typical for term in terms])
+
+    def slices(self) -> list[slice]:
+        """Places of each robot's joints among all."""
+        ends = np.cumsum([0, *(term.model.size for term in self.terms)]).tolist()
+        return [slice(a, b) for a, b in zip(ends, ends[1:])]
+
+    def links(self, own):
+        names = [f"{own[term]} {part}" for term in self.terms for part in ("targets", "torques")]
+        return [JointRows(names, "joints")]
+
+    def check_solver(self, solver) -> None:
+        if not solver.moves_robots:
+            raise ValueError(
+                f"{type(solver).__name__}: robots are unknowns of backward Euler steps alone: take ImplicitEulerSolver"
+            )
+        if self.scene.reduced:
+            raise ValueError("robots do not support reduced sets and ties beside them: leave out reduced= and Tie")
+        if self.scene.origin.any():
+            raise ValueError(
+                'robots do not support bodies far from the origin in float32: pass precision="f64", or move all nearer to it'
+            )
+
+    def numbers(self, parameters: np.ndarray) -> np.ndarray:
+        """Start positions and velocities, drives' stiffness and damping, masses, shape (5, joints of all)."""
+        rows = [parameters[self.scene.inputs.parameters.of(term)].reshape(5, -1) for term in self.terms]
+        return np.concatenate(rows, 1)
+
+    def add_numbers(self, parameters_adj: np.ndarray, adjoint: np.ndarray) -> None:
+        """Adjoint of `numbers`."""
+        for term, own in zip(self.terms, self.slices()):
+            parameters_adj[self.scene.inputs.parameters.of(term)] += adjoint[:, own].ravel()

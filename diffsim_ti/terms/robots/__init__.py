@@ -1,0 +1,1 @@
+"""Articulated robots of URDF files: the file, kinematics and dynamics by Pinocchio, links as obstacles."""

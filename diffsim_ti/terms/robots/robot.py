@@ -1,0 +1,189 @@
+"""Articulated robots, whose joints are unknowns of implicit steps together with the body."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+from numpy.typing import ArrayLike
+from typing_extensions import Unpack
+
+from diffsim_ti.common import rotations
+from diffsim_ti.inputs import NOT_NEGATIVE, POSITIVE, Input
+from diffsim_ti.inputs.description import Range
+from diffsim_ti.inputs.links import Joined
+from diffsim_ti.inputs.loads import InTime
+from diffsim_ti.terms.obstacles.obstacle import Obstacle
+from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
+from diffsim_ti.terms.robots.model import RobotModel
+from diffsim_ti.terms.robots.urdf import Urdf
+from diffsim_ti.terms.term import Term
+
+AT_LEAST_0 = Range(">= 0", NOT_NEGATIVE.holds, in_runs=False)
+
+
+class LinkContact(TypedDict, total=False):
+    """What links take of `ObstacleOptions`."""
+
+    stiffness_per_area: float | None
+    width: float | None
+    friction: float
+    friction_speed: float
+
+
+class Robot(GivenOverTime, Term):
+    """A tree of rigid links and joints, on a base that stands, with the joint positions q as unknowns of implicit steps.
+
+    `Robot.from_urdf(path)` makes one of the model, inputs, targets and name that it finds. A backward Euler step of length h
+    from (x_n, q_n, v_n) is a stationary point, found by descent, of one incremental potential of body and joints,
+
+        Phi(x) + E_contact(x, links(q)) + 1/2 (q - p)^T M (q - p) / h^2 + b . q
+          + 1/2 k (q - q_target)^2 + 1/2 c (q - q_n)^2 / h - tau . q,    p = q_n + h v_n,
+
+    with friction by the velocities of body and links in the same step, so that no wrench lags. The inertia M(q_n), the bias
+    b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and arms and normal forces of friction, as of every obstacle,
+    are those where the step begins: they change by O(h) within it, which keeps the first order of backward Euler. Action is
+    reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
+
+    All inputs have a gradient, by names that begin with the robot's: "positions", "velocities", shape (joints,), where a
+    run starts [rad or m, per s]; "torques", (joints,) or (steps, joints) [N m or N]; "targets", of shape (joints,),
+    (steps, joints), or (steps + 1, joints) of a function or keyframes; "drive_stiffness" k, "drive_damping" c;
+    "masses" [kg], of what each joint carries rigidly, whose inertia goes along. Links are obstacles <robot>_<link> of the
+    scene. Results: `JointPositions`, `JointVelocities`, and `ContactForce("<robot>_<link>")`.
+    Limits of joints, of effort and of velocity in the file are not enforced.
+    Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425; Featherstone 2008, Rigid Body Dynamics
+    Algorithms.
+    """
+
+    def __init__(self, model: RobotModel, inputs: Sequence[Input], targets: OverTime, name: str):
+        self.model, self.shape = model, (model.size,)
+        self.prescribed, self.damping = np.zeros(model.size, bool), np.zeros(model.size)
+        self.companions: tuple[Obstacle, ...] = ()
+        self.places: tuple[
+            tuple[str, int, tuple], ...
+        ] = ()  # (name of an obstacle, joint that carries it, its pose there)
+        super().__init__(amount("targets", targets, self.shape, "rad, m", "joint_targets"), *inputs, name=name)
+        self._give(targets)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        path: str | Path,
+        name: str = "robot",
+        base: ArrayLike = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
+        positions: ArrayLike | None = None,
+        velocities: ArrayLike | None = None,
+        torques: ArrayLike | None = None,
+        targets: OverTime | None = None,
+        drive_stiffness: ArrayLike = 0.0,
+        drive_damping: ArrayLike = 0.0,
+        prescribed: Sequence[str] = (),
+        links: Sequence[str] | None = None,
+        **contact: Unpack[LinkContact],
+    ) -> "Robot":
+        """The robot of a URDF file, or of its text; joints in the order of `robot.joints`.
+
+        base: pose of its root, a displacement [m] and a rotation vector or quaternion (w, x, y, z). positions, velocities:
+        of the joints at the start. torques: constant, or of each step. targets: what drives pull to, in the form of any
+        amount over time, default `positions`. drive_stiffness [N m/rad or N/m], drive_damping: of each joint or of all; the
+        file's damping comes on top. prescribed: joints that follow their targets, within F h^2 / (10^6 M) where F pulls.
+        links: whose collision geometry acts on the body; None: all. contact: of all links, as of an `Obstacle`; they act on
+        vertices by their distance. Meshes are taken from beside the file.
+
+        Raises ValueError for joints of other kinds, mimic joints, closed loops, dry friction, joints that carry no mass, and
+        files that cannot be read; ImportError without Pinocchio.
+        """
+        urdf = Urdf(path)
+        model = RobotModel(urdf.text, np.asarray(base, np.float64))
+        m = model.size
+        for joint, mass in zip(model.joints, model.masses):
+            if not mass > 0:
+                raise ValueError(
+                    f"Robot.from_urdf: joint {joint!r} carries no mass: give its link an <inertial> element"
+                )
+        if m == 0:
+            raise ValueError("Robot.from_urdf: the robot has no joint that moves; take obstacles such as MeshObstacle")
+        start = np.zeros(m) if positions is None else positions
+        every = lambda x: np.full(m, x, np.float64) if np.ndim(x) == 0 else x  # noqa: E731
+        own, zeros = (m,), np.zeros(m)
+        inputs = [
+            Input("positions", start, (own,), "rad, m", plain="joint_positions"),
+            Input(
+                "velocities",
+                zeros if velocities is None else velocities,
+                (own,),
+                "rad/s, m/s",
+                plain="joint_velocities",
+            ),
+            Input("drive_stiffness", every(drive_stiffness), (own,), "N m/rad, N/m", AT_LEAST_0),
+            Input("drive_damping", every(drive_damping), (own,), "N m s/rad, N s/m", AT_LEAST_0),
+            Input("masses", model.masses, (own,), "kg", POSITIVE, plain="link_masses"),
+            Input(
+                "torques", zeros if torques is None else torques, (own, ("steps", m)), "N m, N", plain="joint_torques"
+            ),
+        ]
+        for given in inputs:
+            given.check_value("Robot")  # before the targets, which may be the positions
+        out = cls(model, inputs, start if targets is None else targets, name)
+        for joint in prescribed:
+            if joint not in model.joints:
+                raise ValueError(
+                    f"Robot.from_urdf: no joint {joint!r} to prescribe; there are {', '.join(model.joints)}"
+                )
+            out.prescribed[model.joints.index(joint)] = True
+        out.damping = urdf.dampings(model.joints)
+        M, _ = model.dynamics(out.values["joint_positions"], np.zeros(m), model.masses, np.zeros(3))
+        if not np.linalg.eigvalsh(M)[0] > 0:
+            raise ValueError(
+                "Robot.from_urdf: the robot has no positive definite inertia where it starts: check the <inertial> elements"
+            )
+        out.typical = np.diag(M).copy()
+        out._take_links(urdf.obstacles(name, None if links is None else tuple(links), dict(contact)))
+        return out
+
+    def _take_links(self, found: list) -> None:
+        parts, places = [], []
+        for link, (turn, shift), obstacle in found:
+            joint, (q, t) = self.model.links[link]
+            pose = rotations.product(q, turn), t + rotations.turned(q, shift)
+            obstacle.described = tuple(i for i in obstacle.described if i.name != "path")
+            obstacle.path = None
+            parts.append(obstacle)
+            places.append((obstacle.name, joint, pose))
+        self.companions, self.places = tuple(parts), tuple(places)
+        for obstacle, (q, t) in zip(parts, self.poses(self.values["joint_positions"])):
+            obstacle.led = np.concatenate([t, q])
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self.model.joints
+
+    def poses(self, q: ArrayLike) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(unit quaternion, position [m]) of each of `companions` at joint positions."""
+        return self.poses_of(self.model.kinematics(np.asarray(q, np.float64))[0])
+
+    def poses_of(self, frames: list) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The same of the joints' frames."""
+        base = np.array([1.0, 0, 0, 0]), np.zeros(3)
+        return [joined(base if joint < 0 else frames[joint], pose) for _, joint, pose in self.places]
+
+    @property
+    def num_numbers(self) -> int:
+        return 5 * self.model.size
+
+    def links(self, names, own):
+        constant = ("joint_positions", "joint_velocities", "drive_stiffness", "drive_damping", "link_masses")
+        return [
+            Joined([names[plain] for plain in constant], own),
+            InTime(names["joint_targets"], f"{own} targets", 2, self.keyed),
+            InTime(names["joint_torques"], f"{own} torques", 2, False),
+        ]
+
+    def __repr__(self) -> str:
+        return f"Robot(name={self.name!r}, joints={', '.join(self.joints)})"
+
+
+def joined(a: tuple, b: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Pose b in the frame of pose a, as seen where a is."""
+    return rotations.product(a[0], b[0]), a[1] + rotations.turned(a[0], b[1])

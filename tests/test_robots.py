@@ -1,0 +1,256 @@
+"""Robots of URDF files in implicit steps: joints against closed forms, both ways of contact, and every gradient."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+
+MASS = (
+    '<inertial><origin xyz="{at} 0 0"/><mass value="{m}"/>'
+    '<inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+LIMIT = '<limit lower="-3" upper="3" effort="9" velocity="9"/>'
+
+
+def joint(name, kind, parent, child, at, axis="0 0 1", more=LIMIT):
+    ends = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/><axis xyz="{axis}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{more}</joint>'
+
+
+def link(name, m=None, at=0.1, inertia=1e-3, shape=""):
+    own = "" if m is None else MASS.format(m=m, at=at, i=inertia)
+    geometry = f"<collision><geometry>{shape}</geometry></collision>" if shape else ""
+    return f'<link name="{name}">{own}{geometry}</link>'
+
+
+def urdf(*parts) -> str:
+    return f'<robot name="r">{"".join(parts)}</robot>'
+
+
+ARM = urdf(
+    link("base"),
+    link("upper", 1.0),
+    link("fore", 0.5),
+    link("tip", shape='<sphere radius="0.03"/>'),
+    joint("shoulder", "revolute", "base", "upper", "0 0.3 0", more=LIMIT + '<dynamics damping="0.01"/>'),
+    joint("elbow", "continuous", "upper", "fore", "0.3 0 0", more=""),
+    joint("flange", "fixed", "fore", "tip", "0.2 0 0", more=""),
+)
+MESH = ds.TetrahedralMesh.create_box((3, 3, 3), 0.06).with_tetrahedron_set("all", np.arange(48))
+SOFT = ds.StableNeoHookean(3e4, 0.35)
+
+
+def scene_of(robot, mesh=MESH, terms=(), **options):
+    return ds.Scene(mesh, SOFT, 500.0, [robot, *terms], precision="f64", **options)
+
+
+def moved(shift):
+    return ds.TetrahedralMesh(MESH.vertices + shift, MESH.tetrahedra, vertex_sets=MESH.vertex_sets)
+
+
+WRONG = {
+    "mimics": (
+        urdf(link("a"), link("b", 1.0), joint("j", "revolute", "a", "b", "0 0 0", more='<mimic joint="k"/>')),
+        {},
+    ),
+    "a closed loop": (
+        urdf(
+            link("a"),
+            link("b", 1.0),
+            joint("j", "revolute", "a", "b", "0 0 0"),
+            joint("k", "revolute", "a", "b", "1 0 0"),
+        ),
+        {},
+    ),
+    "is 'floating'": (urdf(link("a"), link("b", 1.0), joint("j", "floating", "a", "b", "0 0 0")), {}),
+    "has dry friction": (
+        urdf(link("a"), link("b", 1.0), joint("j", "revolute", "a", "b", "0 0 0", more='<dynamics friction="1"/>')),
+        {},
+    ),
+    "carries no mass": (urdf(link("a"), link("b"), joint("j", "revolute", "a", "b", "0 0 0")), {}),
+    "has no joint that moves": (urdf(link("a")), {}),
+    "no link 'hand'; the file has base": (ARM, dict(links=["hand"])),
+    "no joint 'wrist' to prescribe": (ARM, dict(prescribed=["wrist"])),
+    "there is no file 'none.urdf'": ("none.urdf", {}),
+    "Pinocchio, which has written why": (
+        urdf(link("a"), link("b", 1.0), joint("j", "revolute", "a", "b", "0 0 0", more="")),
+        {},
+    ),
+    "is not XML": ("<robot>", {}),
+    "expected an element <robot>, got <sdf>": ("<sdf/>", {}),
+    "no mesh .*hand.stl": (
+        urdf(link("a", shape='<mesh filename="hand.stl"/>'), link("b", 1.0), joint("j", "revolute", "a", "b", "0 0 0")),
+        {},
+    ),
+    "must be sphere, box, cylinder or mesh": (
+        urdf(link("a", shape="<cone/>"), link("b", 1.0), joint("j", "revolute", "a", "b", "0 0 0")),
+        {},
+    ),
+    r"positions must be 2 numbers .*got shape \(3,\)": (ARM, dict(positions=[1, 2, 3])),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_what_is_not_supported_is_refused(message):
+    text, options = WRONG[message]
+    with pytest.raises(ValueError, match=message):
+        ds.Robot.from_urdf(text, **options)
+
+
+def test_other_solvers_refuse_and_say_which_takes_robots(monkeypatch):
+    scene = scene_of(ds.Robot.from_urdf(ARM, links=()), fixed="ymin")
+    for solver in (ds.SemiImplicitSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver):
+        with pytest.raises(ValueError, match="take ImplicitEulerSolver"):
+            solver(scene)
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    with pytest.raises(ImportError, match=r'pip install "diffsim-ti\[robots\]"'):
+        ds.Robot.from_urdf(ARM)
+
+
+def test_advice_works_when_it_is_followed(pressing):
+    text = WRONG["has dry friction"][0].replace('friction="1"/>', 'friction="0" damping="2"/>' + LIMIT)
+    assert ds.Robot.from_urdf(text).damping == [2.0]
+    with pytest.raises(ValueError, match="take what='share'"):
+        ds.ContactSlip("arm_tip").settled(pressing)
+    assert ds.ContactSlip("arm_tip", what="share").settled(pressing).what == "share"
+    with pytest.raises(ValueError, match="leave out reduced= and Tie"):
+        ds.ImplicitEulerSolver(scene_of(ds.Robot.from_urdf(ARM, links=()), reduced={"all": "affine"}))
+    far = dict(mesh=moved([1e5, 0, 0]), terms=[ds.Robot.from_urdf(ARM, links=())], fixed="ymin")
+    with pytest.raises(ValueError, match='pass precision="f64"'):
+        ds.ImplicitEulerSolver(pressing.replace(**far, precision="f32"))
+    ds.ImplicitEulerSolver(pressing.replace(**far, precision="f64"))
+
+
+def test_a_pendulum_swings_as_its_equation_says():
+    """Against scipy at 1e-10; backward Euler with what is frozen at the start of each step is of first order."""
+    from scipy.integrate import solve_ivp
+
+    robot = ds.Robot.from_urdf(
+        urdf(link("a"), link("b", 2.0, 0.3), joint("j", "revolute", "a", "b", "0 5 0")),
+        positions=[-0.5],
+        drive_damping=0.1,
+    )
+    inertia = 2.0 * 0.3**2 + 1e-3
+    equation = lambda t, y: (y[1], -(2.0 * 9.81 * 0.3 * np.cos(y[0]) + 0.1 * y[1]) / inertia)  # noqa: E731
+    exact = solve_ivp(equation, (0, 0.2), (-0.5, 0.0), rtol=1e-10, atol=1e-10).y[:, -1]
+    scene, errors = scene_of(robot, terms=[ds.Gravity()], fixed="ymin"), []
+    for steps in (10, 20):
+        outputs = [ds.JointPositions("robot"), ds.JointVelocities("robot")]
+        rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=0.2 / steps), steps, outputs=outputs)
+        frames = rollout.forward()
+        errors.append(np.array([frames[name][-1, 0] for name in ("joint_positions", "joint_velocities")]) - exact)
+    assert np.abs(errors[1]).max() < 0.04
+    assert np.linalg.norm(errors[0]) / np.linalg.norm(errors[1]) == pytest.approx(2, abs=0.1)
+
+
+def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses():
+    """A sliding ball flies at a body that floats; p of both is kept to the tolerance of the solves."""
+    text = urdf(
+        link("a"),
+        link("b", 1.0, 0.0, shape='<sphere radius="0.02"/>'),
+        joint("j", "prismatic", "a", "b", "-0.0313 0.03 0.03", "1 0 0"),
+    )
+    robot = ds.Robot.from_urdf(text, velocities=[1.0], width=2e-3, stiffness_per_area=3e7, friction=0.3)
+    scene = scene_of(robot)
+    solver = ds.ImplicitEulerSolver(scene, dt=4e-3, tolerance=1e-9)
+    rollout = ds.Rollout(solver, 6, save_every=6, outputs=[ds.JointVelocities("robot")])
+    body, m = 500.0 * 0.06**3, scene.mass_matrix().diagonal()[::3]
+    for ratio in (1e-3, 1.0, 1e3):
+        frames = rollout.forward(**{"robot.masses": [ratio * body]})
+        gained = float(m @ frames.velocities[-1, :, 0])
+        lost = ratio * body * (1.0 - frames["joint_velocities"][-1, 0])
+        assert lost > 0.1 * body * min(ratio, 1.0) and gained == pytest.approx(lost, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def pressing():
+    """An arm of two links presses with its tip on a block and slides."""
+    q = np.array([0.3, -1.0])
+    robot = ds.Robot.from_urdf(
+        ARM,
+        "arm",
+        positions=q,
+        velocities=[-1.0, 0.5],
+        targets=lambda t: [0.3 - 10 * t, -1.0 + 5 * t],
+        drive_stiffness=50.0,
+        drive_damping=1.0,
+        friction=0.4,
+        friction_speed=0.05,
+        width=4e-3,
+        stiffness_per_area=3e7,
+    )
+    tip = robot.poses(q)[0][1]
+    mesh = moved(tip - [0.02, 0.092, 0.03])
+    return scene_of(robot, mesh, [ds.Gravity()], fixed="ymin")
+
+
+def test_every_gradient_goes_through_body_and_joints(pressing):
+    steps, rng = 3, np.random.default_rng(1)
+    outputs = [ds.JointPositions("arm"), ds.JointVelocities("arm"), ds.ContactForce("arm_tip")]
+    solver = ds.ImplicitEulerSolver(pressing, dt=5e-3, tolerance=1e-12)
+    rollout = ds.Rollout(solver, steps, save_every=1, gradients="all", outputs=outputs)
+    given = {"arm.torques": rng.normal(size=(steps, 2))}
+    frames = rollout.forward(**given)
+    friction = np.abs(frames["contact_force"][-1, [0, 2]]).max()
+    assert frames["contact_force"][-1, 1] < -1.0 and friction > 0.1
+    seeds = {
+        name: rng.normal(size=frames[name].shape) for name in ("positions", "velocities", *(x.name for x in outputs))
+    }
+    gradients = rollout.vjp(frames, **seeds)
+    change = {}
+    for name, value in frames.inputs.items():
+        size = 1e-3 if name.endswith("_positions") else max(0.1 * float(np.abs(value).max()), 1e-3)
+        change[name] = size * rng.normal(size=value.shape)
+    own = [name for name in change if name.startswith("arm.")]
+    for names in (*([name] for name in own), change.keys() - set(own)):
+        tangents = rollout.tangents(frames, **{name: change[name] for name in names})
+        pushed = sum(float((seeds[k] * tangents[k]).sum()) for k in seeds)
+        pulled = sum(float((gradients[name] * change[name]).sum()) for name in names)
+        assert pushed == pytest.approx(pulled, rel=1e-9), names
+    sides = []
+    for e in (1e-5, -1e-5):
+        there = rollout.forward(**{name: value + e * change[name] for name, value in frames.inputs.items()})
+        sides.append(sum(float((seeds[k] * there[k]).sum()) for k in seeds))
+    whole = sum(float((gradients[name] * change[name]).sum()) for name in change)
+    assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(whole, rel=1e-5)
+
+
+def test_what_links_do_to_vertices_they_feel_in_the_same_step(pressing):
+    """The joints' equation with forces that the body has, from Pinocchio alone: left over is the rounding of the solve."""
+    import pinocchio as pin
+
+    given = {"arm.torques": np.ones((3, 2))}
+    h, outputs = (
+        5e-3,
+        [ds.JointPositions("arm"), ds.JointVelocities("arm"), ds.ContactForce("arm_tip", "normal", "n", True)],
+    )
+    outputs.append(ds.ContactForce("arm_tip", "friction", "f", True))
+    solver = ds.ImplicitEulerSolver(pressing, dt=h, tolerance=1e-12)
+    frames = ds.Rollout(solver, 3, save_every=1, outputs=outputs).forward(**given)
+    (q0, q), (v0, v) = frames["joint_positions"][-2:], frames["joint_velocities"][-2:]
+    model = pin.buildModelFromXML(ARM)
+    data, at = model.createData(), lambda q: np.array([q[0], np.cos(q[1]), np.sin(q[1])])
+    model.gravity.linear = np.array([0, -9.81, 0])
+    own = pin.rnea(model, data, at(q0), v0, (v - v0) / h) + 50 * (q - [0.15, -0.925]) + [1.01, 1.0] * v - 1.0
+    for force, where, x in ((frames["n"][-1], q, frames.positions[-1]), (frames["f"][-1], q0, frames.positions[-2])):
+        J = pin.computeJointJacobians(model, data, at(where))
+        own = own + J[:3].T @ force.sum(0) + J[3:].T @ np.cross(x, force).sum(0)
+    assert frames["n"][-1].sum(0)[1] < -1 and np.abs(own).max() < 1e-9
+
+
+def test_steps_that_are_given_torques_are_those_of_a_run(pressing):
+    solver, torques = ds.ImplicitEulerSolver(pressing, dt=5e-3), np.random.default_rng(2).normal(size=(2, 2))
+    simulator = ds.Simulator(solver)
+    for row in torques:
+        simulator.step(**{"arm.torques": row})
+    frames = ds.Rollout(solver, 2, outputs=[ds.JointPositions("arm")]).forward(**{"arm.torques": torques})
+    np.testing.assert_array_equal(simulator.output(ds.JointPositions("arm")), frames["joint_positions"][-1])
+    kept = simulator.state
+    simulator.step()
+    there = simulator.output(ds.JointVelocities("arm"))
+    simulator.reset()
+    simulator.resume(kept)
+    simulator.step()
+    np.testing.assert_array_equal(simulator.output(ds.JointVelocities("arm")), there)
