@@ -360,9 +360,12 @@ def test_surfaces_push_a_set(kind, friction):
         precision="f64",
         initial_velocities=np.repeat([[0, 0, 0], [0.1, -0.5, 0]], 8, axis=0),
     )
-    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=10), 8, save_every=4, gradients="all")
+    force = ds.SelfContactForce("body_1")
+    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=10), 8, save_every=4, gradients="all", outputs=force)
     frames = rollout.forward()
     m = scene.inputs.derive(scene.inputs.values).mass[:, None]
+    gained = np.diff((m * frames.velocities)[:, 8:].sum(1), axis=0) / 8e-3
+    np.testing.assert_allclose(frames["self_contact_force"][1:], gained, atol=1e-11 * np.abs(gained).max())
     P, L = (m * frames.velocities).sum(1), (m * np.cross(frames.positions, frames.velocities)).sum(1)
     assert np.abs(P - P[0]).max() < 1e-13 and np.abs(L - L[0]).max() < (1e-4 if friction else 1e-13)
     assert frames.velocities[-1, 8:, 1].max() > -0.4

@@ -64,13 +64,10 @@ class Output(metaclass=Public):
     unit = ""  # for pictures
     linear = False  # whether it is linear in positions and velocities
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
-    reads_contact_forces = False  # whether runs must note frames.contact_forces for it
+    # whether runs must note frames.contact_forces for it: what obstacles do (True), or "surfaces" to each other
+    reads_contact_forces: bool | str = False
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
     reads_law_state = False  # the same of frames.law_state, where the law remembers
-
-    def needs_contact_forces(self, solver) -> bool:
-        """Whether runs of this solver must; here, whether it reads them in all."""
-        return self.reads_contact_forces
 
     @staticmethod
     def refuse_growth(output: str, scene: "Scene") -> None:

@@ -62,9 +62,6 @@ class SmoothMaximum(Output):
         for flag in ("unit", "cumulative", "reads_contact_forces", "reads_chamber_pressures", "reads_law_state"):
             setattr(self, flag, getattr(of, flag))
 
-    def needs_contact_forces(self, solver) -> bool:
-        return self.of.needs_contact_forces(solver)
-
     def settled(self, scene: "Scene") -> "SmoothMaximum":
         out = copy(self)
         out.of = self.of.settled(scene)

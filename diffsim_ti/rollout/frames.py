@@ -25,8 +25,7 @@ class Frames(metaclass=Public):
 
     `contact_forces` [N], where an output reads them: what each obstacle did to each vertex, on average since the frame
     before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
-    `scene.obstacles`. The first frame has none. In implicit runs of surfaces with friction a row more has that of each
-    other's friction, in the substep that ends in the frame.
+    `scene.obstacles`; with SelfContact a row more has what surfaces did to each other. The first frame has none.
 
     `computed` are these outputs themselves, as settled for the scene; `sets`: those of inputs that were given by named sets.
 

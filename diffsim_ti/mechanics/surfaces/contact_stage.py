@@ -263,32 +263,36 @@ class PairContact(Stage):
         self.whole.start = self.whole.u if self.whole.near.sets else self.whole.u[self.whole.nodes]
         self.set.fill(self.whole, self._numbers(self.whole, now))
 
-    def _of_obstacles(self, impulses, at: Passes, one: ContactPass):
-        """(frame, place among the obstacles by pairs, which pairs are its) of each that is noted."""
+    def _of_contacts(self, impulses, at: Passes, one: ContactPass):
+        """(frame, place among the contacts, which pairs are its) of each that is noted."""
         frame = impulses.frame_of(at.numbers)
-        for k in range(len(impulses.by_pairs) if frame is not None else 0):
-            own = one.rest[2].contact == k + 1
+        for k, number in enumerate(impulses.contacts if frame is not None else ()):
+            own = one.rest[2].contact == number
             if own.any():
                 yield frame, k, own
 
+    def _bodies(self, one: ContactPass) -> tuple[np.ndarray, np.ndarray]:
+        """(which nodes are vertices, their numbers)"""
+        own = np.flatnonzero(one.nodes < self.num_own)
+        return own, self.nodes[one.nodes[own]]
+
     def _note(self, impulses, at: Passes, one: ContactPass, of, taken: list, changes: bool = False) -> None:
-        """Note what each obstacle did; taken: (part, where it looked), which are taken here unless changes are noted."""
-        for frame, k, own in self._of_obstacles(impulses, at, one):
-            bodies = one.nodes < self.num_own
-            for part, look in taken:
-                if not changes:
-                    one.solver.take(part, of, look)
-                for side, given in enumerate(one.solver.impulses(look, own, of)):
-                    given = given.imag / 1e-30 if changes else given
-                    impulses.of_pairs[frame, k, side, one.nodes[bodies]] += given[: len(bodies)][bodies]
+        """Note what each contact did; taken: (part, where it looked), which are taken here unless changes are noted."""
+        own, vertices = self._bodies(one)
+        for part, look in taken if not changes else ():
+            one.solver.take(part, of, look)
+        for frame, k, which in self._of_contacts(impulses, at, one):
+            for _, look in taken:
+                for side, given in enumerate(one.solver.impulses(look, which, of)):
+                    impulses.of_pairs[frame, k, side, vertices] += (given.imag / 1e-30 if changes else given)[own]
 
     def _seeds(self, impulses, at: Passes, one: ContactPass) -> list:
-        """Adjoints of what each obstacle did."""
-        out, bodies = [], one.nodes < self.num_own
-        for frame, k, own in self._of_obstacles(impulses, at, one) if impulses else ():
+        """Adjoints of what each contact did."""
+        out, (own, vertices) = [], self._bodies(one)
+        for frame, k, which in self._of_contacts(impulses, at, one) if impulses else ():
             seeds = np.zeros((2, *one.parts[0].e.shape))
-            seeds[:, : len(bodies)][:, bodies] = impulses.of_pairs[frame, k][:, one.nodes[bodies]]
-            out.append((own, *seeds))
+            seeds[:, own] = impulses.of_pairs[frame, k][:, vertices]
+            out.append((which, *seeds))
         return out
 
     def _pass(self, numbers: np.ndarray) -> ContactPass:

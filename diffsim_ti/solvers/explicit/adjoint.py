@@ -38,7 +38,7 @@ class ExplicitAdjoint:
         self._of_bodies = a.bodies.adjoint() if a.bodies else {}
         self._arrays |= self._of_bodies
         vars(self).update(self._arrays)
-        self.impulses = ImpulseRecord(workspace) if workspace.impulses else None
+        self.impulses = ImpulseRecord(workspace, workspace.impulses.of_obstacles) if workspace.impulses else None
         self.stages = with_buffers("adjoint", workspace.stages, self)
 
     def fits(self, workspace) -> bool:

@@ -195,10 +195,11 @@ class ExplicitWorkspace(Workspace):
         self._launches.clear()
         return OwnWork(self)
 
-    def record_contacts(self) -> None:
-        self.arrays.record_contacts()
-        self._launches.clear()
-        self.impulses = ImpulseRecord(self)
+    def record_contacts(self, of_obstacles: bool = True) -> None:
+        if of_obstacles:
+            self.arrays.record_contacts()
+            self._launches.clear()
+        self.impulses = ImpulseRecord(self, of_obstacles)
         self.contact.impulse = self.impulses.impulse
 
     def forget_contacts(self) -> None:
