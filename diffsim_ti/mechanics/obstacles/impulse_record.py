@@ -1,4 +1,4 @@
-"""What obstacles, and surfaces to each other, did in each frame of an explicit run, per vertex; also changes and adjoints."""
+"""What obstacles, and surfaces to each other, did in each frame of an explicit run, per vertex; its changes and adjoints."""
 
 import numpy as np
 

@@ -71,7 +71,7 @@ class Factors:
 class SetInContact:
     """A set that moves by a basis; `at`: where its vertices stand among those of the stage.
 
-    x0, x1: their places where a pass begins and where it would end; m: their masses. It has `count` vectors of three numbers.
+    x0, x1: their places where a pass begins and where it would end; m: their masses. It has `count` vectors of numbers.
     """
 
     follows_places = False  # whether N is of where it is
@@ -189,7 +189,7 @@ class RigidInContact(SetInContact):
         return at
 
     def settle_vjp(self, x0, x1, v, e, b, decay, m, by_x, by_v):
-        at, (t, theta, _), (s, sigma) = self._settled(x0, x1, v, e, b, decay, m), e, b[:2]
+        at, t, (s, sigma) = self._settled(x0, x1, v, e, b, decay, m), e[0], b[:2]
         whole = by_v.sum(0)
         mu = np.linalg.solve(at.I, np.cross(at.z, by_v).sum(0))
         by_z, by_m = spread_vjp(at.z, m, -np.outer(mu, at.omega))
