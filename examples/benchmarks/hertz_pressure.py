@@ -58,7 +58,8 @@ def press(cells: int, share: float = 0.8) -> dict:
     pad, traction = ds.TactilePad(ball, "pad", (24, 24)), ds.ContactTraction(ball)
     outputs = [pad, traction, ds.ContactForce(ball), ds.Reaction("ymin")]
     solver = ds.StaticSolver(scene, load_steps=4, tolerance=1e-9)
-    frames = ds.Rollout(solver, 1, save_every=1, outputs=outputs, gradients=[]).forward()
+    rollout = ds.Rollout(solver, 1, save_every=1, outputs=outputs, gradients=[])
+    frames = rollout.forward()
     force = -4 * frames["contact_force"][-1, 1]
     a = (0.75 * force * RADIUS * (1 - NU**2) / E) ** (1 / 3)
     peak = 1.5 * force / (np.pi * a**2)
@@ -68,8 +69,8 @@ def press(cells: int, share: float = 0.8) -> dict:
         return float(np.abs(pressure[own] / (peak * np.sqrt(1 - (r[own] / a) ** 2)) - 1).max())
 
     top = mesh.vertices[:, 1] > -1e-9
-    places = (np.arange(24) + 0.5) / 24 * mesh.vertices[np.unique(mesh.surface_triangles[mesh.surface_sets["pad"]]), 0].max()
-    of_grid = errors(frames["tactile_pad"][-1, ..., 0], np.hypot(*np.meshgrid(places, places)))
+    places = rollout.outputs["tactile_pad"].places
+    of_grid = errors(frames["tactile_pad"][-1, ..., 0], np.hypot(places[..., 0], places[..., 2]))
     at_vertices = errors(-frames["contact_traction"][-1, top, 1], np.hypot(*mesh.vertices[top][:, [0, 2]].T))
     reaction = float(abs(frames["reaction"][-1, 1] * 4 / force - 1))
     seconds = time.process_time() - start
@@ -81,7 +82,7 @@ def press(cells: int, share: float = 0.8) -> dict:
 
 def main(cells=(12, 14, 16)) -> list[dict]:
     ds.init(precision="f64")
-    print(f"{'cells':>6}{'tetrahedra':>12}{'force [N]':>11}{'a / Hertz':>11}{'pad':>8}{'vertices':>10}{'resultant':>11}{'s':>6}")
+    print(" cells  tetrahedra  force [N]  a / Hertz     pad  vertices  resultant     s")
     found = []
     for count in cells:
         found.append(row := press(count))

@@ -39,7 +39,7 @@ class Shares:
 
 
 class ContactRecord:
-    """Forces of all frames, shape (frames, obstacles, 2, num_vertices, 3); a row more has those of surfaces on each other."""
+    """Forces of all frames, shape (frames, obstacles, 2, num_vertices, 3); one row more is of surfaces on each other."""
 
     def __init__(self, workspace):
         frames, a, self.schedule = workspace.frames.frames_u.shape[0], workspace.arrays, workspace.solver.schedule

@@ -26,7 +26,10 @@ class ImpulseRecord:
         self.contacts = [*range(1, 1 + len(self.rows))]
         if a.self_contact:
             self.rows, self.contacts = [*self.rows, len(a.obstacles)], [*self.contacts, 0]
-        self.num_frames, self.num_obstacles = workspace.frames.frames_u.shape[0], len(a.obstacles) if of_obstacles else 0
+        self.num_frames, self.num_obstacles = (
+            workspace.frames.frames_u.shape[0],
+            len(a.obstacles) if of_obstacles else 0,
+        )
         self.impulse = runtime.array(a.vector, max(1, 2 * self.num_frames * self.num_obstacles), a.num_vertices)
         self.clear()
 

@@ -75,7 +75,9 @@ class SetInContact:
     """
 
     follows_places = False  # whether N is of where it is
-    twist = False  # whether its last vector is the sum of dx x f, dx from the places that N is of to where impulses f act
+    twist = (
+        False  # whether its last vector is the sum of dx x f, dx from the places that N is of to where impulses f act
+    )
 
     def __init__(self, body: Together, at: np.ndarray):
         self.vertices, self.at, self.basis = body.vertices, at, body.basis
@@ -115,7 +117,8 @@ class SetInContact:
     def settle_vjp(self, x0, x1, v, e, b, decay, m, by_x, by_v) -> SimpleNamespace:
         """Adjoints for those of the places x' and of velocities."""
         by_e, by_b = (
-            np.einsum("via,vib->ab", self.own, y.reshape(*self.own.shape[:2], -1)).reshape(e.shape) for y in (by_x, by_v)
+            np.einsum("via,vib->ab", self.own, y.reshape(*self.own.shape[:2], -1)).reshape(e.shape)
+            for y in (by_x, by_v)
         )
         return SimpleNamespace(x0=0.0, x1=by_x, v=by_v, e=by_e, b=decay * by_b, decay=(by_b * b).sum(), m=0.0)
 
@@ -138,7 +141,9 @@ class RigidInContact(SetInContact):
         inverse[:3, :3] /= m.sum()
         inverse[3:6, 3:6] = A = np.linalg.inv(J)
         rho = self._turns(r[here], A)
-        return Factors(np.concatenate([N.reshape(-1, 9), np.eye(9)]), inverse, 1 / m.sum() + np.multiply.outer(rho, rho))
+        return Factors(
+            np.concatenate([N.reshape(-1, 9), np.eye(9)]), inverse, 1 / m.sum() + np.multiply.outer(rho, rho)
+        )
 
     @staticmethod
     def _arms(x0, x1, m):

@@ -34,7 +34,9 @@ NODES = dict(start="ints", index="ints", weight="scalars", rest="vectors", x="ve
 NODES |= dict(inverse="scalars", free="vectors", set="ints", sets="ints", factor="vectors", sizes="scalars")
 OF_SETS = FIRST, COUNT, MEMBER, MEMBERS, FACTOR, SIZES, TWIST = range(7)  # what stands in `sets` of each
 STATE = dict.fromkeys(("e", "b", "e_next", "b_next", "xi"), "vectors")
-OF_NODES = dict.fromkeys(("f", "residual", "step", "sum"), "vectors") | dict.fromkeys(("root", "load", "felt"), "scalars")
+OF_NODES = dict.fromkeys(("f", "residual", "step", "sum"), "vectors") | dict.fromkeys(
+    ("root", "load", "felt"), "scalars"
+)
 OF_POINTS = dict.fromkeys(("at_begin", "at_look", "moved", "at_end"), "vectors")
 OF_PAIRS = dict(filled="ints", open="ints", n="vectors")
 OF_PAIRS |= dict.fromkeys(("fading", "begin", "end", "change", "P", "K", "stiff", "q", "r", "z", "p", "Ap"), "scalars")
