@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import battery_of_surfaces
 import numpy as np
+from example_files import example
 
 import diffsim_ti as ds
 
@@ -89,4 +90,4 @@ def test_a_meshed_ball_presses_a_block_as_the_ball_itself_does():
 def test_a_tactile_pad_reads_the_pressure_of_hertz():
     """On a mesh of four cells in a radius, which averages over faces what is curved, within half the radius."""
     found = example("benchmarks/hertz_pressure").press(4, 0.5)
-    assert found["pad"] < 0.05 and found["vertices"] < 0.05 and found["resultant"] < 1e-6
+    assert found["pad"] < 0.07 and found["vertices"] < 0.04 and found["resultant"] < 1e-6

@@ -17,7 +17,7 @@ A pair that presses with P slides with the velocity t = T B v across its normal,
     r = -h mu P f(s / eps) t / |t|,   s + c f(s / eps) = |t|,   c = h sum_i (|B_i| / m_i) S_i,   S_i = sum |B_i| mu P
 
 over nodes i, the last sum over all pairs, with bounds of the blocks of the inverse mass where a set has a matrix
-(reduced/sets_in_contact.py); f is that of terms/obstacles/friction.py. c / (h mu P) is a bound W of the inverse
+(sets_in_contact.py); f is that of terms/obstacles/friction.py. c / (h mu P) is a bound W of the inverse
 mass that the pair meets while all others have friction, too: by Cauchy and Schwarz |sum_p r_p B_p|^2 / m is at most
 sum_p W_p |r_p|^2. With r_p = -(1 - s / |t|) t / W_p all frictions together change the kinetic energy by no more than
 

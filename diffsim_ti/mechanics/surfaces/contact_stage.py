@@ -16,13 +16,13 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.mechanics.reduced.sets_in_contact import RigidInContact, SetInContact
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.buffers import whole
 from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSolver
 from diffsim_ti.mechanics.surfaces.near_set import NearSet
 from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
 from diffsim_ti.mechanics.surfaces.part_kernels import TAKEN
+from diffsim_ti.mechanics.surfaces.sets_in_contact import RigidInContact, SetInContact
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.runtime.slots import VertexRows, copy_slot
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, Moment
@@ -78,7 +78,7 @@ class PairContact(Stage):
     """The stage, of the pairs of a workspace (surface_pairs.py, curved_pairs.py).
 
     Nodes are vertices of surfaces and of reduced sets, corners of obstacles, and in a pass what stands for the numbers of
-    sets (reduced/sets_in_contact.py).
+    sets (sets_in_contact.py).
     """
 
     def __init__(self, pairs, damping: float, reduced=()):

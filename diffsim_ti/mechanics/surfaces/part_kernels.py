@@ -49,7 +49,7 @@ WORK = OF_NODES | OF_POINTS | OF_PAIRS | OF_ROWS | dict(gauss="scalars")
 class PartKernels(Pair):
     """pairs: of a set, those of vertex and triangle first; `acting` are those of them that a part moves, and its kernel is
     given their numbers for num_vt and num_pairs. nodes: C (points, nodes) by rows; `set` that of a node, or -1. Of a set
-    (reduced/sets_in_contact.py): COUNT nodes from FIRST stand for its numbers, so that their inverse mass is 1, and MEMBERS
+    (sets_in_contact.py): COUNT nodes from FIRST stand for its numbers, so that their inverse mass is 1, and MEMBERS
     from MEMBER are vertices, whose is 0; F, (members, COUNT, 3, 3), by rows from FACTOR, where W = F F^T; bounds from SIZES;
     the node of the twist, or -1."""
 

@@ -1,4 +1,4 @@
-"""What contact of surfaces does to sets that move by few numbers, in an explicit pass (surfaces/contact_stage.py).
+"""What contact of surfaces does to sets that move by few numbers, in an explicit pass (contact_stage.py).
 
 The vertices of a set change by N q for numbers q, so that impulses on them change their velocities by
 
