@@ -522,10 +522,8 @@ class PairContact(Stage):
             by_x, by_v = p[x.at], q[x.at]
             by = x.settle_vjp(*at[:2], one.v[x.at], e[numbers], b[numbers], decay, at[2], by_x, by_v)
             e_adj[numbers], b_adj[numbers], q[x.at] = by.e, by.b, by.v
-            p[x.at], self.by_rest[x.vertices] = (
-                0,
-                self.by_rest[x.vertices] - by_x,
-            )  # displacements are places less these
+            self.by_rest[x.vertices] -= by_x  # displacements are places less these
+            p[x.at] = 0
             self._add_of_set(x, by.x0, by.x1, by.m, at_begin, p)
             by_decay += by.decay
         return by_decay
