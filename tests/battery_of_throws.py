@@ -96,7 +96,7 @@ class Judge:
 def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
     """(what the runs said, the last one of all, which is empty if it came to its end; intersections that nothing said);
     looks: substeps from one look of the judge to the next."""
-    said, dt, silent, judges, reduced = [], None, 0, {}, case["reduced"]
+    said, dt, silent, judges = [], None, 0, {}
     for _ in range(ROUNDS):
         try:
             scene = ds.Scene(
@@ -105,7 +105,7 @@ def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
                 1000.0,
                 [ds.SelfContact(**case["contact"])],
                 initial_velocities=case["v"],
-                reduced=reduced,
+                reduced=case["reduced"],
                 precision=case["precision"],
             )
             dt = dt or 0.7 * float(ds.stable_dt(scene).dt)
@@ -122,9 +122,7 @@ def throw(case: dict, looks: int = 1) -> tuple[list[str], int]:
             said.append(str(error))
         step = re.search(rf"(?:substeps of|substep to) {NUMBER}", said[-1])
         dt = float(step[1]) if step else dt
-        affine = 'pass "affine" in place of "rigid"' in said[-1]
-        reduced = {name: "affine" for name in reduced} if affine else reduced
-        if not (step or affine):
+        if not step:
             return said, silent
     return said, silent
 

@@ -209,13 +209,6 @@ FOLLOWED = {
         lambda: verlet(**RIGID),
         lambda: verlet(**RIGID, contact="force"),
     ),
-    ("mechanics/reduced/body_checks.py", "meet between vertices"): (
-        lambda: verlet(**RIGID | dict(terms=[ds.SelfContact()])),
-        lambda: [
-            ds.ImplicitEulerSolver(scene(**RIGID | dict(terms=[ds.SelfContact()])), dt=1e-3),
-            ds.Simulator(verlet(**RIGID | dict(terms=[ds.SelfContact()], reduced={"body_0": "affine"}))).step(),
-        ],
-    ),
     ("solvers/explicit/solver.py", "are of obstacles that act as a stage"): (
         lambda: ds.Rollout(verlet(terms=[GROUND], contact="force"), 1, outputs=[ds.ContactForce(GROUND)]),
         lambda: ds.Rollout(verlet(terms=[GROUND], contact="stage"), 1, outputs=[ds.ContactForce(GROUND)]),

@@ -121,6 +121,8 @@ def test_a_crawler_pushes_nothing_but_itself():
 
 @pytest.mark.parametrize("method", ["gradient", "PPO"])
 def test_a_crawler_learns_by_gradients_and_ppo_takes_as_many_samples(against_ppo, method):
+    if method == "PPO":
+        pytest.importorskip("stable_baselines3")
     curve = against_ppo.train("crawler", method, 2, scenes=4)
     assert [row[0] for row in curve] == [0, 200, 400] and np.isfinite(curve).all()
     if method == "gradient":

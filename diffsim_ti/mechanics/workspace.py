@@ -172,7 +172,7 @@ class Workspace:
         """From now on note what the law remembers in each frame; the frames are made."""
         self.law_frames = LawFrames(self)
 
-    def record_contacts(self) -> None:
+    def record_contacts(self, of_obstacles: bool = True) -> None:
         """From now on note, for each frame, what obstacles do to each vertex; the frames are made."""
         raise NotImplementedError
 

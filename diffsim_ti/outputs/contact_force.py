@@ -49,28 +49,33 @@ class ContactForce(Output):
         about: ArrayLike | None = None,
         on: str | ArrayLike | None = None,
     ):
+        said = type(self).__name__
         if part not in PARTS:
-            raise ValueError(f"ContactForce: part must be {', '.join(PARTS[:-1])} or {PARTS[-1]}, got {part!r}")
+            raise ValueError(f"{said}: part must be {', '.join(PARTS[:-1])} or {PARTS[-1]}, got {part!r}")
         if about is not None and per_vertex:
-            raise ValueError("ContactForce: a moment is of all vertices: give about= or per_vertex=True, not both")
+            raise ValueError(f"{said}: a moment is of all vertices: give about= or per_vertex=True, not both")
         if on is not None and per_vertex:
-            raise ValueError("ContactForce: give on=, a set whose sum is taken, or per_vertex=True, of all vertices")
+            raise ValueError(f"{said}: give on=, a set whose sum is taken, or per_vertex=True, of all vertices")
         self.obstacle, self.part, self.name, self.per_vertex = obstacle, part, name, bool(per_vertex)
         self.on = on
         self.about = None if about is None else np.array(about, np.float64)
         if self.about is not None and (self.about.shape != (3,) or not np.all(np.isfinite(self.about))):
-            raise ValueError(f"ContactForce: about must be 3 finite numbers [m], got {about!r}")
+            raise ValueError(f"{said}: about must be 3 finite numbers [m], got {about!r}")
 
     def __repr__(self) -> str:
         return f"ContactForce({self.obstacle!r}, {self.part!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "ContactForce":
         out = copy(self)
-        out.place, out.num_vertices = scene.place_of(self.obstacle), scene.mesh.num_vertices
+        out.place, out.num_vertices = self._place(scene), scene.mesh.num_vertices
         n = out.num_vertices
         out.vertices = np.arange(n) if self.on is None else scene.mesh.vertex_indices(self.on)
         out.sides = {"total": slice(0, 2), "normal": slice(0, 1), "friction": slice(1, 2)}[self.part]
         return out
+
+    def _place(self, scene: "Scene") -> int:
+        """Among the rows of frames.contact_forces."""
+        return scene.place_of(self.obstacle)
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames, self.num_vertices, 3) if self.per_vertex else (num_frames, 3)

@@ -28,8 +28,7 @@ class Frames(metaclass=Public):
 
     `contact_forces` [N], where an output reads them: what each obstacle did to each vertex, on average since the frame
     before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
-    `scene.obstacles`. The first frame has none. In implicit runs of surfaces with friction a row more has that of each
-    other's friction, in the substep that ends in the frame.
+    `scene.obstacles`; with SelfContact a row more has what surfaces did to each other. The first frame has none.
 
     `computed` are these outputs themselves, as settled for the scene; `sets`: those of inputs that were given by named sets.
 
@@ -139,14 +138,11 @@ class Output(metaclass=Public):
     unit = ""  # for pictures
     linear = False  # whether it is linear in positions and velocities
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
-    reads_contact_forces = False  # whether runs must note frames.contact_forces for it
+    # whether runs must note frames.contact_forces for it: what obstacles do (True), or "surfaces" to each other
+    reads_contact_forces: bool | str = False
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
     reads_law_state = False  # the same of frames.law_state, where the law remembers
     reads_joint_states = False  # whether it reads frames.joint_states, which runs of robots note
-
-    def needs_contact_forces(self, solver) -> bool:
-        """Whether runs of this solver must; here, whether it reads them in all."""
-        return self.reads_contact_forces
 
     @staticmethod
     def refuse_growth(output: str, scene: Scene) -> None:

@@ -60,9 +60,6 @@ class SmoothMaximum(Output):
         for flag in ("unit", "cumulative", *(f"reads_{what}" for what in reads)):
             setattr(self, flag, getattr(of, flag))
 
-    def needs_contact_forces(self, solver) -> bool:
-        return self.of.needs_contact_forces(solver)
-
     def settled(self, scene: Scene) -> "SmoothMaximum":
         out = copy(self)
         out.of = self.of.settled(scene)

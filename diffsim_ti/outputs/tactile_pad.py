@@ -20,7 +20,8 @@ class TactilePad(Output):
     t_i: `ContactTraction` of the obstacle, w_i: where the grid's point lies in the triangle, in the mesh as it was made. The
     grid spans the smallest rectangle around the set there (columns along its longer side); points beside the set read 0,
     `inside` says which. n, a, b go with the set: n is the mean of its triangles' normals, outwards, a along the columns, b
-    along the rows. So turning the pad as a rigid body does not change what it reads.
+    along the rows. So turning the pad as a rigid body does not change what it reads. Of the output that a Rollout has,
+    `rollout.outputs["tactile_pad"]`, `places` [m] says where the points were in the mesh, shape (rows, columns, 3).
 
     obstacle: its name, or the term as the scene lists it. on: a surface set's name, indices of surface triangles or a mask.
     size: (rows, columns). The resultant is `ContactForce(obstacle, on=...)`, its moment that with about=.
@@ -62,6 +63,7 @@ class TactilePad(Output):
         x, y = np.meshgrid(*(l + s * (h - l) for l, h, s in zip(low, high, shares)))
         out.corners, out.weights = _within(np.stack([x, y], -1).reshape(-1, 2), p, out.triangles)
         out.inside = (out.weights.sum(1) > 0).reshape(self.size)
+        out.places = np.einsum("pc,pcd->pd", out.weights, X[out.corners]).reshape(*self.size, 3)
         lever = p[corners, 0] - p[corners, 0].mean()
         out.along = np.zeros(mesh.num_vertices)
         out.along[corners] = lever / (lever @ lever)  # of places: how much the set's coordinate along a leads them on

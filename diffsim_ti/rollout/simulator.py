@@ -355,11 +355,11 @@ class Simulator(metaclass=Public):
     def output(self, output: Output) -> np.ndarray:
         """Value of an output such as `Reaction("left")` or `Stress()` at the present state, as a Rollout's frame has it.
 
-        ContactForce and ContactTraction are the mean over the last step, zero before the first, and need
-        `Simulator(solver, contact_forces=True)`, as friction of SelfContactForce does in implicit and static solvers.
+        ContactForce, SelfContactForce and ContactTraction are the mean over the last step, zero before the first, and need
+        `Simulator(solver, contact_forces=True)`.
         Raises ValueError for one without, and as the output does.
         """
-        if output.needs_contact_forces(self.solver) and not self._notes:
+        if output.reads_contact_forces and not self._notes:
             raise ValueError(f"{output!r} is of a step: make the simulator with Simulator(solver, contact_forces=True)")
         if output.cumulative:
             raise ValueError(f"{output!r} counts from the start of a run: pass it to Rollout(..., outputs=[...])")

@@ -267,6 +267,11 @@ class SceneArrays:
         out[self.fixed] = 0
         return out
 
+    @property
+    def num_contact_rows(self) -> int:
+        """Of what contact does to vertices: the obstacles', and one of surfaces on each other."""
+        return len(self.obstacles) + bool(self.self_contact)
+
     def place_obstacles(self, schedule: Schedule, j: int) -> None:
         """Put what evaluates a state between passes where the obstacles are when pass j begins."""
         if self.rows["path"] is not None:

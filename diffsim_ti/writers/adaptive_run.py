@@ -117,7 +117,7 @@ class ForwardRun:
             steps //= self.parts
             solver = solver_class(scene, dt=steps * dt, substeps=steps, **options)
         self.outputs = tuple(outputs)
-        self._noted = dict(contact_forces=any(output.needs_contact_forces(solver) for output in self.outputs))
+        self._noted = dict(contact_forces=any(output.reads_contact_forces for output in self.outputs))
         self.simulator = self._last = Simulator(solver, **self._noted)
         self.frame_time = self.parts * solver.dt
         ws = self.simulator.workspace

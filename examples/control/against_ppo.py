@@ -6,13 +6,16 @@ Every iteration of either takes one episode of all scenes. Returns are those of 
 
     python examples/control/against_ppo.py [--iterations 30] [--more 4] [--folder output]
 
-Schulman et al. 2017, Proximal Policy Optimization, arXiv:1707.06347, as in CleanRL's ppo_continuous_action.
+PPO is that of Stable-Baselines3 (pip install diffsim_ti[learning]). Schulman et al. 2017, Proximal Policy Optimization,
+arXiv:1707.06347; Raffin et al. 2021, Stable-Baselines3, jmlr.org/papers/v22/20-1364.html.
 """
 
 import argparse
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import torch
 from torch import nn
@@ -23,36 +26,27 @@ from diffsim_ti.envs.jumper import SoftJumpers
 
 HORIZON = SoftJumpers.horizon
 TASKS = {"jumper": (SoftJumpers, HORIZON), "crawler": (SoftCrawlers, 10)}  # steps before states are cut off
-SCENES, GAMMA, LAMBDA, CLIP, EPOCHS, BATCHES = 16, 0.99, 0.95, 0.2, 10, 4
+SCENES = 16
 
 
 class Policy(nn.Module):
-    """Mean actions, and how much PPO tries around them; observations are scaled by those of the first episode."""
+    """Actions; observations are scaled by those of the first episode."""
 
     def __init__(self, num_actions: int, seen: np.ndarray):
         super().__init__()
         self.register_buffer("centre", torch.tensor(seen.mean(0), dtype=torch.float32))
         self.register_buffer("scale", torch.tensor(seen.std(0) + 1e-3, dtype=torch.float32))
-        self.mean, self.value = self._layers(seen, num_actions, 0.01), self._layers(seen, 1, 1.0)
-        self.log_std = nn.Parameter(torch.full((num_actions,), -0.5))
-
-    @staticmethod
-    def _layers(seen: np.ndarray, outputs: int, gain: float) -> nn.Sequential:
-        out = nn.Sequential(
-            nn.Linear(seen.shape[1], 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs)
-        )
-        nn.init.orthogonal_(out[-1].weight, gain)
-        nn.init.zeros_(out[-1].bias)
-        return out
+        sizes = (seen.shape[1], 64), (64, 64)
+        hidden = [layer for size in sizes for layer in (nn.Linear(*size), nn.Tanh())]
+        self.layers = nn.Sequential(*hidden, nn.Linear(64, num_actions))
+        nn.init.orthogonal_(self.layers[-1].weight, 0.01)
+        nn.init.zeros_(self.layers[-1].bias)
 
     def scaled(self, observed) -> torch.Tensor:
         return ((torch.as_tensor(observed, dtype=torch.float32) - self.centre) / self.scale).clamp(-10, 10)
 
     def forward(self, observed) -> torch.Tensor:
-        return self.mean(self.scaled(observed)).tanh()
-
-    def tried(self, observed) -> torch.distributions.Normal:
-        return torch.distributions.Normal(self(observed), self.log_std.exp())
+        return self.layers(self.scaled(observed)).tanh()
 
 
 def fresh(envs, seed: int) -> Policy:
@@ -66,14 +60,12 @@ def fresh(envs, seed: int) -> Policy:
     return Policy(envs.single_action_space.shape[0], np.concatenate(rows))
 
 
-def mean_return(envs, policy: Policy) -> float:
-    """Of an episode by mean actions, from the same starts each time."""
+def mean_return(envs, actions_of: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Of an episode by mean actions for what is observed, from the same starts each time."""
     observed, _ = envs.reset(seed=999)
     total = np.zeros(envs.num_envs)
     for _ in range(HORIZON):
-        with torch.no_grad():
-            actions = policy(observed).numpy()
-        observed, rewards, *_ = envs.step(actions)
+        observed, rewards, *_ = envs.step(actions_of(observed))
         total += rewards
     return float(total.mean())
 
@@ -97,66 +89,79 @@ def gradient_iteration(envs, policy: Policy, optimizer, span: int, seed: int) ->
     total = total if span < HORIZON else envs.goal(torch.stack(shown)).mean()
     optimizer.zero_grad()
     (-total).backward()
-    nn.utils.clip_grad_norm_(policy.mean.parameters(), 1.0)
+    nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
     optimizer.step()
 
 
-def episode(envs, policy: Policy, seed: int) -> tuple[torch.Tensor, ...]:
-    """Observations, tried actions, their log likelihoods, rewards of an episode, (steps, scenes, ...)."""
-    observed, _ = envs.reset(seed=seed)
-    rows = []
-    for _ in range(HORIZON):
-        with torch.no_grad():
-            tried = policy.tried(observed)
-            actions = tried.sample()
-            likelihood = tried.log_prob(actions).sum(1)
-        after, rewards, *_ = envs.step(actions.numpy())
-        rows.append((torch.tensor(observed, dtype=torch.float32), actions, likelihood, torch.tensor(rewards)))
-        observed = after
-    return tuple(torch.stack(column).float() for column in zip(*rows))
+def ppo_of(envs, scaled: Callable, seed: int):
+    """Stable-Baselines3's PPO on the scenes: an iteration is an episode of all, in four parts, gone through ten times."""
+    try:
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.vec_env import VecEnv
+    except ImportError:
+        raise ImportError("PPO of Stable-Baselines3 is missing: pip install diffsim_ti[learning]") from None
 
+    class Scenes(VecEnv):
+        """Which show scaled observations and rewards, and start anew in the step in which they end, as `SoftBodies` do."""
 
-def ppo_iteration(envs, policy: Policy, optimizer, reward_scale: float, seed: int) -> None:
-    """One episode of all scenes, and `EPOCHS` passes over it."""
-    observed, actions, likelihoods, rewards = episode(envs, policy, seed)
-    with torch.no_grad():
-        values, advantage = policy.value(policy.scaled(observed))[..., 0], torch.zeros_like(rewards)
-        running = torch.zeros(envs.num_envs)
-        for t in reversed(range(HORIZON)):  # an episode ends in its last step
-            after = values[t + 1] if t + 1 < HORIZON else torch.zeros(envs.num_envs)
-            running = rewards[t] * reward_scale + GAMMA * after - values[t] + GAMMA * LAMBDA * running
-            advantage[t] = running
-        returns = (advantage + values).flatten()
-    flat = observed.flatten(0, 1), actions.flatten(0, 1), likelihoods.flatten(), advantage.flatten()
-    for _ in range(EPOCHS):
-        for rows in torch.randperm(len(returns)).chunk(BATCHES):
-            seen, done, before, gain = (x[rows] for x in flat)
-            ratio = (policy.tried(seen).log_prob(done).sum(1) - before).exp()
-            gain = (gain - gain.mean()) / (gain.std() + 1e-8)
-            surrogate = torch.minimum(ratio * gain, ratio.clamp(1 - CLIP, 1 + CLIP) * gain).mean()
-            missed = (policy.value(policy.scaled(seen))[:, 0] - returns[rows]).square().mean()
-            optimizer.zero_grad()
-            (0.5 * missed - surrogate).backward()
-            nn.utils.clip_grad_norm_(policy.parameters(), 0.5)
-            optimizer.step()
+        def __init__(self):
+            space = gymnasium.spaces.Box(-10, 10, envs.single_observation_space.shape, np.float32)
+            super().__init__(envs.num_envs, space, envs.single_action_space)
+
+        def reset(self):
+            return scaled(envs.reset(seed=seed)[0]).numpy()
+
+        def step_async(self, actions):
+            self.actions = actions
+
+        def step_wait(self):
+            observed, rewards, terminated, truncated, info = envs.step(self.actions)
+            ended = terminated | truncated
+            last = scaled(info["final_obs"]).numpy() if info else None
+            infos = [dict(terminal_observation=last[k]) if end else {} for k, end in enumerate(ended)]
+            return scaled(observed).numpy(), 30.0 * rewards, ended, infos
+
+        def close(self):
+            """Nothing is open."""
+
+        def get_attr(self, attr_name, indices=None):
+            return [getattr(envs, attr_name, None)] * self.num_envs
+
+        def set_attr(self, attr_name, value, indices=None):
+            setattr(envs, attr_name, value)
+
+        def env_method(self, method_name, *args, indices=None, **options):
+            return [getattr(envs, method_name)(*args, **options)] * self.num_envs
+
+        def env_is_wrapped(self, wrapper_class, indices=None):
+            return [False] * self.num_envs
+
+    samples = HORIZON * envs.num_envs
+    network = dict(net_arch=[64, 64], log_std_init=-0.5)
+    sizes = dict(n_steps=HORIZON, batch_size=samples // 4, n_epochs=10)
+    return PPO("MlpPolicy", Scenes(), 1e-3, **sizes, policy_kwargs=network, seed=seed, device="cpu")
 
 
 def train(task: str, method: str, iterations: int, seed: int = 0, scenes: int = SCENES) -> list[tuple]:
     """(samples, seconds of processor time, return [m]) after each iteration; the first is before them."""
     kind, span = TASKS[task]
-    envs = kind(scenes)
+    envs, tested = kind(scenes), kind(scenes)
     policy = fresh(envs, seed)
-    rate = 3e-3 if method == "gradient" else 1e-3
-    optimizer = torch.optim.Adam(policy.parameters(), lr=rate)
-    curve, spent = [(0, 0.0, mean_return(envs, policy))], 0.0
+    if method == "gradient":
+        optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
+        actions_of = lambda observed: policy(observed).detach().numpy()  # noqa: E731
+    else:
+        ppo = ppo_of(envs, policy.scaled, seed)
+        actions_of = lambda observed: ppo.predict(policy.scaled(observed).numpy(), deterministic=True)[0]  # noqa: E731
+    curve, spent = [(0, 0.0, mean_return(tested, actions_of))], 0.0
     for k in range(1, iterations + 1):
         begin = time.process_time()
         if method == "gradient":
             gradient_iteration(envs, policy, optimizer, span, seed + k)
         else:
-            ppo_iteration(envs, policy, optimizer, 30.0, seed + k)
+            ppo.learn(scenes * HORIZON, reset_num_timesteps=k == 1)
         spent += time.process_time() - begin
-        curve.append((k * scenes * HORIZON, spent, mean_return(envs, policy)))
+        curve.append((k * scenes * HORIZON, spent, mean_return(tested, actions_of)))
     return curve
 
 

@@ -1,4 +1,5 @@
-"""What obstacles do in each frame of an implicit run, per vertex, with tangent and adjoint; on the host, in float64.
+"""What obstacles, and surfaces to each other, do in each frame of an implicit run, per vertex, with tangent and adjoint; on
+the host, in float64.
 
 Forces are those where passes take them, averaged over the passes since the frame before; of static solves those of the
 last pass.
@@ -38,13 +39,11 @@ class Shares:
 
 
 class ContactRecord:
-    """Forces of all frames, shape (frames, obstacles, 2, num_vertices, 3); where surfaces have friction with each other that
-    is in one row more, beside zeros, of the pass that ends in the frame."""
+    """Forces of all frames, shape (frames, obstacles, 2, num_vertices, 3); one row more is of surfaces on each other."""
 
     def __init__(self, workspace):
         frames, a, self.schedule = workspace.frames.frames_u.shape[0], workspace.arrays, workspace.solver.schedule
-        self.num_obstacles, rows = len(a.obstacles), len(a.obstacles) + bool(workspace.potential.surface_friction)
-        self.forces = np.zeros((frames, rows, 2, a.num_vertices, 3))
+        self.forces = np.zeros((frames, a.num_contact_rows, 2, a.num_vertices, 3))
 
     def _weight(self, j: int, save_every: int, static: bool) -> tuple[int, float]:
         """(the frame that pass j leads to, how much it counts there)."""
@@ -53,26 +52,18 @@ class ContactRecord:
             return frame, float(frame >= 0 and self.schedule.ends_frame(j, save_every))
         return frame, float(self.schedule.length(j) / self.schedule.frame_time(frame, save_every))
 
-    def add(self, j: int, save_every: int, static: bool, make, friction) -> None:
-        """Add make(), forces of obstacles in pass j, to the frame that the pass leads to, and put friction(), that between
-        surfaces, where the pass ends in it."""
+    def add(self, j: int, save_every: int, static: bool, *made) -> None:
+        """Add what `made` give, forces in pass j of the first rows, or of all, to the frame that the pass leads to."""
         frame, weight = self._weight(j, save_every, static)
-        if weight and self.num_obstacles:
-            self.forces[frame, : self.num_obstacles] += weight * make()
-        if self._ends(frame, j, save_every):
-            self.forces[frame, -1, 1] = friction()
+        for make in made if weight else ():
+            forces = make()
+            self.forces[frame, : len(forces)] += weight * forces
 
-    def _ends(self, frame: int, j: int, save_every: int) -> bool:
-        """Whether friction between surfaces is noted, and pass j ends in its frame."""
-        return frame >= 0 and self.forces.shape[1] > self.num_obstacles and self.schedule.ends_frame(j, save_every)
-
-    def seed(self, j: int, save_every: int, static: bool) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Adjoints of the forces in pass j, and of friction between surfaces, `forces` being those of the frames; None where
-        they are zero."""
+    def seed(self, j: int, save_every: int, static: bool) -> np.ndarray | None:
+        """Adjoints of the forces in pass j, `forces` being those of the frames; None where they are zero."""
         frame, weight = self._weight(j, save_every, static)
-        own = weight * self.forces[frame, : self.num_obstacles] if weight else np.zeros(0)
-        friction = self.forces[frame, -1, 1] if self._ends(frame, j, save_every) else np.zeros(0)
-        return tuple(x if x.any() else None for x in (own, friction))
+        own = weight * self.forces[frame] if weight else np.zeros(0)
+        return own if own.any() else None
 
 
 class SharesAdjoint(Shares):

@@ -18,14 +18,6 @@ def check_bodies(scene: "Scene", contact: str) -> None:
         )
     if scene.holds_volumes:
         raise ValueError(f"{said} and FilledChamber do not go together in explicit steps: take an implicit solver")
-    between = meets_between_vertices(scene)
-    if between and (scene.reduced.by_basis or any(body.rigid for body in scene.reduced.by_few)):
-        names = ", ".join(sorted({type(x).__name__ for x in between}))
-        affine = "" if scene.reduced.by_basis else 'pass "affine" in place of "rigid", or '
-        raise ValueError(
-            f"{said} and surfaces that meet between vertices ({names}) do not go together in explicit steps, but for affine "
-            f"sets: {affine}take an implicit solver, or give obstacles by_pairs=False"
-        )
     rough = [term for term in scene.terms if term.acts_on_surface and term.has_friction]
     if rough and scene.reduced.by_basis:
         raise ValueError(

@@ -16,8 +16,8 @@ A pair that presses with P slides with the velocity t = T B v across its normal,
 
     r = -h mu P f(s / eps) t / |t|,   s + c f(s / eps) = |t|,   c = h sum_i (|B_i| / m_i) S_i,   S_i = sum |B_i| mu P
 
-over nodes i, the last sum over all pairs, with the sizes of the entries of the inverse mass where an affine set has a matrix
-(NearPairs.lightened); f is that of terms/obstacles/friction.py. c / (h mu P) is a bound W of the inverse
+over nodes i, the last sum over all pairs, with bounds of the blocks of the inverse mass where a set has a matrix
+(sets_in_contact.py); f is that of terms/obstacles/friction.py. c / (h mu P) is a bound W of the inverse
 mass that the pair meets while all others have friction, too: by Cauchy and Schwarz |sum_p r_p B_p|^2 / m is at most
 sum_p W_p |r_p|^2. With r_p = -(1 - s / |t|) t / W_p all frictions together change the kinetic energy by no more than
 
@@ -47,7 +47,8 @@ DENSE = 1000  # unknowns up to which a dense matrix is factored
 @dataclass
 class NearPairs:
     """What does not change in a pass: corners (pairs, 4) among the points, which are of edges, their scale (proximity.py);
-    C (points, nodes) or None, what nodes may do (nodes, 3, 3) or None; sets (sets, 4), nodes of affine sets."""
+    C (points, nodes) or None, what nodes may do (nodes, 3, 3) or None; of sets that move by few numbers the nodes that are
+    their vertices, and those that stand for their numbers (SetInContact)."""
 
     corners: np.ndarray
     edges: np.ndarray
@@ -55,7 +56,7 @@ class NearPairs:
     num_points: int
     C: object
     free: np.ndarray | None
-    sets: np.ndarray
+    sets: list[SimpleNamespace]  # at: nodes, the vertices first, `here` of the set; twist: a node, or None
 
     def points(self, nodes: np.ndarray) -> np.ndarray:
         return nodes if self.C is None else self.C @ nodes
@@ -66,20 +67,38 @@ class NearPairs:
     def freed(self, x: np.ndarray) -> np.ndarray:
         return x if self.free is None else np.einsum("nij,nj->ni", self.free, x)
 
-    def lightened(self, of, x: np.ndarray, sizes: bool = False) -> np.ndarray:
-        """Products of inverse masses with vectors or numbers of the nodes; sizes: of the sizes of inverse masses."""
+    def lightened(self, of, x: np.ndarray) -> np.ndarray:
+        """Products of inverse masses with vectors of the nodes."""
         out = (of.inverse * x.T).T
-        if len(self.sets):
-            coupled = np.where(of.coupled.real < 0, -of.coupled, of.coupled) if sizes else of.coupled
-            out[self.sets] = np.einsum("sab,sb...->sa...", coupled, x[self.sets])
+        for near, own in zip(self.sets, of.sets):
+            out[near.at] = own.lightened(x[near.at])
         return out
 
-    def lightened_vjp(self, of, adj, a: np.ndarray, x: np.ndarray, sizes: bool = False) -> None:
+    def lightened_vjp(self, of, adj, a: np.ndarray, x: np.ndarray) -> None:
         """Add the adjoints of inverse masses in a . lightened(x)."""
-        adj.inverse += a * x if a.ndim == 1 else dot(a, x)
-        if len(self.sets):
-            a, x = (y[self.sets].reshape(*self.sets.shape, -1) for y in (a, x))
-            adj.coupled += np.einsum("sad,sbd->sab", a, x) * (np.sign(of.coupled) if sizes else 1)
+        adj.inverse += dot(a, x)
+        for near, own, by in zip(self.sets, of.sets, adj.sets):
+            own.lightened_vjp(by, a[near.at], x[near.at])
+
+    def felt(self, of, x: np.ndarray) -> np.ndarray:
+        """The same of numbers, by bounds of inverse masses."""
+        out = of.inverse * x
+        for near, own in zip(self.sets, of.sets):
+            at = near.at[: len(near.here)]
+            out[at] = own.sizes @ x[at]
+        return out
+
+    def felt_vjp(self, of, adj, a: np.ndarray, x: np.ndarray) -> None:
+        adj.inverse += a * x
+        for near, by in zip(self.sets, adj.sets):
+            at = near.at[: len(near.here)]
+            by.sizes += np.outer(a[at], x[at])
+
+    def twist(self, part, of, at) -> list:
+        """(node of the sum, nodes, how far they are from where the mobility of a rigid set is taken)"""
+        sets = [(x.twist, x.at[: len(x.here)]) for x in self.sets if x.twist is not None]
+        moved = at.X + part.theta * at.f - of.x - 0.5 * of.motion if sets else None
+        return [(node, own, moved[own]) for node, own in sets]
 
     def relative(self, points: np.ndarray) -> np.ndarray:
         """Of corners 1 to 3 relative to corner 0."""
@@ -127,7 +146,7 @@ class Part:
 
 class PartSolver:
     """Takes parts of a pass; `of`, its numbers, has x, motion (nodes, 3): displacements of nodes, and how they move without
-    contact; rest (points, 3); inverse (nodes,): 1 / mass, 0 of affine sets, which have `coupled` (sets, 4, 4); stiffness,
+    contact; rest (points, 3); inverse (nodes,): 1 / mass, 0 of sets, which have Factors in `sets`; stiffness,
     width, radius, mu, speed (pairs,); wall; h, alpha; seeds: adjoints of `impulses`, (which pairs, of push, of friction)."""
 
     def __init__(self, near: NearPairs):
@@ -184,22 +203,20 @@ class PartSolver:
     def answer(self, of, at, A, K: np.ndarray):
         """The map (K^-1 + A Q A^T)^-1 of vectors of the pairs, where K > 0."""
         from scipy.linalg import cho_factor, cho_solve
-        from scipy.sparse import coo_matrix, diags
+        from scipy.sparse import csr_matrix, diags
         from scipy.sparse.linalg import splu
 
         some, near = np.flatnonzero(K > 0), self.near
         if not some.size:
             return np.zeros_like
-        Q = diags(np.repeat(of.inverse, 3))
-        if len(near.sets):
-            rows, columns = (
-                3 * near.sets[:, x, None] + np.arange(3) for x in (np.repeat(range(4), 4), [*range(4)] * 4)
-            )
-            data = np.repeat(of.coupled.reshape(-1, 16), 3, axis=1)
-            Q = Q + coo_matrix((data.ravel(), (rows.ravel(), columns.ravel())), Q.shape)
         root = np.sqrt(K[some])
         A = diags(root) @ A[some]
-        H = (A @ Q @ A.T) * at.give
+        H = A @ diags(np.repeat(of.inverse, 3)) @ A.T
+        for x, own in zip(near.sets, of.sets):
+            N, inverse = own.of_components(len(x.at))
+            N = A[:, (3 * x.at[:, None] + np.arange(3)).ravel()] @ csr_matrix(N)
+            H = H + N @ csr_matrix(inverse) @ N.T
+        H = H * at.give
         if some.size <= DENSE:
             H = H.toarray()
             H[np.diag_indices(some.size)] += 1
@@ -230,7 +247,12 @@ class PartSolver:
         at.friction = self._friction(part, of, at) if of.rough else 0 * at.delta
         blend = 0.5 * (1 + part.c)
         at.w_drift = part.b + blend * at.delta + at.friction
-        return part.e + at.alpha * at.w_drift, part.b + at.delta + at.friction
+        e, at.given = part.e + at.alpha * at.w_drift, at.h * near.freed(at.pressed)
+        if of.rough:
+            at.given = at.given + near.freed(at.friction_sum)
+        for node, own, moved in near.twist(part, of, at):
+            e[node] += np.cross(moved, at.given[own]).sum(0)
+        return e, part.b + at.delta + at.friction
 
     def impulses(self, at, own: np.ndarray, of) -> tuple[np.ndarray, np.ndarray]:
         """What some pairs gave the nodes in a part that was taken [N s], by push and by friction."""
@@ -242,7 +264,8 @@ class PartSolver:
     def _follow(self, part: Part, of, at) -> None:
         real = SimpleNamespace(**{k: x.real if isinstance(x, np.ndarray) else x for k, x in vars(at).items()})
         real.B, real.h, real.alpha, real.give = at.B.real, at.h, np.real(at.alpha), np.real(at.give)
-        own = SimpleNamespace(**{k: np.real(x) for k, x in vars(of).items()})
+        own = SimpleNamespace(**{k: np.real(x) for k, x in vars(of).items() if k != "sets"})
+        own.sets = [x.real for x in of.sets]
         A = self.along_normals(real)
         base = self.displaced(own, real, (A.T @ part.P).reshape(-1, 3))
 
@@ -270,7 +293,7 @@ class PartSolver:
         at.sizes = at.B.copy()
         at.sizes.data = np.where(at.B.data.real < 0, -at.B.data, at.B.data)
         at.S = at.sizes.T @ at.load
-        at.bound = at.h * (at.sizes @ near.lightened(of, at.S, sizes=True))
+        at.bound = at.h * (at.sizes @ near.felt(of, at.S))
         at.kappa, at.share_of_mu, at.ratio, at.slip = slip(at.s, at.bound, of.speed, ARRAYS)
         at.impulse = (-at.h * at.load * at.kappa)[:, None] * at.t
         at.friction_sum = at.B.T @ at.impulse
@@ -290,8 +313,13 @@ class PartSolver:
             w=np.zeros_like(at.w), n=np.zeros_like(at.n), d=0 * at.d, P=0 * at.d, m=0 * at.d, motion=0 * at.X
         )
         at_corners = lambda nodes: near.points(nodes)[near.corners]  # noqa: E731
+        seeds, by_moved = list(of.seeds), 0 * at.X
+        for node, own, moved in near.twist(part, of, at):
+            q = 0 * at.X
+            q[own], by_moved[own] = np.cross(e_adj[node], moved), np.cross(at.given[own], e_adj[node])
+            seeds.append((np.ones(len(at.d)), q, q))
         if of.rough:
-            b_prev += self._friction_vjp(of, at, friction_adj, by, adj, at_corners)
+            b_prev += self._friction_vjp(of, at, friction_adj, seeds, by, adj, at_corners)
         # delta
         freed = near.freed(delta_adj)
         pulled = at.h * near.lightened(of, freed)
@@ -300,7 +328,7 @@ class PartSolver:
         by.n += at.P[:, None] * Bq
         by.w += at.P[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(pulled))
         near.lightened_vjp(of, adj, at.h * freed, at.pressed)
-        for own, pushed, _ in of.seeds:
+        for own, pushed, _ in seeds:
             q = at.h * near.freed(pushed)
             Bq = own[:, None] * (at.B @ q)
             by.P += dot(at.n, Bq)
@@ -338,16 +366,17 @@ class PartSolver:
         y_of = geometry.nearest_vjp(at.y, near.edges, at.w, at.r, at.g, by.w, r_adj)
         y_of += geometry.fading_vjp(at.y, near.edges, near.scale, by.m)
         by_points = near.scattered(np.concatenate([-y_of.sum(1, keepdims=True), y_of], 1))
-        X_adj = near.nodes(by_points)
+        X_adj = near.nodes(by_points) + by_moved
         adj.rest += by_points
         f_adj += part.theta * X_adj
-        adj.x += X_adj
+        adj.x += X_adj - by_moved
+        adj.motion += -0.5 * by_moved
         adj.motion += part.begin * X_adj + part.share * f_adj + by.motion
         by_alpha += (f_adj * part.b).sum()
         adj.alpha += part.share * by_alpha
         return e_prev + X_adj, b_prev + at.alpha * f_adj
 
-    def _friction_vjp(self, of, at, friction_adj, by, adj, at_corners) -> np.ndarray:
+    def _friction_vjp(self, of, at, friction_adj, seeds, by, adj, at_corners) -> np.ndarray:
         """Adjoint of b by friction."""
         near = self.near
         freed = near.freed(friction_adj)
@@ -355,7 +384,7 @@ class PartSolver:
         near.lightened_vjp(of, adj, freed, at.friction_sum)
         r_adj = at.B @ pulled
         by.w += np.einsum("pd,pkd->pk", at.impulse, at_corners(pulled))
-        for own, _, by_friction in of.seeds:
+        for own, _, by_friction in seeds:
             q = near.freed(by_friction)
             r_adj = r_adj + own[:, None] * (at.B @ q)
             by.w += own[:, None] * np.einsum("pd,pkd->pk", at.impulse, at_corners(q))
@@ -372,12 +401,12 @@ class PartSolver:
         V_adj = at.B.T @ v_adj
         # the bound
         back = at.sizes.T @ by_bound
-        S_adj = at.h * near.lightened(of, back, sizes=True)
-        near.lightened_vjp(of, adj, at.h * back, at.S, sizes=True)
+        S_adj = at.h * near.felt(of, back)
+        near.felt_vjp(of, adj, at.h * back, at.S)
         by_load += at.sizes @ S_adj
         row = np.repeat(np.arange(at.B.shape[0]), np.diff(at.B.indptr))
         column = at.B.indices
-        met = near.lightened(of, at.S, sizes=True)
+        met = near.felt(of, at.S)
         of_entries = at.h * by_bound[row] * met[column] + at.load[row] * S_adj[column]
         entries = at.B.copy()
         entries.data = np.sign(at.B.data) * of_entries

@@ -22,6 +22,7 @@ from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSol
 from diffsim_ti.mechanics.surfaces.near_set import NearSet
 from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
 from diffsim_ti.mechanics.surfaces.part_kernels import TAKEN
+from diffsim_ti.mechanics.surfaces.sets_in_contact import RigidInContact, SetInContact
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.runtime.slots import VertexRows, copy_slot
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, Moment
@@ -48,11 +49,12 @@ class ContactPass:
     points: np.ndarray  # vertices of the surface
     pairs: np.ndarray  # corners, which are such vertices, (pairs, 4)
     rest: tuple  # of pairs: plane and weights at rest, which coefficient of friction
-    start: np.ndarray
+    start: np.ndarray  # of all nodes, where there are sets
     u: np.ndarray | None = None
     v: np.ndarray | None = None
     parts: list[Part] = field(default_factory=list)
-    b: np.ndarray | None = None  # what velocities gained
+    e: np.ndarray | None = None  # what displacements and velocities gained
+    b: np.ndarray | None = None
 
     @property
     def solver(self) -> PartSolver:
@@ -65,33 +67,37 @@ class ContactPass:
         own = SimpleNamespace(**{name: x[chosen] for name, x in vars(own).items()})
         rest = plane[chosen], weights[chosen], own
         given = near, self.numbers[chosen], self.nodes, self.points, self.pairs[chosen], rest
-        return ContactPass(*given, start[self.nodes], u, v)
+        return ContactPass(*given, start if self.near.sets else start[self.nodes], u, v)
+
+    def vectors(self, x: np.ndarray) -> np.ndarray:
+        """Those of its nodes, from vectors of all nodes, and zeros of what stands for numbers of sets."""
+        return np.concatenate([x[self.nodes], np.zeros((sum(len(y.at) - len(y.here) for y in self.near.sets), 3))])
 
 
 class PairContact(Stage):
     """The stage, of the pairs of a workspace (surface_pairs.py, curved_pairs.py).
 
-    Nodes are vertices of surfaces and of affine sets, corners of obstacles, and then four of each affine set: its vertices
-    move by u = B q (terms/reduced.py), and rows of C say points by q in their place.
+    Nodes are vertices of surfaces and of reduced sets, corners of obstacles, and in a pass what stands for the numbers of
+    sets (sets_in_contact.py).
     """
 
-    def __init__(self, pairs, damping: float):
+    def __init__(self, pairs, damping: float, reduced=()):
         self.damping = damping
         self.pairs, self.inner, self.a = pairs, getattr(pairs, "inner", pairs), pairs.a
         a, mesh = self.a, self.a.mesh
         self.matrix, self.obstacles = getattr(pairs, "matrix", None), pairs.obstacles
-        self.sets = a.bodies.bodies if a.bodies else ()
-        own = np.unique(np.concatenate([mesh.surface_vertices, *(x.vertices for x in self.sets)]))
+        own = np.unique(np.concatenate([mesh.surface_vertices, *(x.vertices for x in reduced)]))
         self.rows, self.num_own = VertexRows(a, own), len(own)
-        num_corners = 0
+        num_nodes = mesh.num_vertices
         if self.obstacles:
-            num_corners, self.matrix = self.obstacles.corners.count, self.pairs.finer.mesh.with_corners
-        self.first_set, num_nodes = self.num_own + num_corners, mesh.num_vertices + num_corners + 4 * len(self.sets)
+            num_nodes, self.matrix = num_nodes + self.obstacles.corners.count, self.pairs.finer.mesh.with_corners
         self.nodes = np.append(own, np.arange(mesh.num_vertices, num_nodes))  # numbers of the others follow vertices
         self.node_place = np.full(num_nodes, -1)
         self.node_place[self.nodes] = np.arange(len(self.nodes))
-        self.members = [self.node_place[x.vertices] for x in self.sets]
-        self.moves = self._moves(mesh.num_vertices + num_corners) if self.sets else self.matrix
+        self.sets = [(RigidInContact if x.rigid else SetInContact)(x, self.node_place[x.vertices]) for x in reduced]
+        self.set_of, self.member = np.full((2, len(self.nodes)), -1)
+        for k, x in enumerate(self.sets):
+            self.set_of[x.at], self.member[x.at] = k, np.arange(len(x.at))
         self.kept: dict[int, ContactPass | None] = {}
         self.work = 0.0  # done by what moves obstacles and held vertices, as they press [J]
         self.partly_fixed = bool(len(a.supports.partly_fixed))
@@ -106,59 +112,31 @@ class PairContact(Stage):
 
     # ---- nodes ---------------------------------------------------------------------------------------------------------
 
-    def _moves(self, count: int):
-        """C of points, (points, nodes by number), with all four entries of each set that a point belongs to."""
-        from scipy.sparse import coo_matrix, identity
-
-        C = identity(count, format="csr") if self.matrix is None else self.matrix.tocsr()
-        entries = C.tocoo()
-        kept = ~np.isin(entries.col, np.concatenate([x.vertices for x in self.sets]))
-        rows, columns, data = ([x[kept]] for x in (entries.row, entries.col, entries.data))
-        for k, x in enumerate(self.sets):
-            of_set = C[:, x.vertices]
-            B, points = of_set @ x.basis, np.flatnonzero(abs(of_set).sum(1))
-            rows.append(np.repeat(points, 4))
-            columns.append(np.tile(count + 4 * k + np.arange(4), len(points)))
-            data.append(B[points].ravel())
-        shape = C.shape[0], count + 4 * len(self.sets)
-        out = coo_matrix((np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))), shape).tocsr()
-        out.sort_indices()
-        return out
-
     def _all(self, own: np.ndarray, corners: np.ndarray | None) -> np.ndarray:
         """Of all nodes, from displacements of vertices and of corners of obstacles."""
-        more = [corners] if self.obstacles else []
-        more += [x.basis.T @ own[at] for x, at in zip(self.sets, self.members)]
-        return np.concatenate([own, *more]) if more else own
+        return np.concatenate([own, corners]) if self.obstacles else own
 
-    def _all_vjp(self, places: np.ndarray, by: np.ndarray, out: np.ndarray) -> None:
-        """Add the adjoint of vertices for that of some nodes."""
-        own = places < self.num_own
-        out[places[own]] += by[own]
-        for x, at, here in self._of_sets(places):
-            out[at] += x.basis @ by[here]
+    def _alone_among(self, places: np.ndarray) -> np.ndarray:
+        """Which of some nodes are vertices of no set."""
+        return (places < self.num_own) & (self.set_of[places] < 0)
 
-    def _add(self, x: np.ndarray, places: np.ndarray, change: np.ndarray) -> None:
-        """Add to vertices what some nodes changed by."""
-        own = places < self.num_own
-        x[places[own]] += change[own]
-        for body, at, here in self._of_sets(places):
-            x[at] += body.basis @ change[here]
+    def _settle(self, one: ContactPass, given: tuple, u, v, start, e, b, decay, mass, rest=None) -> None:
+        """Add to displacements and velocities of all nodes what contact has done in a pass, e and b, without which they are
+        those given."""
+        alone = np.flatnonzero(self._alone_among(one.nodes))
+        u[one.nodes[alone]] += e[alone]
+        v[one.nodes[alone]] += decay * b[alone]
+        for near, places in zip(one.near.sets, self._places(one, start, given[0], mass, rest)):
+            x, at = self.sets[near.set], self.sets[near.set].at
+            numbers = near.at[len(near.here) :]
+            moved, v[at] = x.settle(*places[:2], given[1][at], e[numbers], b[numbers], decay, places[2])
+            u[at] += moved
 
-    def _add_vjp(self, places: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """The adjoint of such changes."""
-        out, own = np.zeros((len(places), 3)), places < self.num_own
-        out[own] = by[places[own]]
-        for x, at, here in self._of_sets(places):
-            out[here] = x.basis.T @ by[at]
-        return out
-
-    def _of_sets(self, places: np.ndarray):
-        """(the set, places of its vertices, which four of the nodes are its) of those that have nodes there."""
-        for k, (x, at) in enumerate(zip(self.sets, self.members)):
-            here = np.flatnonzero((places - self.first_set) // 4 == k)
-            if len(here):
-                yield x, at, here
+    def _places(self, one: ContactPass, start, end, mass, rest=None) -> list:
+        """(places where the pass begins, where it would end, masses) of the sets that are near something."""
+        rest = self.a.values.rest - self.a.origin if rest is None else rest
+        every = (self.sets[near.set] for near in one.near.sets)
+        return [(rest[x.vertices] + start[x.at], rest[x.vertices] + end[x.at], mass[x.vertices]) for x in every]
 
     # ---- passes --------------------------------------------------------------------------------------------------------
 
@@ -251,19 +229,17 @@ class PairContact(Stage):
             flagged = np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
             if not near.holds(flagged):
                 self._extend(flagged, now)
-            place = self.whole.nodes
-            motion = u[place] - start[place]
-            near.begin(start[place], anew=tries == 0)
-            if not near.choose(led_to[place] - start[place]):
+            mass = self.a.values.mass
+            near.begin(self.whole.vectors(start), anew=tries == 0)
+            if any(self.sets[x.set].follows_places for x in self.whole.near.sets):
+                near.put_sets(self._factors(self.whole, self._places(self.whole, start, u, mass)))
+            if not near.choose(self.whole.vectors(led_to - start)):
                 break
-            near.start(motion)
+            near.start(self.whole.vectors(u - start))
             parts = self._go(at, now, recording)
             e, b = near.moved
             led_to, v_next = u.copy(), v.copy()
-            self._add(led_to, place, e)
-            if self.sets:
-                led_to = self._all(led_to[: self.num_own], led_to[self.num_own : self.first_set])
-            self._add(v_next, place, now.decay * b)
+            self._settle(self.whole, (u, v), led_to, v_next, start, e, b, now.decay, mass)
             self.rows.put(at.history.u, at.end, led_to[: self.num_own])
             self.rows.put(at.history.v, at.end, v_next)
             _, lost, _ = self._look(*self._fine(at.history.u, at.end))
@@ -271,7 +247,7 @@ class PairContact(Stage):
             self._refuse(at, now)
         if b is not None and recording:
             one = self.whole.of(near.chosen > 0, start, u, v)
-            one.parts, one.b = parts, b
+            one.parts, one.e, one.b = parts, e, b
         return one, lost
 
     def _extend(self, numbers: np.ndarray, now) -> None:
@@ -284,62 +260,80 @@ class PairContact(Stage):
         numbers = np.flatnonzero(close)
         self.whole = self._pass(numbers)
         self.whole.u = np.zeros((len(self.nodes), 3))
-        self.whole.start = self.whole.u[self.whole.nodes]
+        self.whole.start = self.whole.u if self.whole.near.sets else self.whole.u[self.whole.nodes]
         self.set.fill(self.whole, self._numbers(self.whole, now))
 
-    def _of_obstacles(self, impulses, at: Passes, one: ContactPass):
-        """(frame, place among the obstacles by pairs, which pairs are its) of each that is noted."""
+    def _of_contacts(self, impulses, at: Passes, one: ContactPass):
+        """(frame, place among the contacts, which pairs are its) of each that is noted."""
         frame = impulses.frame_of(at.numbers)
-        for k in range(len(impulses.by_pairs) if frame is not None else 0):
-            own = one.rest[2].contact == k + 1
+        for k, number in enumerate(impulses.contacts if frame is not None else ()):
+            own = one.rest[2].contact == number
             if own.any():
                 yield frame, k, own
 
+    def _bodies(self, one: ContactPass) -> tuple[np.ndarray, np.ndarray]:
+        """(which nodes are vertices, their numbers)"""
+        own = np.flatnonzero(one.nodes < self.num_own)
+        return own, self.nodes[one.nodes[own]]
+
     def _note(self, impulses, at: Passes, one: ContactPass, of, taken: list, changes: bool = False) -> None:
-        """Note what each obstacle did; taken: (part, where it looked), which are taken here unless changes are noted."""
-        for frame, k, own in self._of_obstacles(impulses, at, one):
-            bodies = one.nodes < self.num_own
-            for part, look in taken:
-                if not changes:
-                    one.solver.take(part, of, look)
-                for side, given in enumerate(one.solver.impulses(look, own, of)):
-                    given = given.imag / 1e-30 if changes else given
-                    impulses.of_pairs[frame, k, side, one.nodes[bodies]] += given[bodies]
+        """Note what each contact did; taken: (part, where it looked), which are taken here unless changes are noted."""
+        own, vertices = self._bodies(one)
+        for part, look in taken if not changes else ():
+            one.solver.take(part, of, look)
+        for frame, k, which in self._of_contacts(impulses, at, one):
+            for _, look in taken:
+                for side, given in enumerate(one.solver.impulses(look, which, of)):
+                    impulses.of_pairs[frame, k, side, vertices] += (given.imag / 1e-30 if changes else given)[own]
 
     def _seeds(self, impulses, at: Passes, one: ContactPass) -> list:
-        """Adjoints of what each obstacle did."""
-        out, bodies = [], one.nodes < self.num_own
-        for frame, k, own in self._of_obstacles(impulses, at, one) if impulses else ():
-            seeds = np.zeros((2, len(one.nodes), 3))
-            seeds[:, bodies] = impulses.of_pairs[frame, k][:, one.nodes[bodies]]
-            out.append((own, *seeds))
+        """Adjoints of what each contact did."""
+        out, (own, vertices) = [], self._bodies(one)
+        for frame, k, which in self._of_contacts(impulses, at, one) if impulses else ():
+            seeds = np.zeros((2, *one.parts[0].e.shape))
+            seeds[:, own] = impulses.of_pairs[frame, k][:, vertices]
+            out.append((which, *seeds))
         return out
 
     def _pass(self, numbers: np.ndarray) -> ContactPass:
         """Pairs of the list, without a state."""
+        from scipy.sparse import csr_matrix, identity
+
         inner = self.inner
         corners = runtime.fetch(inner.list.pairs)[: 4 * inner.list.count].reshape(-1, 4)[numbers]
         edges = numbers >= inner.list.num_vt
         scale = np.zeros(len(numbers))
         scale[edges] = whole(inner.list.scale)[numbers[edges] - inner.list.num_vt]
         points, local = np.unique(corners, return_inverse=True)
-        C, nodes, sets = None, points, np.zeros((0, 4), int)
-        if self.moves is not None:
-            C = self.moves[points]
+        C, nodes, sets, free, count = None, points, [], None, len(points)
+        if self.matrix is not None:
+            C = self.matrix[points]
             nodes = np.unique(C.indices)
-            C = C[:, nodes].tocsr()
+        place = self.node_place[nodes]
+        if (self.set_of[place] >= 0).any():
+            nodes = nodes[np.argsort(self.set_of[place], kind="stable")]  # those of a set together
+            place = self.node_place[nodes]
+            C = identity(len(self.node_place), format="csr")[points] if C is None else C
+        if C is not None:
+            C, count = C[:, nodes].tocsr(), len(nodes)
+        for k in np.unique(self.set_of[place][self.set_of[place] >= 0]):
+            at, more = np.flatnonzero(self.set_of[place] == k), np.arange(count, count + self.sets[k].count)
+            twist = more[-1] if self.sets[k].twist else None
+            sets.append(SimpleNamespace(set=k, here=self.member[place[at]], at=np.append(at, more), twist=twist))
+            count = count + len(more)
+        if sets:
+            C = csr_matrix((C.data, C.indices, C.indptr), (len(points), count))
+        if C is not None:
             C.sort_indices()
-        if self.sets:
-            sets = np.flatnonzero(nodes >= len(self.node_place) - 4 * len(self.sets)).reshape(-1, 4)
-        free = None if self.free is None else self.free[nodes]
+        if self.free is not None:
+            free = np.concatenate([self.free[nodes], np.broadcast_to(np.eye(3), (count - len(nodes), 3, 3))])
         near = NearPairs(local.reshape(-1, 4), edges, scale, len(points), C, free, sets)
         rest = whole(inner.rest_plane)[numbers].astype(float), whole(inner.rest_weights)[numbers].astype(float)
-        place = self.node_place[nodes]
         return ContactPass(near, numbers, place, points, corners, (*rest, self.numbers.of(numbers, corners)), None)
 
     def _numbers(self, one: ContactPass, now, changes=None) -> SimpleNamespace:
         """What parts read; changes: of it, as imaginary parts that are tiny."""
-        a, own = self.a, one.rest[2]
+        a, own, near = self.a, one.rest[2], one.near
         nodes, numbers = self.nodes[one.nodes], a.values.parameters.astype(float)
         rest, mass, inverse_mass, radius = a.values.rest - a.origin, a.values.mass, self.inverse, 0.0
         if self.obstacles:
@@ -347,9 +341,8 @@ class PairContact(Stage):
             rest, radius = np.concatenate([rest, corners.made(numbers)]), np.append(0.0, corners.radii(numbers))
             mass = np.append(mass, np.zeros(corners.count))
             radius = radius[own.contact]
-        mass = np.append(mass, np.zeros(4 * len(self.sets)))
         inverse_mass = np.append(inverse_mass, np.zeros(len(mass) - len(inverse_mass)))
-        start, end, h_alpha, D = one.start, one.u[one.nodes], now.alpha, one.rest[0][:, 3]
+        start, end, h_alpha, D = one.start, one.u if near.sets else one.u[one.nodes], now.alpha, one.rest[0][:, 3]
         if changes is not None:
             numbers, rest, mass = numbers + changes.parameters, rest + changes.rest, mass + changes.mass
             start, end, h_alpha = start + changes.start, end + changes.end, h_alpha + changes.alpha
@@ -358,23 +351,27 @@ class PairContact(Stage):
         k, W = own.area * numbers[own.stiffness], numbers[own.width]
         half = 0.5 * D / W
         share = np.where(half.real < 1, half, 1)
-        inverse = np.where(inverse_mass[nodes] > 0, 1 / np.where(mass[nodes] > 0, mass[nodes], 1), 0)
+        inverse, sets = np.where(inverse_mass[nodes] > 0, 1 / np.where(mass[nodes] > 0, mass[nodes], 1), 0), []
+        if near.sets:
+            inverse[self.set_of[one.nodes] >= 0] = 0
+            sets = self._factors(one, self._places(one, start, end, mass, rest))
+            start, end = one.vectors(start), one.vectors(end)
+            inverse = np.append(inverse, np.zeros(len(start) - len(inverse)))
         mu, with_friction = np.zeros(len(one.pairs), numbers.dtype), own.mu >= 0
         mu[with_friction] = numbers[own.mu[with_friction]]
         speed = np.where(with_friction, numbers[own.speed], 1.0)
         rest = rest[one.points] if self.matrix is None else self.matrix[one.points] @ rest
-        coupled, wall = self._coupled(one.nodes, mass), mass[self.a.mesh.surface_vertices].mean()
+        wall = mass[self.a.mesh.surface_vertices].mean()
         return SimpleNamespace(
-            x=start, rest=rest, motion=end - start, inverse=inverse, coupled=coupled, h=now.h, alpha=h_alpha, wall=wall,
+            x=start, rest=rest, motion=end - start, inverse=inverse, sets=sets, h=now.h, alpha=h_alpha, wall=wall,
             stiffness=k / share, rough=self.rough,
             width=share * W, mu=mu, speed=speed,
             share=share, k=k, W=W, D=D, radius=radius, seeds=(),
         )  # fmt: skip
 
-    def _coupled(self, places: np.ndarray, mass: np.ndarray) -> np.ndarray:
-        """Inverse masses of affine sets, (B^T M B)^-1, shape (sets, 4, 4)."""
-        every = [x.basis.T @ (mass[x.vertices][:, None] * x.basis) for x, _, _ in self._of_sets(places)]
-        return np.linalg.inv(np.array(every)) if every else np.zeros((0, 4, 4))
+    def _factors(self, one: ContactPass, places: list) -> list:
+        """Inverse masses of the sets."""
+        return [self.sets[near.set].factors(near.here, *at) for near, at in zip(one.near.sets, places)]
 
     @property
     def inverse(self) -> np.ndarray:
@@ -444,10 +441,10 @@ class PairContact(Stage):
             rest, mass = (np.concatenate([x, np.zeros((len(at_end), *x.shape[1:]))]) for x in (rest, mass))
             radius = np.append(0.0, self.obstacles.corners.radii_jvp(self.a.values.parameters, parameters))
         first, last = self._all(before, at_begin), self._all(after, at_end)
-        mass = np.append(mass, np.zeros(4 * len(self.sets)))
+        at_nodes = (lambda x: x) if one.near.sets else (lambda x: x[one.nodes])
         dots = SimpleNamespace(
             parameters=tiny * parameters, rest=tiny * rest, mass=tiny * mass, radius=tiny * radius,
-            start=tiny * first[one.nodes], end=tiny * last[one.nodes], alpha=tiny * rate * now.alpha_by_rate,
+            start=tiny * at_nodes(first), end=tiny * at_nodes(last), alpha=tiny * rate * now.alpha_by_rate,
             fine_rest=tiny * (rest if self.matrix is None else self.matrix @ rest),
         )  # fmt: skip
         of = self._numbers(one, now, dots)
@@ -460,10 +457,13 @@ class PairContact(Stage):
         if run.impulses:
             self._note(run.impulses, at, one, of, looks, changes=True)
         decay = now.decay + tiny * rate * now.decay_by_rate
-        self._add(after, one.nodes, e.imag / 1e-30)
-        self._add(change, one.nodes, (decay * b).imag / 1e-30)
-        self.rows.put(run.u, 0, after)
-        self.rows.put(run.v, 0, change)
+        u, v = one.u + tiny * last, one.v + tiny * change
+        given, start = (u.copy(), v.copy()), one.start + dots.start
+        mass, rest = (x[: self.a.num_vertices] for x in (dots.mass, dots.rest))
+        mass, rest = self.a.values.mass + mass, self.a.values.rest - self.a.origin + rest
+        self._settle(one, given, u, v, start, e, b, decay, mass, rest)
+        self.rows.put(run.u, 0, u.imag[: self.num_own] / 1e-30)
+        self.rows.put(run.v, 0, v.imag / 1e-30)
 
     # ---- adjoint -------------------------------------------------------------------------------------------------------
 
@@ -478,33 +478,66 @@ class PairContact(Stage):
         p, q = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         of = self._numbers(one, now)
         of.seeds = self._seeds(run.impulses, at, one)
-        count = len(one.nodes)
+        count = len(of.inverse)
         adj = SimpleNamespace(
             x=np.zeros_like(of.motion), motion=np.zeros_like(of.motion), inverse=np.zeros(count), alpha=0.0,
-            rest=np.zeros_like(of.rest), coupled=np.zeros_like(of.coupled),
+            rest=np.zeros_like(of.rest), sets=[x.zeros() for x in of.sets],
             stiffness=np.zeros(len(one.pairs)), width=np.zeros(len(one.pairs)), mu=np.zeros(len(one.pairs)),
             speed=np.zeros(len(one.pairs)), radius=np.zeros(len(one.pairs)), wall=0.0,
         )  # fmt: skip
-        e_adj, b_adj = self._add_vjp(one.nodes, p), self._add_vjp(one.nodes, q)
+        e_adj, b_adj, alone = np.zeros((count, 3)), np.zeros((count, 3)), np.flatnonzero(self._alone_among(one.nodes))
+        e_adj[alone], b_adj[alone] = p[one.nodes[alone]], q[one.nodes[alone]]
         by_decay = fsum((b_adj * one.b).ravel())  # whatever other nodes the set has, which add zeros
         b_adj = now.decay * b_adj
+        at_begin, places = np.zeros_like(p), []
+        if one.near.sets:
+            places = self._places(one, one.start, one.u, self.a.values.mass)
+            by_decay += self._settle_vjp(one, places, now.decay, p, q, at_begin, e_adj, b_adj)
         for part in one.parts[::-1]:
             e_adj, b_adj = one.solver.back(part, of, e_adj, b_adj, adj)
         self.by_rate += now.alpha_by_rate * adj.alpha + now.decay_by_rate * by_decay
-        self._all_vjp(one.nodes, adj.motion, p)
+        for near, where, own, by in zip(one.near.sets, places, of.sets, adj.sets):
+            x = self.sets[near.set]
+            by_places, by_mass = x.factors_vjp(near.here, *where, own, by)
+            self._add_of_set(x, by_places, by_places, by_mass, at_begin, p)
+        own = one.nodes < self.num_own
+        at_begin[one.nodes[own]] += (adj.x - adj.motion)[: len(own)][own]
+        p[one.nodes[own]] += adj.motion[: len(own)][own]
         self.rows.put(run.u, 0, p)
+        if one.near.sets:
+            self.rows.put(run.v, 0, q)
         self._add_numbers(one, of, adj)
         if self.obstacles:
             self._add_obstacles(at, one, adj)
         with self._alone(at, one):
             yield
-        p = self.rows.get(run.u, 0)
-        self._all_vjp(one.nodes, adj.x - adj.motion, p)
-        self.rows.put(run.u, 0, p)
+        self.rows.put(run.u, 0, self.rows.get(run.u, 0) + at_begin)
+
+    def _settle_vjp(self, one: ContactPass, places: list, decay, p, q, at_begin, e_adj, b_adj) -> float:
+        """From the adjoints of where the pass led to those of sets without contact, and of what it did, e and b; the adjoint
+        of the decay."""
+        e, b, by_decay = one.e, one.b, 0.0
+        for near, at in zip(one.near.sets, places):
+            x, numbers = self.sets[near.set], near.at[len(near.here) :]
+            by_x, by_v = p[x.at], q[x.at]
+            by = x.settle_vjp(*at[:2], one.v[x.at], e[numbers], b[numbers], decay, at[2], by_x, by_v)
+            e_adj[numbers], b_adj[numbers], q[x.at] = by.e, by.b, by.v
+            self.by_rest[x.vertices] -= by_x  # displacements are places less these
+            p[x.at] = 0
+            self._add_of_set(x, by.x0, by.x1, by.m, at_begin, p)
+            by_decay += by.decay
+        return by_decay
+
+    def _add_of_set(self, x: SetInContact, by_x0, by_x1, by_mass, at_begin, p) -> None:
+        """Adjoints by places where a pass begins and would end, which a set's mobility is of, and by masses."""
+        at_begin[x.at] += by_x0
+        p[x.at] += by_x1
+        self.by_rest[x.vertices] += by_x0 + by_x1
+        self.by_mass[x.vertices] += by_mass
 
     def _add_obstacles(self, at: Passes, one: ContactPass, adj) -> None:
         """Adjoints of where corners of obstacles were, and of radii."""
-        theirs = (one.nodes >= self.num_own) & (one.nodes < self.first_set)
+        theirs = np.flatnonzero(one.nodes >= self.num_own)
         obstacles, place = self.obstacles, one.nodes[theirs] - self.num_own
         by_begin, by_end = np.zeros((2, obstacles.corners.count, 3))
         by_begin[place], by_end[place] = (adj.x - adj.motion)[theirs], adj.motion[theirs]
@@ -521,9 +554,7 @@ class PairContact(Stage):
         """Adjoints of the numbers, of masses and of the rest shape."""
         surface, own = self.a.mesh.surface_vertices, one.nodes < self.num_own
         nodes, numbers = self.nodes[one.nodes[own]], one.rest[2]
-        self.by_mass[nodes] -= (of.inverse**2 * adj.inverse)[own]
-        for W, by_W, (x, _, _) in zip(of.coupled, adj.coupled, self._of_sets(one.nodes)):
-            self.by_mass[x.vertices] -= np.einsum("na,ab,nb->n", x.basis, W @ by_W @ W, x.basis)
+        self.by_mass[nodes] -= (of.inverse**2 * adj.inverse)[: len(own)][own]
         self.by_mass[surface] += adj.wall / len(surface)
         self.by_fine_rest[one.points] += adj.rest
         # stiffness k / share, width share W, share = min(1, D / (2 W))
@@ -543,7 +574,7 @@ class PairContact(Stage):
     def clear(self) -> None:
         a, path = self.a, self.a.rows.get("path")
         self.by_numbers, self.by_mass, self.by_rate = np.zeros(len(a.values.parameters)), np.zeros(a.num_vertices), 0.0
-        self.by_fine_rest = np.zeros((self.inner.mesh.num_vertices, 3))
+        self.by_fine_rest, self.by_rest = np.zeros((self.inner.mesh.num_vertices, 3)), np.zeros((a.num_vertices, 3))
         self.by_path = np.zeros(path.shape) if self.obstacles and path is not None else None
         if self.obstacles:
             self.obstacles.clear()
@@ -557,7 +588,7 @@ class PairContact(Stage):
             out.parameters += self.obstacles.by_parameters
         if self.by_path is not None:
             out.path += self.by_path
-        out.rest = by_fine + out.rest
+        out.rest = by_fine + self.by_rest + out.rest
         out.mass = out.mass + self.by_mass
         drag = self.a.features().drag
         if drag >= 0:

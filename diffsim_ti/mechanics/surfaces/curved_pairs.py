@@ -21,13 +21,11 @@ A = ti.template()
 ROWS = dict(start="ints", index="ints", weight="scalars")
 
 
-def pairs_of(kind: type, arrays, parallel: bool, with_obstacles: bool = True):
+def pairs_of(kind: type, arrays, parallel: bool):
     """Pairs of a kind (surface_pairs.py, implicit_pairs.py), of a finer surface where faces are curved and smooth, and with
     the corners of obstacles; None where a scene has none."""
     mesh, term = arrays.mesh, arrays.self_contact
-    corners = (
-        ObstacleCorners(arrays) if with_obstacles and any(x.primitives is not None for x in arrays.contacts) else None
-    )
+    corners = ObstacleCorners(arrays) if any(x.primitives is not None for x in arrays.contacts) else None
     if not (term or corners):
         return None
     cuts = cuts_of(mesh, arrays.width_of_pairs, arrays.bend)

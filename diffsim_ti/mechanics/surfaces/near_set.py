@@ -47,7 +47,7 @@ class NearSet:
         """one, of: a ContactPass of pairs of the list, those that were in the set among them, and what its parts read."""
         near, numbers, count = one.near, one.numbers, len(one.numbers)
         (start, index, weight), n, edges = near.rows, len(of.inverse), int(near.edges.sum())
-        room = 4 * int(np.diff(start).max(initial=1))
+        room = 4 * int(np.diff(start).max(initial=1)) + sum(sorted(len(x.at) - len(x.here) for x in near.sets)[-4:])
         chosen = np.zeros(count, np.int32)
         if self.builds == self.inner.builds:
             chosen[np.searchsorted(numbers, self.numbers)] = self.chosen
@@ -60,13 +60,11 @@ class NearSet:
         self._put("pairs", kernels.PAIRS, corners=near.corners.ravel(), number=numbers, chosen=chosen, **own)
         free = np.broadcast_to(np.eye(3), (n, 3, 3)) if near.free is None else near.free
         rows = dict(start=start, index=index, weight=weight, rest=of.rest, free=free.reshape(-1, 3))
-        inverse, group, blocks = of.inverse.copy(), np.full(n, -1), np.zeros((2, n, 4))
-        if len(near.sets):
-            inverse[near.sets], group[near.sets] = 1, near.sets[:, :1]
-            blocks[0, near.sets] = of.coupled
-            blocks[1, near.sets] = np.swapaxes(np.linalg.cholesky(of.coupled), 1, 2)
-        rows |= dict(inverse=inverse, group=group, coupled=blocks[0].ravel(), mixed=blocks[1].ravel())
-        self._put("nodes", kernels.NODES, **rows)
+        inverse, self.sets, of_node = of.inverse.copy(), near.sets, np.full(n, -1)
+        for k, x in enumerate(near.sets):
+            of_node[x.at[: len(x.here)]], inverse[x.at[len(x.here) :]] = k, 1
+        self._put("nodes", kernels.NODES, **rows, inverse=inverse, set=of_node)
+        self.put_sets(of.sets)
         self._put("work", kernels.WORK, gauss=np.stack([NODES, SHARES], 1).ravel())
         self._take("pairs", dict(acting="ints"), count)
         self._take("nodes", dict(x="vectors", motion="vectors"), n)
@@ -78,6 +76,25 @@ class NearSet:
         self.of_all = dict(wall=of.wall, rough=int(of.rough))
         self._choose = self.launch(self.kernels.choose, list=SimpleNamespace(near=self.inner.near), **self.arrays)
         self._take_part = self.launch(self.kernels.take, **self.arrays)
+
+    def put_sets(self, factors: list) -> None:
+        """Inverse masses of the sets."""
+        table, parts, sizes, self.roots, first, size = [], [np.zeros((1, 3))], [np.zeros(1)], [], 1, 1
+        for x, own in zip(self.sets, factors):
+            members, count = len(x.here), len(x.at) - len(x.here)
+            root, N = own.whitened()
+            N = N[: len(N) // len(x.at) * members]
+            if len(N) == members:
+                N = np.einsum("vb,de->vdbe", N, np.eye(3))
+            F = np.swapaxes(N.reshape(members, 3, count, 3), 1, 2)
+            twist = -1 if x.twist is None else x.twist
+            table.append([x.at[members], count, x.at[0], members, first, size, twist])
+            parts.append(F.reshape(-1, 3))
+            sizes.append(own.sizes.ravel())
+            self.roots.append((x.at[members:], root))
+            first, size = first + len(parts[-1]), size + members**2
+        data = dict(sets=np.ravel(table).astype(int) if table else np.zeros(1, int), sizes=np.concatenate(sizes))
+        self._put("nodes", kernels.NODES, **data, factor=np.concatenate(parts))
 
     @property
     def chosen(self) -> np.ndarray:
@@ -113,7 +130,11 @@ class NearSet:
     @property
     def moved(self) -> tuple[np.ndarray, np.ndarray]:
         """What contact has added to displacements and velocities, (e, b)."""
-        return self._get("e"), self._get("b")
+        out = self._get("e"), self._get("b")
+        for at, root in self.roots:
+            for x in out:
+                x[at] = (root @ x[at].reshape(len(root), -1)).reshape(-1, 3)
+        return out
 
     @property
     def work(self) -> float:

@@ -1,4 +1,5 @@
-"""What points and edges of each obstacle do to each vertex of the body in an implicit pass, with tangent and adjoint."""
+"""What points and edges of each obstacle, and surfaces of bodies, do to each vertex in an implicit pass, with tangent and
+adjoint."""
 
 import numpy as np
 
@@ -7,16 +8,29 @@ from diffsim_ti.mechanics.surfaces.buffers import whole
 
 
 class PairShares:
-    """Of pairs with obstacles (curved_pairs.py), at the displacement of a potential that holds them; arrays of the shape
-    (obstacles, 2: by push and by friction, num_vertices, 3)."""
+    """Of the pairs of a potential at its displacement, by contacts; arrays of the shape (obstacles, and a row of surfaces on
+    each other, 2: by push and by friction, num_vertices, 3)."""
 
     def __init__(self, potential):
         self.p, self.pairs = potential, potential.pairs
-        self.parts = list(enumerate(self.pairs.finer.mesh.corners.parts, start=1))
-        self.shape = len(potential.arrays.obstacles), 2, potential.arrays.num_vertices, 3
+        a, self.parts = potential.arrays, []  # (row, number of the contact, None where there is one alone)
+        if self.pairs.obstacles:
+            self.parts = [(part.k, k) for k, part in enumerate(self.pairs.finer.mesh.corners.parts, start=1)]
+        if a.self_contact:
+            self.parts.append((len(a.obstacles), 0 if self.parts else None))
+        self.shape = a.num_contact_rows, 2, a.num_vertices, 3
 
-    def _pushes(self, number: int, all_pairs: bool) -> np.ndarray:
+    def _felt(self) -> np.ndarray:
+        """What all pairs have put into the last corners, of vertices."""
+        a, out = self.p.arrays, np.zeros(self.shape[2:])
+        surface = a.mesh.surface_vertices
+        out[surface] = runtime.fetch(a.corner)[a.first_contact_corner :][: len(surface)]
+        return out
+
+    def _pushes(self, number: int | None, all_pairs: bool) -> np.ndarray:
         """What the pairs of a contact have stored for their corners, of vertices; of those that press, or all."""
+        if number is None:
+            return self._felt()
         inner, surface = self.pairs.inner, self.pairs.finer.mesh
         count = inner.list.count
         corners = runtime.fetch(inner.list.pairs)[: 4 * count].reshape(-1, 4)
@@ -34,10 +48,10 @@ class PairShares:
     def forces(self) -> np.ndarray:
         out, friction = np.zeros(self.shape), self.pairs.friction
         self.pairs.forces(self.p.u, 0, self.p.arrays.corner)
-        for number, part in self.parts:
-            out[part.k, 0] = self._pushes(number, all_pairs=False)
+        for row, number in self.parts:
+            out[row, 0] = self._pushes(number, all_pairs=False)
             if friction:
-                out[part.k, 1] = friction.forces(self.p.held_at, number)
+                out[row, 1] = friction.forces(self.p.held_at, number)
         return out
 
     def jvp(self, d_star, dx, du_begin, numbers, parameters_dot, poses_dot) -> np.ndarray:
@@ -45,23 +59,23 @@ class PairShares:
         out, friction = np.zeros(self.shape), self.pairs.friction
         runtime.fill(self.p.w, d_star[None])
         moved = numbers.rest, parameters_dot
-        self.pairs.product(self.p.u, 0, self.p.w, self.p.arrays.corner, *moved, poses_dot=poses_dot)
-        for number, part in self.parts:
-            out[part.k, 0] = self._pushes(number, all_pairs=True)
-        for number, part in self.parts if friction else ():
-            out[part.k, 1] = friction.jvp(self.p.held_at, d_star, dx, du_begin, numbers, poses_dot, number)
+        more = dict(poses_dot=poses_dot) if self.pairs.obstacles else {}
+        self.pairs.product(self.p.u, 0, self.p.w, self.p.arrays.corner, *moved, **more)
+        for row, number in self.parts:
+            out[row, 0] = self._pushes(number, all_pairs=True)
+        for row, number in self.parts if friction else ():
+            out[row, 1] = friction.jvp(self.p.held_at, d_star, dx, du_begin, numbers, only=number, **more)
         return out
 
     def vjp(self, seed: np.ndarray) -> np.ndarray:
         """Adjoints of u*, of x, of where the pass begins; adds those of the scene's numbers and of poses."""
         a, out, friction = self.p.arrays, np.zeros((3, *self.shape[2:])), self.pairs.friction
-        surface = a.mesh.surface_vertices
-        for number, part in self.parts:
-            if seed[part.k, 0].any():
-                runtime.fill(self.p.w, seed[part.k, :1])
+        for row, number in self.parts:
+            if seed[row, 0].any():
+                runtime.fill(self.p.w, seed[row, :1])
                 self.pairs.vjp(self.p.u, 0, self.p.w, a.corner, only=number)
-                out[0, surface] += runtime.fetch(a.corner)[a.first_contact_corner :][: len(surface)]
-        for number, part in self.parts if friction else ():
-            if seed[part.k, 1].any():
-                out += friction.vjp(self.p.held_at, seed[part.k, 1], number)
+                out[0] += self._felt()
+        for row, number in self.parts if friction else ():
+            if seed[row, 1].any():
+                out += friction.vjp(self.p.held_at, seed[row, 1], number)
         return out

@@ -31,9 +31,12 @@ LOOK, CHECK, CHECK_BEGIN, CHECK_END, DONE = range(5)  # steps of a part: normals
 PAIRS = dict.fromkeys(("corners", "number", "chosen", "acting"), "ints")
 PAIRS |= dict.fromkeys(("scale", "stiffness", "width", "radius", "mu", "speed"), "scalars")
 NODES = dict(start="ints", index="ints", weight="scalars", rest="vectors", x="vectors", motion="vectors")
-NODES |= dict(inverse="scalars", free="vectors", group="ints", coupled="scalars", mixed="scalars")
+NODES |= dict(inverse="scalars", free="vectors", set="ints", sets="ints", factor="vectors", sizes="scalars")
+OF_SETS = FIRST, COUNT, MEMBER, MEMBERS, FACTOR, SIZES, TWIST = range(7)  # what stands in `sets` of each
 STATE = dict.fromkeys(("e", "b", "e_next", "b_next", "xi"), "vectors")
-OF_NODES = dict.fromkeys(("f", "residual", "step", "sum"), "vectors") | dict.fromkeys(("root", "load"), "scalars")
+OF_NODES = dict.fromkeys(("f", "residual", "step", "sum"), "vectors") | dict.fromkeys(
+    ("root", "load", "felt"), "scalars"
+)
 OF_POINTS = dict.fromkeys(("at_begin", "at_look", "moved", "at_end"), "vectors")
 OF_PAIRS = dict(filled="ints", open="ints", n="vectors")
 OF_PAIRS |= dict.fromkeys(("fading", "begin", "end", "change", "P", "K", "stiff", "q", "r", "z", "p", "Ap"), "scalars")
@@ -45,9 +48,10 @@ WORK = OF_NODES | OF_POINTS | OF_PAIRS | OF_ROWS | dict(gauss="scalars")
 @dataclass(frozen=True)
 class PartKernels(Pair):
     """pairs: of a set, those of vertex and triangle first; `acting` are those of them that a part moves, and its kernel is
-    given their numbers for num_vt and num_pairs. nodes: C (points, nodes) by rows; those of an affine set are four in a row,
-    `group` the first of them or -1, `coupled` W and `mixed` L^T by rows, W = L L^T their inverse masses in place of
-    `inverse`, which is 1."""
+    given their numbers for num_vt and num_pairs. nodes: C (points, nodes) by rows; `set` that of a node, or -1. Of a set
+    (sets_in_contact.py): COUNT nodes from FIRST stand for its numbers, so that their inverse mass is 1, and MEMBERS
+    from MEMBER are vertices, whose is 0; F, (members, COUNT, 3, 3), by rows from FACTOR, where W = F F^T; bounds from SIZES;
+    the node of the twist, or -1."""
 
     # ---- the barrier (host_geometry.py) --------------------------------------------------------------------------------
 
@@ -171,25 +175,64 @@ class PartKernels(Pair):
         return y
 
     @ti.func
+    def of_set(self, i, k: A, nodes: A):
+        return nodes.sets[ti.static(len(OF_SETS)) * nodes.set[i] + k]
+
+    @ti.func
+    def factor(self, i, b, d, nodes: A):
+        """Row d of F for node i and vector b of its set."""
+        count = self.of_set(i, COUNT, nodes)
+        member = i - self.of_set(i, MEMBER, nodes)
+        return three(nodes.factor[self.of_set(i, FACTOR, nodes) + 3 * (count * member + b) + d])
+
+    @ti.func
+    def gather(self, x: A, nodes: A, plan: A):
+        """F^T x of each set, to the nodes that stand for its numbers, where x is zero."""
+        for i in range(plan.num_nodes):
+            if nodes.set[i] >= 0:
+                for b in range(self.of_set(i, COUNT, nodes)):
+                    for d in ti.static(range(3)):
+                        x[self.of_set(i, FIRST, nodes) + b] += self.four(x[i][d] * self.factor(i, b, d, nodes))
+
+    @ti.func
     def lightened(self, i, x: A, nodes: A):
         """What impulses x on the nodes change of the velocity of node i."""
-        first = nodes.group[i]
         out = nodes.inverse[i] * self.freed(i, three(x[i]), nodes)
-        if first >= 0:
-            out = self.vec3(0)
-            for b in range(4):
-                out += nodes.coupled[4 * i + b] * three(x[first + b])
+        if nodes.set[i] >= 0:
+            for b in range(self.of_set(i, COUNT, nodes)):
+                of_set = three(x[self.of_set(i, FIRST, nodes) + b])
+                for d in ti.static(range(3)):
+                    out[d] += self.factor(i, b, d, nodes).dot(of_set)
         return out
 
     @ti.func
     def lightened_sizes(self, i, x: A, nodes: A):
-        """The same of numbers, by the sizes of inverse masses."""
-        first, out = nodes.group[i], nodes.inverse[i] * x[i]
-        if first >= 0:
-            out = ti.cast(0, self.fp)
-            for b in range(4):
-                out += ti.abs(nodes.coupled[4 * i + b]) * x[first + b]
+        """The same of numbers, by bounds of inverse masses."""
+        out = nodes.inverse[i] * x[i]
+        if nodes.set[i] >= 0:
+            first, count = self.of_set(i, MEMBER, nodes), self.of_set(i, MEMBERS, nodes)
+            for k in range(count):
+                out += nodes.sizes[self.of_set(i, SIZES, nodes) + count * (i - first) + k] * x[first + k]
         return out
+
+    @ti.func
+    def add_set_to_row(self, p, k, filled, n, nodes: A, work: A, plan: A):
+        """Add to row p of J, which has `filled` entries, what the k-th does by the numbers of its set; how many it then
+        has."""
+        i, begin, size = work.node[k], p * plan.room, filled
+        first, count, at = self.of_set(i, FIRST, nodes), self.of_set(i, COUNT, nodes), p * plan.room
+        while at < begin + size and work.node[at] != first:
+            at += 1
+        if at == begin + size:
+            for b in range(count):
+                work.node[at + b], work.share[at + b], work.row[at + b] = first + b, 0.0, self.vec4(0)
+            size += count
+        for b in range(count):
+            pulled = self.vec3(0)
+            for d in ti.static(range(3)):
+                pulled += n[d] * self.factor(i, b, d, nodes)
+            work.row[at + b] += work.share[k] * work.root[first + b] * self.four(pulled)
+        return size
 
     @ti.func
     def place_points(self, target: A, source: A, nodes: A, plan: A):
@@ -285,13 +328,13 @@ class PartKernels(Pair):
             work.n[p], work.fading[p] = self.four(n), m
             work.begin[p], work.end[p] = d - theta * along, d + (1 - theta) * along
             self.set_row(p, w, pairs, nodes, work, plan)
+            filled = work.filled[p]
             for k in range(p * plan.room, p * plan.room + work.filled[p]):
-                i, share = work.node[k], work.share[k]
-                if nodes.group[i] >= 0:
-                    share = 0.0
-                    for b in range(4):
-                        share += nodes.mixed[4 * i + b] * work.share[k + nodes.group[i] - i + b]
-                work.row[k] = share * work.root[i] * self.four(self.freed(i, n, nodes))
+                i = work.node[k]
+                work.row[k] = work.share[k] * work.root[i] * self.four(self.freed(i, n, nodes))
+                if nodes.set[i] >= 0:
+                    filled = self.add_set_to_row(p, k, filled, n, nodes, work, plan)
+            work.filled[p] = filled
             fine = before > 0 and d > HALF * before
         else:
             fine = ti.min(before, self.parted(kind, p, n, work.at_end, pairs) - pairs.radius[p]) > room
@@ -419,27 +462,40 @@ class PartKernels(Pair):
             for m in range(p * plan.room, p * plan.room + work.filled[p]):
                 work.residual[work.node[m]] += work.share[m] * work.P[p] * work.n[p]
                 work.load[work.node[m]] += ti.abs(work.share[m]) * pairs.mu[p] * work.P[p]
+        if plan.rough > 0:
+            for i in range(plan.num_nodes):
+                work.felt[i] = self.lightened_sizes(i, work.load, nodes)
         for k in range(plan.num_pairs * plan.rough):
             p, v, bound = pairs.acting[k], self.vec4(0), ti.cast(0, self.fp)
             for m in range(p * plan.room, p * plan.room + work.filled[p]):
                 i = work.node[m]
                 v += work.share[m] * work.step[i]
-                bound += h * ti.abs(work.share[m]) * self.lightened_sizes(i, work.load, nodes)
+                bound += h * ti.abs(work.share[m]) * work.felt[i]
             t = v - work.n[p].dot(v) * work.n[p]
             kappa, f, y, slip = slip_in_kernels(ti.sqrt(t.norm_sqr()), bound, pairs.speed[p], KERNELS)
             impulse = (-1.0 * h * pairs.mu[p] * work.P[p] * kappa) * t
             for m in range(p * plan.room, p * plan.room + work.filled[p]):
                 work.sum[work.node[m]] += work.share[m] * impulse
+        self.gather(work.residual, nodes, plan)
+        self.gather(work.sum, nodes, plan)
         for i in range(plan.num_nodes):
             delta = h * self.lightened(i, work.residual, nodes)
             friction = self.lightened(i, work.sum, nodes)
             given = h * three(work.residual[i]) + three(work.sum[i])
             if nodes.inverse[i] > 0:  # what holds it in some directions takes the rest
                 given = given - self.freed(i, given, nodes)
+            elif nodes.set[i] >= 0:
+                given = self.vec3(0)
             done = done - given.dot(three(nodes.motion[i])) / plan.h
             way = three(state.b[i]) + 0.5 * (1 + c) * delta + friction
             state.e_next[i] = state.e[i] + alpha * self.four(way)
             state.b_next[i] = state.b[i] + self.four(delta + friction)
+        for i in range(plan.num_nodes):
+            if nodes.set[i] >= 0:
+                if self.of_set(i, TWIST, nodes) >= 0:
+                    moved = state.e[i] + (plan.begin - 0.5) * nodes.motion[i] + 0.5 * (1 - c) * work.f[i]
+                    given = h * three(work.residual[i]) + three(work.sum[i])
+                    state.e_next[self.of_set(i, TWIST, nodes)] += self.four(three(moved).cross(given))
         for i in range(plan.num_nodes):
             work.sum[i] = nodes.x[i] + (plan.begin + plan.share) * nodes.motion[i] + state.e_next[i]
         self.place_points(work.at_end, work.sum, nodes, plan)

@@ -66,8 +66,8 @@ class ExplicitSolver(Solver):
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
         are `reduced` take obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
         SelfContact, and obstacles that act by pairs, are always a stage, in parts of each substep
-        (surfaces/contact_stage.py), which keeps surfaces apart whatever the stiffness, with friction in it; of sets that
-        are `reduced` affine ones go with them.
+        (surfaces/contact_stage.py), which keeps surfaces apart whatever the stiffness, with friction in it, also of sets
+        that are `reduced`.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.
@@ -193,10 +193,11 @@ class ExplicitWorkspace(Workspace):
         self._launches.clear()
         return OwnWork(self)
 
-    def record_contacts(self) -> None:
-        self.arrays.record_contacts()
-        self._launches.clear()
-        self.impulses = ImpulseRecord(self)
+    def record_contacts(self, of_obstacles: bool = True) -> None:
+        if of_obstacles:
+            self.arrays.record_contacts()
+            self._launches.clear()
+        self.impulses = ImpulseRecord(self, of_obstacles)
         self.contact.impulse = self.impulses.impulse
 
     def forget_contacts(self) -> None:

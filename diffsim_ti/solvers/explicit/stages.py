@@ -45,7 +45,7 @@ class KickDrift(Stage):
 
 def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
-    pairs = PairContact(ws.pairs, ws.solver.contact_damping) if ws.pairs else None
+    pairs = PairContact(ws.pairs, ws.solver.contact_damping, ws.scene.reduced.bodies) if ws.pairs else None
     every = pairs, ws.volumes, ws.chambers, ws.projected, KickDrift()
     return [stage for stage in every if stage]
 

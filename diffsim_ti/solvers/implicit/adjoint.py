@@ -121,22 +121,20 @@ class ImplicitAdjoint(RecordedPasses):
 
     def _pull_back_contacts(self, j: int, save_every: int) -> tuple[tuple | None, tuple | None]:
         """Adjoints of what the forces of obstacles in pass j depend on (SharesAdjoint), and of what pairs do
-        (LaggedFriction.vjp, PairShares.vjp), where a loss names them."""
-        seed, friction = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else (None, None)
-        seen = None if seed is None else self._shares.pull_back(seed)
-        p, by_pairs, found = self.potential, self.ws.pair_shares, []
-        if by_pairs and seed is not None:
-            found.append(by_pairs.vjp(seed))
-        if friction is not None:
-            found.append(np.array(p.surface_friction.vjp(p.held_at, friction, 0 if by_pairs else None)))
-        if found:
-            p.place(self.u_star)
-        return seen, tuple(sum(found)) if found else None
+        (PairShares.vjp), where a loss names them."""
+        seed = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else None
+        seen = by_pairs = None
+        if seed is not None and self._shares:
+            seen = self._shares.pull_back(seed[: self._shares.num_obstacles])
+        if seed is not None and self.ws.pair_shares:
+            by_pairs = tuple(self.ws.pair_shares.vjp(seed))
+            self.potential.place(self.u_star)
+        return seen, by_pairs
 
     def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
-        seen, from_friction = self._pull_back_contacts(j, save_every)
-        by_contacts, by_x, by_lag = np.zeros((3, *p.shape)) if from_friction is None else from_friction
+        seen, from_pairs = self._pull_back_contacts(j, save_every)
+        by_contacts, by_x, by_lag = np.zeros((3, *p.shape)) if from_pairs is None else from_pairs
         by_contacts = by_contacts if seen is None else by_contacts + seen[0]
         if s.static:
             q = np.zeros_like(q)

@@ -132,18 +132,15 @@ class ImplicitTangent(RecordedPasses):
         return dict(tangent=(SimpleNamespace(lag=self.lag, poses=self.poses), self.numbers))
 
     def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray, dx: np.ndarray, poses) -> None:
-        """Change of the forces of obstacles, and of friction between surfaces, in pass j, u* changing by d_star."""
-        p = self.ws.potential
-        runtime.fill(p.w, d_star[None])
-        along, by_pairs = (d_star, dx, self.du, self.numbers), self.ws.pair_shares
-        of_bodies = dict(poses_dot=poses, only=0) if by_pairs else {}
-
-        def change():
-            out = self._shares.forces("jvp", **self._moved)
-            return out + by_pairs.jvp(*along, self.tangent.parameters, poses) if by_pairs else out
-
-        friction = lambda: p.surface_friction.jvp(p.held_at, *along, **of_bodies)  # noqa: E731
-        self.contacts.add(j, save_every, self.stage.static, change, friction)
+        """Change of the forces of obstacles, and of surfaces on each other, in pass j, u* changing by d_star."""
+        made, pairs = [], self.ws.pair_shares
+        runtime.fill(self.ws.potential.w, d_star[None])
+        if self._shares:
+            made.append(lambda: self._shares.forces("jvp", **self._moved))
+        if pairs:
+            along = d_star, dx, self.du, self.numbers, self.tangent.parameters, poses
+            made.append(lambda: pairs.jvp(*along))
+        self.contacts.add(j, save_every, self.stage.static, *made)
 
     @property
     def joint_frames(self) -> list:

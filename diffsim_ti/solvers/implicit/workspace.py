@@ -370,7 +370,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         """Raise Overlap if a vertex is in an obstacle."""
         self.collisions.check_apart()
 
-    def record_contacts(self) -> None:
+    def record_contacts(self, of_obstacles: bool = True) -> None:
         self.impulses = ContactRecord(self)
 
     def forget_contacts(self) -> None:
@@ -380,23 +380,17 @@ class ImplicitWorkspace(PrescribedInPasses):
         return self.impulses.forces
 
     def note_contacts(self, j: int, save_every: int) -> None:
-        """What obstacles, and friction between surfaces, did in pass j, where it is asked for."""
+        """What obstacles, and surfaces to each other, did in pass j, where it is asked for."""
         if self.impulses and save_every:
-            at = self.potential.place(self.u_star)
+            self.potential.place(self.u_star)
             shares = self.kept("shares", lambda: Shares(self)) if len(self.arrays.obstacles) else None
-            pair_shares = self.pair_shares
-            friction = lambda: self.potential.surface_friction.forces(at, 0 if pair_shares else None)  # noqa: E731
-            forces = lambda: shares.forces() + (pair_shares.forces() if pair_shares else 0.0)  # noqa: E731
-            self.impulses.add(j, save_every, self.is_static, forces, friction)
+            made = [x.forces for x in (shares, self.pair_shares) if x]
+            self.impulses.add(j, save_every, self.is_static, *made)
 
     @property
     def pair_shares(self) -> PairShares | None:
-        """What obstacles do by pairs; None where none acts so."""
-        return (
-            self.kept("pair shares", lambda: PairShares(self.potential))
-            if self.pairs and self.pairs.obstacles
-            else None
-        )
+        """What contact by pairs does; None where there is none."""
+        return self.kept("pair shares", lambda: PairShares(self.potential)) if self.pairs else None
 
     # ---- what stands in the way --------------------------------------------------------------------------------------
 
