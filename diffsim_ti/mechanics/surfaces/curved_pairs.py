@@ -152,12 +152,20 @@ class CurvedPairs:
 
     # ---- between nodes and points ------------------------------------------------------------------------------------
 
-    def _fine(self, u, slot: int, target, given: str):
+    def _refining(self, u, slot: int, target, given: str) -> tuple:
         self.finer.follow()
         more = {"given": getattr(self.obstacles, given)} if self.obstacles else {}
-        at = SimpleNamespace(source=u, target=target, **more)
-        self._launch(self.kernels.refine, rows=self.down, at=at)(count=self.finer.num_vertices, slot=slot)
-        return target
+        records = dict(rows=self.down, at=SimpleNamespace(source=u, target=target, **more))
+        return self.kernels.refine, records, dict(count=self.finer.num_vertices, slot=slot)
+
+    def _fine(self, *what):
+        self.launch([self._refining(*what)])
+        return what[2]
+
+    def launch(self, parts: list[tuple]) -> None:
+        """Launch kernels with records and numbers, in this order."""
+        for kernel, records, numbers in parts:
+            self._launch(kernel, **records)(**numbers)
 
     def fine(self, u, slot: int):
         """Displacements of the finer surface, from those of a slot."""
@@ -176,11 +184,13 @@ class CurvedPairs:
         """Changes of all parameters, of a Tangent."""
         return runtime.fetch(numbers.parameters)[: len(self.a.values.parameters)].astype(np.float64)
 
+    def _gathering(self, out) -> tuple:
+        records = dict(rows=self.to_corners, at=SimpleNamespace(source=self.finer.corner, target=out))
+        return self.kernels.gather, records, dict(count=self.num_corners, first=self.a.first_contact_corner)
+
     def _gather(self, out) -> None:
         """From the points' corners to those of the nodes, the last ones of `out`."""
-        at = SimpleNamespace(source=self.finer.corner, target=out)
-        gather = self._launch(self.kernels.gather, rows=self.to_corners, at=at)
-        gather(count=self.num_corners, first=self.a.first_contact_corner)
+        self.launch([self._gathering(out)])
 
     def spread(self, u: np.ndarray, to: np.ndarray | None = None) -> np.ndarray:
         """Displacements of the finer surface, of corners of obstacles to where they are, or are said to be."""
@@ -240,9 +250,7 @@ class CurvedPairs:
         self.inner.forces(self.fine(u, slot), 0, self.finer.corner, exact)
         self._gather(out)
 
-    def product(
-        self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False, poses_dot=None
-    ) -> None:
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, poses_dot=None) -> None:
         """poses_dot: changes of the rows of poses, None: zero."""
         if self.obstacles and parameters_dot is not None:
             self.obstacles.change(parameters_dot, poses_dot)
@@ -251,7 +259,7 @@ class CurvedPairs:
         if rest_dot is not None:
             runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(rest_dot).astype(np.float64))
             moved = self._rest_dot
-        self.inner.product(fine_u, 0, fine_w, self.finer.corner, moved, parameters_dot, has_planes)
+        self.inner.product(fine_u, 0, fine_w, self.finer.corner, moved, parameters_dot)
         self._gather(out)
 
     def clear_sums(self) -> None:
@@ -283,9 +291,9 @@ class CurvedPairs:
     def energies(self) -> np.ndarray:
         return self.inner.energies()
 
-    def hessian_product(self, u, w, convex: bool) -> None:
-        self.inner.hessian_product(self.fine(u, 0), self.fine_change(w), convex)
-        self._gather(self.a.corner)
+    def multiplying(self, u, w, convex: bool) -> tuple:
+        refining = self._refining(w, 0, self._w, "unmoved")
+        return refining, *self.inner.multiplying(self.fine(u, 0), self._w, convex), self._gathering(self.a.corner)
 
     def add_blocks(self, u, out) -> None:
         """Those of points by squares of what nodes have of them, without what two points of a node have in common."""

@@ -72,29 +72,27 @@ class ImplicitPairs(SurfacePairs):
             self._acting = SimpleNamespace(**arrays), dict(num_vt=num_vt, num_pairs=len(own))
         return self._acting
 
-    def run_acting(self, kernel, at: dict, slot: int = 0, **numbers) -> None:
-        """Launch a kernel of pairs on those that act."""
+    def _of_those_acting(self, kernel, at: dict, **numbers) -> tuple:
+        """A kernel of pairs on those that act."""
         acting, sizes = self._of_acting()
-        self.run(kernel, at, acting, slot=slot, **numbers, **sizes)
+        return self.prepared(kernel, at, acting, slot=0, **numbers, **sizes)
 
     def energies(self) -> np.ndarray:
         """Energy of each pair [J]."""
         return runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
 
-    def hessian_product(self, u, w, convex: bool) -> None:
+    def multiplying(self, u, w, convex: bool) -> list[tuple]:
         """Change of the forces of contact and friction for changes w[0] of the positions, to the last corners of
-        `arrays.corner`."""
-        at = dict(u=u, w=w, out=self.a.corner)
-        if convex:
-            self.run_acting(self.hessian.products, at)
-        else:
-            self.product(u, 0, w, self.a.corner, has_planes=True)
-        if self.friction:
-            self.friction.add_product(u, w, self.a.corner)
+        `arrays.corner`, as [(kernel, records, numbers)]; convex: the convex part of contact alone."""
+        kernel, at, numbers = self.hessian.products, dict(u=u, w=w, out=self.a.corner), {}
+        if not convex:
+            kernel, (at, numbers) = self.kernels.products, self._of_product(u, w, self.a.corner, has_planes=True)
+        friction = self.friction.multiplying(u, w, self.a.corner) if self.friction else []
+        return [self._of_those_acting(kernel, at, **numbers), *friction]
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (mechanics/energy/kernels.py)."""
-        self.run_acting(self.hessian.blocks, dict(u=u, out=out))
+        self.launch([self._of_those_acting(self.hessian.blocks, dict(u=u, out=out))])
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
