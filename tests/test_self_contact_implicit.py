@@ -89,20 +89,20 @@ def test_products_and_diagonal_of_the_hessian():
     tail = slice(a.first_contact_corner, None)
     w = np.random.default_rng(0).standard_normal(u.shape)
     runtime.fill(potential.w, w[None])
-    pairs.hessian_product(potential.u, potential.w, False)
+    pairs.launch(pairs.multiplying(potential.u, potential.w, False))
     mine = runtime.fetch(a.corner)[tail].copy()
     pairs.product(potential.u, 0, potential.w, a.corner)
     other = runtime.fetch(a.corner)[tail]
     assert np.abs(other).max() > 0
     np.testing.assert_allclose(mine, other, atol=1e-12 * np.abs(other).max())
-    pairs.hessian_product(potential.u, potential.w, True)
+    pairs.launch(pairs.multiplying(potential.u, potential.w, True))
     assert -(runtime.fetch(a.corner)[tail] * w[a.mesh.surface_vertices]).sum() > 0
     blocks, i = potential.contact_blocks(), int(np.abs(potential.contact_blocks()).sum((1, 2)).argmax())
     for d in range(3):
         unit = np.zeros_like(u)
         unit[i, d] = 1
         runtime.fill(potential.w, unit[None])
-        pairs.hessian_product(potential.u, potential.w, True)
+        pairs.launch(pairs.multiplying(potential.u, potential.w, True))
         column = -runtime.fetch(a.corner)[tail][np.searchsorted(a.mesh.surface_vertices, i)]
         np.testing.assert_allclose(blocks[i][:, d], column, atol=1e-12 * np.abs(blocks[i]).max())
 

@@ -75,8 +75,9 @@ class Potential:
         sizes = dict(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices)
         return sizes | dict(per_gamma=self.per_gamma)
 
-    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, poses: np.ndarray) -> None:
-        """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (obstacles.py)."""
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, poses: np.ndarray, ahead=None) -> None:
+        """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (obstacles.py); ahead: the
+        step [m] that it is expected to make."""
         self.per_gamma = per_gamma
         if self.has_friction:
             runtime.fill(self.lag, np.stack([u, x]))
@@ -84,7 +85,7 @@ class Potential:
             runtime.fill(self.poses, poses)
         if self.pairs:
             self.pairs.follow(poses, AT_BEGIN)
-            self.pairs.begin(u)
+            self.pairs.begin(u, np.zeros_like(u) if ahead is None else ahead)
         if self.surface_friction:
             self.surface_friction.begin(u, x, per_gamma)
         if self.pairs:
@@ -95,11 +96,11 @@ class Potential:
         runtime.fill(self.u, u[None])
         return self.arrive()
 
-    def arrive(self) -> np.ndarray:
-        """The same of a displacement that is on the device."""
+    def arrive(self, on_way: bool = False) -> np.ndarray:
+        """The same of a displacement that is on the device; on_way: of the last step whose safe share pairs said."""
         self.held_at = runtime.fetch_row(self.u, 0)
         if self.pairs:
-            self.pairs.place(self.u)
+            self.pairs.place(self.u, on_way)
         if self.rigid:
             self.rigid.place(self.held_at)
         return self.held_at

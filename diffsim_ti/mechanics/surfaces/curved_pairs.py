@@ -280,12 +280,12 @@ class CurvedPairs:
 
     # ---- in Newton's method ------------------------------------------------------------------------------------------
 
-    def begin(self, u: np.ndarray) -> None:
+    def begin(self, u: np.ndarray, ahead: np.ndarray | None = None) -> None:
         runtime.fill(self.next, u[None])
-        self.inner.begin(self.spread(u))
+        self.inner.begin(self.spread(u), None if ahead is None else self.matrix @ ahead)
 
-    def place(self, u) -> None:
-        self.inner.place(self.fine(u, 0))
+    def place(self, u, on_way: bool = False) -> None:
+        self.inner.place(self.fine(u, 0), on_way)
         self._gather(self.a.corner)
 
     def energies(self) -> np.ndarray:
@@ -305,9 +305,11 @@ class CurvedPairs:
     def _step(self, step: np.ndarray, drift) -> np.ndarray:
         return self.spread(step, 0.0 if drift is None else drift)
 
-    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None) -> float:
+    def safe_share(
+        self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None, placed: bool = False
+    ) -> float:
         """drift: displacements of corners of obstacles meanwhile; None: they stand still."""
-        return self.inner.safe_share(self.spread(u), self._step(step, drift), most)
+        return self.inner.safe_share(self.spread(u), self._step(step, drift), most, placed)
 
     @property
     def met(self) -> tuple[tuple[int, ...], int | None] | None:

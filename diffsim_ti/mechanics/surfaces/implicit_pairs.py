@@ -24,6 +24,8 @@ class ImplicitPairs(SurfacePairs):
     friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
     blocked: np.ndarray | None = None  # corners of the pair that stopped the last march
+    _ahead: np.ndarray | float = 0.0  # how far vertices are expected to go in a pass [m]
+    _holds_on_way = False  # whether the list holds on all of the last step that was asked for its safe share
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)
@@ -32,15 +34,19 @@ class ImplicitPairs(SurfacePairs):
         self.next = runtime.array(self.kernels.vec4, 1, arrays.num_vertices)
         self._places, self._acting = runtime.fetch(self.list.place), None
 
-    def begin(self, u: np.ndarray) -> None:
-        """A new pass from u: from here on all is a function of u, whatever came before."""
+    def begin(self, u: np.ndarray, ahead: np.ndarray | None = None) -> None:
+        """A new pass from u: from here on all is a function of u, and of how far `ahead` [m] it is expected to go, whatever
+        came before; None: as before."""
         self.fresh = False
+        if ahead is not None:
+            self._ahead = 1.5 * self.travel(ahead[self.mesh.surface_vertices])
         runtime.fill(self.next, u[None])
-        self.build(self.next, 0)
+        self.build(self.next, 0, wanted=self._ahead)
 
-    def place(self, u) -> None:
-        """Go to the displacements u[0]."""
-        self.ensure(u, 0)
+    def place(self, u, on_way: bool = False) -> None:
+        """Go to the displacements u[0]; on_way: of the last step that was asked for its safe share."""
+        if not (on_way and self._holds_on_way):
+            self.ensure(u, 0)
         self.forces(u, 0, self.a.corner)
         self._acting = None
         if self.friction:
@@ -94,15 +100,19 @@ class ImplicitPairs(SurfacePairs):
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (mechanics/energy/kernels.py)."""
         self.launch([self._of_those_acting(self.hessian.blocks, dict(u=u, out=out))])
 
-    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
+    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, placed: bool = False) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
         largest such share only where they are about to meet. Marches along the step, with a new list at each halt,
-        unless the present one holds on all of it."""
+        unless the present one holds on all of it. placed: `place` was last at u."""
         travel = self.travel(step[self.mesh.surface_vertices])
         if not travel.any():
             return most
         runtime.fill(self.step, step[None])
-        share, self.blocked, holds = 0.0, None, self._holds(u + most * step) and self._holds(u)
+        share, self.blocked, holds = 0.0, None, self._holds(u + most * step)
+        placed, holds = placed and holds, holds and (placed or self._holds(u))
+        self._holds_on_way = holds
+        if placed:
+            runtime.fill(self.next, u[None])
         for _ in range(self.longest_march):
             unlisted = np.inf
             if not holds:
@@ -110,8 +120,9 @@ class ImplicitPairs(SurfacePairs):
                 self.build(self.next, 0, wanted=(most - share) * travel)
                 reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
                 unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
-            self.forces(self.next, 0, self.a.corner, exact=True)
-            shares = self._shares(most - share)
+            if not placed:
+                self.forces(self.next, 0, self.a.corner, exact=True)
+            shares, placed = self._shares(most - share), False
             listed = shares.min(initial=np.inf)
             share += min(listed, unlisted)
             if share >= most:

@@ -192,7 +192,7 @@ class DeviceNewton:
                 self._shorten()
         move(1, **numbers)
         if self.beside:
-            u = self.potential.arrive() if is_new or state[nk.PHASE] == nk.TRY else self.potential.held_at
+            u = self.potential.arrive(on_way=True) if is_new or state[nk.PHASE] == nk.TRY else self.potential.held_at
             energies, mass = self.potential.energies_beside(), self.newton.mass
             against = 0.0
             if isinstance(mass, ConsistentMass):
@@ -205,7 +205,7 @@ class DeviceNewton:
         """Not farther along a new direction than to where surfaces meet."""
         u, step, friction = self._base, runtime.fetch_row(self.detection.way.step, 0), self.potential.surface_friction
         state = runtime.fetch(self.cg.state)
-        share = self.potential.pairs.safe_share(u, step, state[nk.FRACTION])
+        share = self.potential.pairs.safe_share(u, step, float(state[nk.FRACTION]), placed=True)
         cuts = state[nk.CUTS] + (share < 1 == state[nk.FRACTION])
         self._set({nk.CUTS: cuts, nk.FRACTION: share} | ({} if share > self.newton.shortest else {nk.PHASE: nk.TROUBLE}))
         if friction:
