@@ -136,9 +136,10 @@ class Repeated:
     """Kernels one after the other, again and again in one launch: `launch(times, **numbers)`.
 
     groups: lists of (kernel, records, numbers), records as of `Kernel.bind`; an array that several of them take is one
-    argument; numbers: None where they are those of the launch, else as the dictionary has them then. The body of the first of a group says whether the others are
-    wanted. On one thread of the processor it is asked each time; elsewhere the others themselves do nothing once they are
-    not wanted, in a list of tasks that names them so often (repeated_loops.py).
+    argument; numbers: None where they are those of the launch, else a dictionary, of which they are taken then. The body
+    of the first of a group says whether the others are wanted. On one thread of the processor it is asked each time;
+    elsewhere the others themselves do nothing once they are not wanted, in a list of tasks that names them so often
+    (repeated_loops.py).
     """
 
     def __init__(self, name: str, groups: list[list], parallel: bool, vectorized: bool = False):

@@ -291,6 +291,11 @@ class Potential:
         blocks = np.swapaxes(runtime.fetch(self.barriers.blocks).astype(np.float64), 0, 1)
         return blocks if on_host is None else blocks + on_host
 
+    def put_contact_blocks(self) -> None:
+        """All of them, on the device."""
+        self.launch("contact_blocks", lanes=False, out=self.barriers)
+        self.leave_contact_blocks()
+
     def leave_contact_blocks(self) -> None:
         """Those of pairs and from the host join those of obstacles on the device."""
         if self.pairs:

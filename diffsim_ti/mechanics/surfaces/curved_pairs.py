@@ -305,9 +305,7 @@ class CurvedPairs:
     def _step(self, step: np.ndarray, drift) -> np.ndarray:
         return self.spread(step, 0.0 if drift is None else drift)
 
-    def safe_share(
-        self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None, placed: bool = False
-    ) -> float:
+    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None, placed: bool = False) -> float:
         """drift: displacements of corners of obstacles meanwhile; None: they stand still."""
         return self.inner.safe_share(self.spread(u), self._step(step, drift), most, placed)
 

@@ -41,7 +41,7 @@ class FrictionProductKernels:
                 p, corner = of.corner_of[k] // 4, of.corner_of[k] % 4
                 total += of.weights[p][corner] * of.pull[p]
             if of.row[s + 1] > of.row[s]:
-                at.out[plan.first_out + s] -= total
+                at.out[plan.first_out + s] = at.out[plan.first_out + s] - total
 
     @cached_property
     def products(self) -> Kernel:

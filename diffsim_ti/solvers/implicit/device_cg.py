@@ -101,7 +101,10 @@ class DeviceCG:
         if self._is_one_kernel:
             repeated = Repeated("cg", [parts], self.parallel, lanes)
             return lambda times, rounding: repeated(times, **potential.sizes(), **self._sizes, rounding=rounding)
-        launches = [(kernel.bind(lanes, **records), numbers or self._sizes) for kernel, records, numbers in parts[1 : -1 - len(products)]]
+        launches = [
+            (kernel.bind(lanes, **records), numbers or self._sizes)
+            for kernel, records, numbers in parts[1 : -1 - len(products)]
+        ]
         step = parts[-1][0].bind(lanes, **parts[-1][1])
 
         def iterate(times: int, rounding: float) -> None:

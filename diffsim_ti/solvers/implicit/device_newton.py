@@ -207,7 +207,9 @@ class DeviceNewton:
         state = runtime.fetch(self.cg.state)
         share = self.potential.pairs.safe_share(u, step, float(state[nk.FRACTION]), placed=True)
         cuts = state[nk.CUTS] + (share < 1 == state[nk.FRACTION])
-        self._set({nk.CUTS: cuts, nk.FRACTION: share} | ({} if share > self.newton.shortest else {nk.PHASE: nk.TROUBLE}))
+        self._set(
+            {nk.CUTS: cuts, nk.FRACTION: share} | ({} if share > self.newton.shortest else {nk.PHASE: nk.TROUBLE})
+        )
         if friction:
             self.newton.turning = friction.turns(u, u + step)
 

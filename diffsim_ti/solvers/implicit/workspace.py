@@ -376,7 +376,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     # ---- what a pass is told -----------------------------------------------------------------------------------------
 
     def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray, ahead: np.ndarray | None = None) -> None:
-        """Tell the potential where obstacles are in pass j, where friction is measured from, and the step that is expected."""
+        """Tell the potential where obstacles are in pass j, where friction is measured from, which step is expected."""
         self.collisions.begin(j, stage)
         self.potential.begin(u, x, 1 / stage.gamma, self.collisions.rows, ahead)
         self.origin = x
