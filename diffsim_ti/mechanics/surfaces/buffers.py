@@ -94,6 +94,11 @@ class Launches:
             bound = self._bound[tuple(key)] = kernel.bind(vectorized, **records)
         return bound
 
+    def run(self, parts) -> None:
+        """Launch (kernel, records, numbers), one after the other."""
+        for kernel, records, numbers in parts:
+            self(kernel, **records)(**numbers)
+
     def clear(self) -> None:
         """Let go of the arrays."""
         self._bound.clear()

@@ -148,6 +148,7 @@ class CurvedPairs:
         self._row, self._rest_dot = runtime.array(vector, 1, n), runtime.array(vector, surface.num_vertices)
         self.step, self.next = runtime.array(vector, 1, n), runtime.array(vector, 1, n)
         self._launch = Launches()
+        self.launch = self._launch.run
         self.friction = CurvedLaggedFriction(self) if self.inner.friction else None
 
     # ---- between nodes and points ------------------------------------------------------------------------------------
@@ -161,11 +162,6 @@ class CurvedPairs:
     def _fine(self, *what):
         self.launch([self._refining(*what)])
         return what[2]
-
-    def launch(self, parts: list[tuple]) -> None:
-        """Launch kernels with records and numbers, in this order."""
-        for kernel, records, numbers in parts:
-            self._launch(kernel, **records)(**numbers)
 
     def fine(self, u, slot: int):
         """Displacements of the finer surface, from those of a slot."""

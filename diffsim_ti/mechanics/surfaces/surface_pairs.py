@@ -72,6 +72,7 @@ class SurfacePairs:
         surface = mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body
         self.list = CandidatePairs(*surface, arrays.precision, parallel, self.kinematic)
         self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vec4
+        self.launch = self._launch.run
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
         marked = spread(self.body[mesh.surface_vertices], self.markers)
@@ -169,11 +170,6 @@ class SurfacePairs:
     def run(self, kernel, at: dict, *more, **numbers) -> None:
         """Launch a kernel of pairs."""
         self.launch([self.prepared(kernel, at, *more, **numbers)])
-
-    def launch(self, parts: list[tuple]) -> None:
-        """Launch kernels with records and numbers, in this order."""
-        for kernel, records, numbers in parts:
-            self._launch(kernel, **records)(**numbers)
 
     # ---- the list ---------------------------------------------------------------------------------------------------
 

@@ -244,10 +244,12 @@ class DeviceNewton:
         return more
 
     def _iterate(self, state: np.ndarray, eps: float) -> None:
-        """Conjugate gradients, some or all of them."""
+        """Conjugate gradients, until they stop."""
         friction, more = self.potential.surface_friction, self._more is not None
         with friction.bounded(self.newton.turning) if friction else nullcontext():
-            self.cg.iterate(int(state[COUNT]), int(state[LIMIT]), eps, more)
+            while not state[STOPPED] and self._is_going_well(state):
+                self.cg.iterate(int(state[COUNT]), int(state[LIMIT]), eps, more)
+                state = runtime.fetch(self.cg.state)
 
     def _here(self) -> np.ndarray:
         """The displacement on the device, of which the host is told."""
