@@ -68,7 +68,7 @@ class DeviceNewton:
         if self.whole:
             groups += [[(updates, own, None), *update]] if update else []
             groups.append([(solves, own, None), *cg.parts(False, potential.multiplying())[1:]])
-        self._steps = self._more = None
+        self._trial = self._residual = self._steps = self._more = None
         if self.whole:
             self._trial = Repeated("newton", groups, cg.parallel, vectorized=True)
         elif beside or on_cpu:
