@@ -87,7 +87,7 @@ def traced_alone(found: dict):
     def run(self, state, eps=0.0):
         """Once, and then the host has to go on."""
         numbers = self._always | self.potential.sizes() | dict(rounding=0.0)
-        for part in (self._trial, self._residual, self._update):
+        for part in (self._trial, self._residual, self._update, *(self._steps or ())):
             if part:
                 part(1, **numbers)
         runtime.fill(self.u, self.potential.held_at)

@@ -193,7 +193,7 @@ def test_forces_of_curved_faces_are_the_slope_of_their_energy():
     found = (at[1e-6][0] - at[-1e-6][0]) / 2e-6
     assert found == pytest.approx(-(at[0][1] * d).sum(), rel=1e-6) and abs(found) > 1e-3
     runtime.fill(potential.w, d[None])
-    potential.pairs.hessian_product(potential.u, potential.w, convex=False)
+    potential.pairs.launch(potential.pairs.multiplying(potential.u, potential.w, convex=False))
     np.testing.assert_allclose(
         ((at[1e-6][1] - at[-1e-6][1]) * e).sum() / 2e-6, (_at_corners(simulator) * e).sum(), rtol=1e-5
     )

@@ -1,13 +1,17 @@
 """The preconditioner of implicit solves and conjugate gradients on the device; equilibria by load stepping."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import diffsim_ti as ds
+from diffsim_ti import runtime
 from diffsim_ti.mechanics.stress.projection import Projection
-from diffsim_ti.solvers.implicit.cycle import Cycle
+from diffsim_ti.solvers.implicit.contact_kernels import ContactKernels
+from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
 from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
@@ -428,3 +432,34 @@ def test_matrices_of_the_strained_state(monkeypatch):
     assert len(state["preconditioner"]) > 2 and np.array_equal(simulator.displacements, other.displacements)
     with pytest.raises(ValueError, match="preconditioner: expected 2 finite numbers, or 1817"):
         other.resume(state | dict(preconditioner=np.zeros(3)))
+
+
+def test_contact_joins_the_finest_level_turned_back_without_what_is_negative():
+    """Blocks of full rank, of rank one, none; an axis that is held; a block that only the host can invert."""
+    rng, n = np.random.default_rng(0), 60
+    C, B, normal = rng.standard_normal((n, 3, 3)), rng.standard_normal((n, 3, 3)), rng.standard_normal((20, 3))
+    C, B = C + np.swapaxes(C, 1, 2), B @ np.swapaxes(B, 1, 2) + np.eye(3)
+    C[:20], C[20:30], B[59], C[59] = normal[:, :, None] * normal[:, None], 0, 0, -np.eye(3)
+    R = np.linalg.qr(rng.standard_normal((n, 3, 3)))[0].astype(np.float32).astype(float)
+    P = np.tile(np.eye(3), (n, 1, 1))
+    P[40:50, 0, 0] = 0
+    blocks, own = (runtime.array(runtime.array_types("f64")["vectors"].dtype, 3, n) for _ in range(2))
+    runtime.fill(blocks, np.moveaxis(C, 2, 0))
+    runtime.fill(own, np.moveaxis(B, 2, 0))
+    marks = [runtime.array(ti.i32, n) for _ in range(3)]
+    level = SimpleNamespace(diagonal=upload_rows(np.zeros((n, 3, 3))), inverse=upload_rows(np.zeros((n, 3, 3))))
+    ContactKernels("f64", "f64", False).join.bind(
+        at=SimpleNamespace(blocks=blocks),
+        frames=SimpleNamespace(turned=upload_rows(R), allowed=upload_rows(P)),
+        turning=SimpleNamespace(hard=marks[0]),
+        level=level,
+        body=SimpleNamespace(own=own, touched=marks[1], hard=marks[2]),
+    )(vertices=n, theta=2.0)
+    values, vectors = np.linalg.eigh(C)
+    positive = (vectors * np.maximum(values, 0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+    D, on = B + np.swapaxes(R, 1, 2) @ P @ positive @ P @ R, C.any((1, 2))
+    found, inverse = (np.swapaxes(runtime.fetch(x).reshape(-1, 3, 3), 1, 2) for x in (level.diagonal, level.inverse))
+    np.testing.assert_allclose(found[on], D[on], atol=1e-6 * np.abs(D).max())
+    np.testing.assert_allclose(inverse[on][:-1], np.linalg.inv(D[on][:-1]) / 2, atol=1e-6)
+    assert np.array_equal(runtime.fetch(marks[1]) > 0, on)
+    assert np.flatnonzero(runtime.fetch(marks[2])).tolist() == [59]

@@ -8,6 +8,7 @@ from test_self_contact import MATERIAL, crossed_edges, momenta, two_blocks
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
+from diffsim_ti.solvers.implicit.newton import Newton
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 solvers = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
@@ -30,6 +31,19 @@ def test_large_steps_keep_bodies_apart_and_their_momentum(solver, precision):
     assert np.abs(p1 - p).max() <= 10 * tolerance * size
     if precision == "f64" and solver is ds.ImplicitMidpointSolver:  # the others damp rotation
         assert np.abs(L1 - L).max() <= 10 * tolerance * size
+
+
+def test_rounds_on_the_device_go_as_those_on_the_host(monkeypatch):
+    """Two blocks that meet."""
+    scene, found = two_blocks().scene, []
+    for on_device in (True, False):
+        if not on_device:
+            monkeypatch.setattr(Newton, "_on_device", lambda newton: None)
+        rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=4e-3), 10)
+        found.append((rollout.forward().displacements[-1], rollout.report.iterations))
+    (u, rounds), (v, others) = found
+    np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
+    assert abs(rounds - others) <= 0.1 * others
 
 
 @lru_cache
@@ -89,20 +103,20 @@ def test_products_and_diagonal_of_the_hessian():
     tail = slice(a.first_contact_corner, None)
     w = np.random.default_rng(0).standard_normal(u.shape)
     runtime.fill(potential.w, w[None])
-    pairs.hessian_product(potential.u, potential.w, False)
+    pairs.launch(pairs.multiplying(potential.u, potential.w, False))
     mine = runtime.fetch(a.corner)[tail].copy()
     pairs.product(potential.u, 0, potential.w, a.corner)
     other = runtime.fetch(a.corner)[tail]
     assert np.abs(other).max() > 0
     np.testing.assert_allclose(mine, other, atol=1e-12 * np.abs(other).max())
-    pairs.hessian_product(potential.u, potential.w, True)
+    pairs.launch(pairs.multiplying(potential.u, potential.w, True))
     assert -(runtime.fetch(a.corner)[tail] * w[a.mesh.surface_vertices]).sum() > 0
     blocks, i = potential.contact_blocks(), int(np.abs(potential.contact_blocks()).sum((1, 2)).argmax())
     for d in range(3):
         unit = np.zeros_like(u)
         unit[i, d] = 1
         runtime.fill(potential.w, unit[None])
-        pairs.hessian_product(potential.u, potential.w, True)
+        pairs.launch(pairs.multiplying(potential.u, potential.w, True))
         column = -runtime.fetch(a.corner)[tail][np.searchsorted(a.mesh.surface_vertices, i)]
         np.testing.assert_allclose(blocks[i][:, d], column, atol=1e-12 * np.abs(blocks[i]).max())
 

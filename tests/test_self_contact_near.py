@@ -115,13 +115,13 @@ def test_forces_and_products_are_derivatives(mesh):
     push = -(force * w[mesh.surface_vertices]).sum()
     assert abs(push) > 0 and (high - low) / (2 * eps) == pytest.approx(push, rel=1e-5)
     runtime.fill(potential.w, w[None])
-    pairs.hessian_product(potential.u, potential.w, False)
+    pairs.launch(pairs.multiplying(potential.u, potential.w, False))
     product = runtime.fetch(a.corner)[a.first_contact_corner :]
     np.testing.assert_allclose((after - before) / (2 * eps), product, atol=1e-4 * np.abs(product).max())
     v = 1e-2 * rng.standard_normal(u.shape)
     runtime.fill(potential.w, v[None])
     left = (product * v[mesh.surface_vertices]).sum()
-    pairs.hessian_product(potential.u, potential.w, False)
+    pairs.launch(pairs.multiplying(potential.u, potential.w, False))
     right = (runtime.fetch(a.corner)[a.first_contact_corner :] * w[mesh.surface_vertices]).sum()
     assert left == pytest.approx(right, rel=1e-9, abs=1e-9 * np.abs(product).max())
 

@@ -160,15 +160,15 @@ class JoinedCG(DeviceCG):
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=self.nodes)
         self._look = self.many if self.by_scene else 0
 
-    def _iteration(self, more: bool, convex: bool):
+    def _iteration(self, more: bool, convex: bool, products: list):
         if not self.by_scene:
-            return super()._iteration(more, convex)
+            return super()._iteration(more, convex, products)
         a, own, per = self.potential.arrays, dict(cg=self, at=self.potential), self.scenes
         kernels = kernels_of(CGKernels, a.precision, self.precision, False, self.guided, more)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
         product = kernels_of(PotentialKernels, a.law, a.features().of_state(), False, a.in_lanes).product
         parts = [(kernels.wanted, own, {}), *before, (kernels.turn, own, self._sizes)]
-        parts += [(product, self.potential.multiplying[1], self.potential.sizes()), (kernels.step, own, self._sizes)]
+        parts += [(product, products[0][1], self.potential.sizes()), (kernels.step, own, self._sizes)]
         whole = WHOLE | ({("scene", "coefficients")} if a.features().uniform else set())
         run = Piecewise("cg_of_scenes", [x[:2] for x in parts], per, whole, COUNTING, True)
         each = [{n: x // per if n in COUNTS else x for n, x in numbers.items()} for _, _, numbers in parts]

@@ -136,9 +136,10 @@ class Repeated:
     """Kernels one after the other, again and again in one launch: `launch(times, **numbers)`.
 
     groups: lists of (kernel, records, numbers), records as of `Kernel.bind`; an array that several of them take is one
-    argument; numbers: None where they are those of the launch. The body of the first of a group says whether the others are
-    wanted. On one thread of the processor it is asked each time; elsewhere the others themselves do nothing once they are
-    not wanted, in a list of tasks that names them so often (repeated_loops.py).
+    argument; numbers: None where they are those of the launch, else a dictionary, of which they are taken then. The body
+    of the first of a group says whether the others are wanted. On one thread of the processor it is asked each time;
+    elsewhere the others themselves do nothing once they are not wanted, in a list of tasks that names them so often
+    (repeated_loops.py).
     """
 
     def __init__(self, name: str, groups: list[list], parallel: bool, vectorized: bool = False):
@@ -150,8 +151,8 @@ class Repeated:
         title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
         options = dict(title=title, loops=0 if one_thread else -1)
         launch = Launch(made, *arrays, vectorized=vectorized, **options)
-        own = [(n, None if k is None else own_numbers[k][n]) for k, n in numbers]
-        self._launch = lambda times, given: launch(*(given[n] if x is None else x for n, x in own), times)
+        own = [(n, None if k is None else own_numbers[k]) for k, n in numbers]
+        self._launch = lambda times, given: launch(*((given if x is None else x)[n] for n, x in own), times)
 
     @staticmethod
     def is_possible(parallel: bool) -> bool:

@@ -76,8 +76,9 @@ class Potential:
         sizes = dict(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices)
         return sizes | dict(per_gamma=self.per_gamma)
 
-    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, poses: np.ndarray) -> None:
-        """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (obstacles.py)."""
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, poses: np.ndarray, ahead=None) -> None:
+        """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (obstacles.py); ahead: the
+        step [m] that it is expected to make."""
         self.per_gamma = per_gamma
         if self.has_friction:
             runtime.fill(self.lag, np.stack([u, x]))
@@ -87,7 +88,7 @@ class Potential:
             self.joints.u_n = u
         if self.pairs:
             self.pairs.follow(poses, AT_BEGIN)
-            self.pairs.begin(u)
+            self.pairs.begin(u, np.zeros_like(u) if ahead is None else ahead)
         if self.surface_friction:
             self.surface_friction.begin(u, x, per_gamma)
         if self.pairs:
@@ -96,9 +97,13 @@ class Potential:
     def place(self, u: np.ndarray) -> np.ndarray:
         """Go to displacement u [m]; returns it as the device holds it."""
         runtime.fill(self.u, u[None])
-        self.held_at = runtime.fetch(self.u)[0].astype(np.float64)
+        return self.arrive()
+
+    def arrive(self, on_way: bool = False) -> np.ndarray:
+        """The same of a displacement that is on the device; on_way: of the last step whose safe share pairs said."""
+        self.held_at = runtime.fetch_row(self.u, 0)
         if self.pairs:
-            self.pairs.place(self.u)
+            self.pairs.place(self.u, on_way)
         if self.rigid:
             self.rigid.place(self.held_at)
         if self.joints:
@@ -155,22 +160,30 @@ class Potential:
         """(energy [J], the sum of its absolute parts, J at each point)."""
         self.launch("energy", lanes=False)
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
-        if self.pairs:
-            contact = np.concatenate([contact, self.pairs.energies()])
-        contact = np.concatenate([contact, *(part.energies(self.held_at) for part in self._on_host())])
+        contact = np.concatenate([contact, self.energies_beside()])
         if self.joints:
             contact = np.concatenate([contact, self.joints.energies()])
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
+
+    def energies_beside(self) -> np.ndarray:
+        """Those of pairs and from the host [J]."""
+        of_pairs = self.pairs.energies() if self.pairs else np.zeros(0)
+        return np.concatenate([of_pairs, *(part.energies(self.held_at) for part in self._on_host())])
+
+    def forces_beside(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those from the host [N], and the sums of their sizes."""
+        forces, sizes = np.zeros_like(self.held_at), np.zeros(len(self.held_at))
+        for part in self._on_host():
+            forces, sizes = forces + part.forces(self.held_at), sizes + part.sizes(self.held_at)
+        return forces, sizes
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(forces -dE/du [N], sum of the sizes of the forces that meet at each vertex)."""
         if self.pairs:
             self.pairs.forces(self.u, 0, self.arrays.corner)
         self.launch("forces")
-        forces, sizes = (runtime.fetch(x).astype(np.float64) for x in (self.y, self.size))
-        for part in self._on_host():
-            forces, sizes = forces + part.forces(self.held_at), sizes + part.sizes(self.held_at)
-        return forces[0], sizes
+        forces, sizes = self.forces_beside()
+        return runtime.fetch_row(self.y, 0) + forces, runtime.fetch(self.size).astype(np.float64) + sizes
 
     def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
         """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
@@ -184,18 +197,13 @@ class Potential:
     def multiply(self, convex: bool = False) -> None:
         """y = -d2E/du2 w on the device, without host forces."""
         if self.pairs:
-            self.pairs.hessian_product(self.u, self.w, convex)
+            self.pairs.launch(self.pairs.multiplying(self.u, self.w, convex))
         self.launch("product")
 
-    @property
-    def is_one_kernel(self) -> bool:
-        """Whether `multiplying` does all of `multiply`."""
-        return not self.pairs
-
-    @property
-    def multiplying(self) -> tuple:
-        """(kernel, records) of y = -d2E/du2 w, which takes `sizes`."""
-        return self.kernels.product, self._records
+    def multiplying(self, convex: bool = False) -> list[tuple]:
+        """`multiply` where the potential stands, as [(kernel, records, numbers)]; the last takes `sizes`."""
+        own = self.pairs.multiplying(self.u, self.w, convex) if self.pairs else []
+        return [*own, (self.kernels.product, self._records, None)]
 
     def blocks(self) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
@@ -275,7 +283,7 @@ class Potential:
         if a.contacts:
             y += np.einsum("kij,kj->ki", self.obstacle_blocks(), w)
         if self.pairs:
-            self.pairs.hessian_product(self.u, self.w, False)
+            self.pairs.launch(self.pairs.multiplying(self.u, self.w, False))
             y[a.mesh.surface_vertices] -= runtime.fetch(a.corner)[a.first_contact_corner :][
                 : len(a.mesh.surface_vertices)
             ]
@@ -291,6 +299,19 @@ class Potential:
             self.pairs.add_blocks(self.u, self.barriers.blocks)
         blocks = np.swapaxes(runtime.fetch(self.barriers.blocks).astype(np.float64), 0, 1)
         return blocks if on_host is None else blocks + on_host
+
+    def put_contact_blocks(self) -> None:
+        """All of them, on the device."""
+        self.launch("contact_blocks", lanes=False, out=self.barriers)
+        self.leave_contact_blocks()
+
+    def leave_contact_blocks(self) -> None:
+        """Those of pairs and from the host join those of obstacles on the device."""
+        if self.pairs:
+            self.pairs.add_blocks(self.u, self.barriers.blocks)
+        for part in self._on_host():
+            blocks = np.swapaxes(part.blocks(self.held_at), 0, 1)
+            runtime.fill(self.barriers.blocks, runtime.fetch(self.barriers.blocks) + blocks)
 
     def obstacle_blocks(self) -> np.ndarray:
         """The part of obstacles at vertices in `blocks`."""

@@ -94,6 +94,11 @@ class Launches:
             bound = self._bound[tuple(key)] = kernel.bind(vectorized, **records)
         return bound
 
+    def run(self, parts) -> None:
+        """Launch (kernel, records, numbers), one after the other."""
+        for kernel, records, numbers in parts:
+            self(kernel, **records)(**numbers)
+
     def clear(self) -> None:
         """Let go of the arrays."""
         self._bound.clear()
@@ -123,6 +128,7 @@ class Buffers:
 
     def __init__(self, launch: Launches, parallel: bool):
         self._arrays, self._launch, self._scan = {}, launch, kernels_of(Scan, parallel).kernel
+        self.renewals = 0  # arrays that were made anew
 
     def take(self, name: str, dtype, count: int, least: int = 16):
         """The array of that name, made anew, half as long again, if it is too short; then nothing stays bound."""
@@ -132,6 +138,7 @@ class Buffers:
                 dtype, max(least, count + count // 2 if have is not None else count)
             )
             self._launch.clear()
+            self.renewals += 1
         return have
 
     def scan(self, values, count: int) -> None:

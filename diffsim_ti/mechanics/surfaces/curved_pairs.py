@@ -146,16 +146,20 @@ class CurvedPairs:
         self._row, self._rest_dot = runtime.array(vector, 1, n), runtime.array(vector, surface.num_vertices)
         self.step, self.next = runtime.array(vector, 1, n), runtime.array(vector, 1, n)
         self._launch = Launches()
+        self.launch = self._launch.run
         self.friction = CurvedLaggedFriction(self) if self.inner.friction else None
 
     # ---- between nodes and points ------------------------------------------------------------------------------------
 
-    def _fine(self, u, slot: int, target, given: str):
+    def _refining(self, u, slot: int, target, given: str) -> tuple:
         self.finer.follow()
         more = {"given": getattr(self.obstacles, given)} if self.obstacles else {}
-        at = SimpleNamespace(source=u, target=target, **more)
-        self._launch(self.kernels.refine, rows=self.down, at=at)(count=self.finer.num_vertices, slot=slot)
-        return target
+        records = dict(rows=self.down, at=SimpleNamespace(source=u, target=target, **more))
+        return self.kernels.refine, records, dict(count=self.finer.num_vertices, slot=slot)
+
+    def _fine(self, *what):
+        self.launch([self._refining(*what)])
+        return what[2]
 
     def fine(self, u, slot: int):
         """Displacements of the finer surface, from those of a slot."""
@@ -174,11 +178,13 @@ class CurvedPairs:
         """Changes of all parameters, of a Tangent."""
         return runtime.fetch(numbers.parameters)[: len(self.a.values.parameters)].astype(np.float64)
 
+    def _gathering(self, out) -> tuple:
+        records = dict(rows=self.to_corners, at=SimpleNamespace(source=self.finer.corner, target=out))
+        return self.kernels.gather, records, dict(count=self.num_corners, first=self.a.first_contact_corner)
+
     def _gather(self, out) -> None:
         """From the points' corners to those of the nodes, the last ones of `out`."""
-        at = SimpleNamespace(source=self.finer.corner, target=out)
-        gather = self._launch(self.kernels.gather, rows=self.to_corners, at=at)
-        gather(count=self.num_corners, first=self.a.first_contact_corner)
+        self.launch([self._gathering(out)])
 
     def spread(self, u: np.ndarray, to: np.ndarray | None = None) -> np.ndarray:
         """Displacements of the finer surface, of corners of obstacles to where they are, or are said to be."""
@@ -238,9 +244,7 @@ class CurvedPairs:
         self.inner.forces(self.fine(u, slot), 0, self.finer.corner, exact)
         self._gather(out)
 
-    def product(
-        self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False, poses_dot=None
-    ) -> None:
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, poses_dot=None) -> None:
         """poses_dot: changes of the rows of poses, None: zero."""
         if self.obstacles and parameters_dot is not None:
             self.obstacles.change(parameters_dot, poses_dot)
@@ -249,7 +253,7 @@ class CurvedPairs:
         if rest_dot is not None:
             runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(rest_dot).astype(np.float64))
             moved = self._rest_dot
-        self.inner.product(fine_u, 0, fine_w, self.finer.corner, moved, parameters_dot, has_planes)
+        self.inner.product(fine_u, 0, fine_w, self.finer.corner, moved, parameters_dot)
         self._gather(out)
 
     def clear_sums(self) -> None:
@@ -270,20 +274,20 @@ class CurvedPairs:
 
     # ---- in Newton's method ------------------------------------------------------------------------------------------
 
-    def begin(self, u: np.ndarray) -> None:
+    def begin(self, u: np.ndarray, ahead: np.ndarray | None = None) -> None:
         runtime.fill(self.next, u[None])
-        self.inner.begin(self.spread(u))
+        self.inner.begin(self.spread(u), None if ahead is None else self.matrix @ ahead)
 
-    def place(self, u) -> None:
-        self.inner.place(self.fine(u, 0))
+    def place(self, u, on_way: bool = False) -> None:
+        self.inner.place(self.fine(u, 0), on_way)
         self._gather(self.a.corner)
 
     def energies(self) -> np.ndarray:
         return self.inner.energies()
 
-    def hessian_product(self, u, w, convex: bool) -> None:
-        self.inner.hessian_product(self.fine(u, 0), self.fine_change(w), convex)
-        self._gather(self.a.corner)
+    def multiplying(self, u, w, convex: bool) -> tuple:
+        refining = self._refining(w, 0, self._w, "unmoved")
+        return refining, *self.inner.multiplying(self.fine(u, 0), self._w, convex), self._gathering(self.a.corner)
 
     def add_blocks(self, u, out) -> None:
         """Those of points by squares of what nodes have of them, without what two points of a node have in common."""
@@ -295,9 +299,9 @@ class CurvedPairs:
     def _step(self, step: np.ndarray, drift) -> np.ndarray:
         return self.spread(step, 0.0 if drift is None else drift)
 
-    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None) -> float:
+    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None, placed: bool = False) -> float:
         """drift: displacements of corners of obstacles meanwhile; None: they stand still."""
-        return self.inner.safe_share(self.spread(u), self._step(step, drift), most)
+        return self.inner.safe_share(self.spread(u), self._step(step, drift), most, placed)
 
     @property
     def met(self) -> tuple[tuple[int, ...], int | None] | None:

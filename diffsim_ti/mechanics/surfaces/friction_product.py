@@ -41,7 +41,7 @@ class FrictionProductKernels:
                 p, corner = of.corner_of[k] // 4, of.corner_of[k] % 4
                 total += of.weights[p][corner] * of.pull[p]
             if of.row[s + 1] > of.row[s]:
-                at.out[plan.first_out + s] -= total
+                at.out[plan.first_out + s] = at.out[plan.first_out + s] - total
 
     @cached_property
     def products(self) -> Kernel:
@@ -80,9 +80,8 @@ class FrictionProduct:
         whole[: len(data)] = data
         runtime.fill(array, whole)
 
-    def add(self, w, out) -> None:
-        """Add the change of the forces for changes w[0] to the last corners of `out`."""
-        if self.count:
-            product = self.pairs.list.launch(self.kernels.products, of=self.of, at=SimpleNamespace(w=w, out=out))
-            sizes = dict(num_pairs=self.count, num_surface=len(self.pairs.mesh.surface_vertices))
-            product(**sizes, first_out=self.arrays.first_contact_corner)
+    def part(self, w, out) -> tuple:
+        """What adds the change of the forces for changes w[0] to the last corners of `out`: kernel, records, numbers."""
+        sizes = dict(num_pairs=self.count, num_surface=len(self.pairs.mesh.surface_vertices))
+        sizes["first_out"] = self.arrays.first_contact_corner
+        return self.kernels.products, dict(of=self.of, at=SimpleNamespace(w=w, out=out)), sizes

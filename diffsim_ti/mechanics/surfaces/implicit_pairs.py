@@ -24,6 +24,8 @@ class ImplicitPairs(SurfacePairs):
     friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
     blocked: np.ndarray | None = None  # corners of the pair that stopped the last march
+    _ahead: np.ndarray | float = 0.0  # how far vertices are expected to go in a pass [m]
+    _holds_on_way = False  # whether the list holds on all of the last step that was asked for its safe share
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)
@@ -32,15 +34,19 @@ class ImplicitPairs(SurfacePairs):
         self.next = runtime.array(self.kernels.vec4, 1, arrays.num_vertices)
         self._places, self._acting = runtime.fetch(self.list.place), None
 
-    def begin(self, u: np.ndarray) -> None:
-        """A new pass from u: from here on all is a function of u, whatever came before."""
+    def begin(self, u: np.ndarray, ahead: np.ndarray | None = None) -> None:
+        """A new pass from u: from here on all is a function of u, and of how far `ahead` [m] it is expected to go, whatever
+        came before; None: as before."""
         self.fresh = False
+        if ahead is not None:
+            self._ahead = 1.5 * self.travel(ahead[self.mesh.surface_vertices])
         runtime.fill(self.next, u[None])
-        self.build(self.next, 0)
+        self.build(self.next, 0, wanted=self._ahead)
 
-    def place(self, u) -> None:
-        """Go to the displacements u[0]."""
-        self.ensure(u, 0)
+    def place(self, u, on_way: bool = False) -> None:
+        """Go to the displacements u[0]; on_way: of the last step that was asked for its safe share."""
+        if not (on_way and self._holds_on_way):
+            self.ensure(u, 0)
         self.forces(u, 0, self.a.corner)
         self._acting = None
         if self.friction:
@@ -72,39 +78,41 @@ class ImplicitPairs(SurfacePairs):
             self._acting = SimpleNamespace(**arrays), dict(num_vt=num_vt, num_pairs=len(own))
         return self._acting
 
-    def run_acting(self, kernel, at: dict, slot: int = 0, **numbers) -> None:
-        """Launch a kernel of pairs on those that act."""
+    def _of_those_acting(self, kernel, at: dict, **numbers) -> tuple:
+        """A kernel of pairs on those that act."""
         acting, sizes = self._of_acting()
-        self.run(kernel, at, acting, slot=slot, **numbers, **sizes)
+        return self.prepared(kernel, at, acting, slot=0, **numbers, **sizes)
 
     def energies(self) -> np.ndarray:
         """Energy of each pair [J]."""
         return runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
 
-    def hessian_product(self, u, w, convex: bool) -> None:
+    def multiplying(self, u, w, convex: bool) -> list[tuple]:
         """Change of the forces of contact and friction for changes w[0] of the positions, to the last corners of
-        `arrays.corner`."""
-        at = dict(u=u, w=w, out=self.a.corner)
-        if convex:
-            self.run_acting(self.hessian.products, at)
-        else:
-            self.product(u, 0, w, self.a.corner, has_planes=True)
-        if self.friction:
-            self.friction.add_product(u, w, self.a.corner)
+        `arrays.corner`, as [(kernel, records, numbers)]; convex: the convex part of contact alone."""
+        kernel, at, numbers = self.hessian.products, dict(u=u, w=w, out=self.a.corner), {}
+        if not convex:
+            kernel, (at, numbers) = self.kernels.products, self._of_product(u, w, self.a.corner, has_planes=True)
+        friction = self.friction.multiplying(u, w, self.a.corner) if self.friction else []
+        return [self._of_those_acting(kernel, at, **numbers), *friction]
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (mechanics/energy/kernels.py)."""
-        self.run_acting(self.hessian.blocks, dict(u=u, out=out))
+        self.launch([self._of_those_acting(self.hessian.blocks, dict(u=u, out=out))])
 
-    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
+    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, placed: bool = False) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
         largest such share only where they are about to meet. Marches along the step, with a new list at each halt,
-        unless the present one holds on all of it."""
+        unless the present one holds on all of it. placed: `place` was last at u."""
         travel = self.travel(step[self.mesh.surface_vertices])
         if not travel.any():
             return most
         runtime.fill(self.step, step[None])
-        share, self.blocked, holds = 0.0, None, self._holds(u + most * step) and self._holds(u)
+        share, self.blocked, holds = 0.0, None, self._holds(u + most * step)
+        placed, holds = placed and holds, holds and (placed or self._holds(u))
+        self._holds_on_way = holds
+        if placed:
+            runtime.fill(self.next, u[None])
         for _ in range(self.longest_march):
             unlisted = np.inf
             if not holds:
@@ -112,8 +120,9 @@ class ImplicitPairs(SurfacePairs):
                 self.build(self.next, 0, wanted=(most - share) * travel)
                 reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
                 unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
-            self.forces(self.next, 0, self.a.corner, exact=True)
-            shares = self._shares(most - share)
+            if not placed:
+                self.forces(self.next, 0, self.a.corner, exact=True)
+            shares, placed = self._shares(most - share), False
             listed = shares.min(initial=np.inf)
             share += min(listed, unlisted)
             if share >= most:

@@ -150,12 +150,14 @@ class LaggedFriction:
         out += np.where(self._bounded, 0.0, slope - kappa)[:, None, None] * e[:, :, None] * e[:, None]
         return (self.per_gamma * self.L)[:, None, None] * out
 
-    def add_product(self, u, w, out) -> None:
-        """Add the change of the forces at u[0] for changes w[0] of the positions to the last corners of `out`."""
+    def multiplying(self, u, w, out) -> list[tuple]:
+        """What adds the change of the forces at u[0] for changes w[0] of the positions to the last corners of `out`."""
+        if not self._product.count:
+            return []
         if not self._is_put:
             self._product.put(self._stiffness(runtime.fetch_row(u, 0)))
             self._is_put = True
-        self._product.add(w, out)
+        return [self._product.part(w, out)]
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m]."""

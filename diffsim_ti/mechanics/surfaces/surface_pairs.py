@@ -72,6 +72,7 @@ class SurfacePairs:
         surface = mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body
         self.list = CandidatePairs(*surface, arrays.precision, parallel, self.kinematic)
         self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vec4
+        self.launch = self._launch.run
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
         marked = spread(self.body[mesh.surface_vertices], self.markers)
@@ -159,14 +160,16 @@ class SurfacePairs:
     def follow(self, rows: np.ndarray, m: int) -> None:
         """Obstacles are where rows of poses say."""
 
-    def run(self, kernel, at: dict, *more, **numbers) -> None:
-        """Launch a kernel of pairs, with the arrays `at`, and `more` of the scene."""
+    def prepared(self, kernel, at: dict, *more, **numbers) -> tuple:
+        """A kernel of pairs, its records, of the arrays `at` and `more` of the scene, and its numbers."""
         k, a, mine = self.list, self.a, (self.contacts,) if self.kinematic else ()
-        numbers |= dict(num_surface=k.num_surface, first_out=a.first_contact_corner)
+        sizes = dict(num_vt=k.num_vt, num_pairs=k.count, num_surface=k.num_surface, first_out=a.first_contact_corner)
         scene = *more, k, self, *mine, SimpleNamespace(rest=a.rest, parameters=a.parameters)
-        self._launch(kernel, scene=scene, at=SimpleNamespace(**at))(
-            **dict(num_vt=k.num_vt, num_pairs=k.count) | numbers
-        )
+        return kernel, dict(scene=scene, at=SimpleNamespace(**at)), sizes | numbers
+
+    def run(self, kernel, at: dict, *more, **numbers) -> None:
+        """Launch a kernel of pairs."""
+        self.launch([self.prepared(kernel, at, *more, **numbers)])
 
     # ---- the list ---------------------------------------------------------------------------------------------------
 
@@ -257,11 +260,16 @@ class SurfacePairs:
         """Contact forces at u[slot], to the last corners of `out`."""
         self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
 
-    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, has_planes=False, only=None) -> None:
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, only=None) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of the rest shape and all parameters).
 
-        has_planes: `place` has been at u[slot] (implicit_pairs.py). only: of the pairs of one contact.
+        only: of the pairs of one contact.
         """
+        at, numbers = self._of_product(u, w, out, rest_dot, parameters_dot, only)
+        self.run(self.kernels.products, at, slot=slot, **numbers)
+
+    def _of_product(self, u, w, out, rest_dot=None, parameters_dot=None, only=None, has_planes=False) -> tuple:
+        """Arrays and numbers of it; has_planes: `place` has been at u (implicit_pairs.py)."""
         at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
         numbers = dict(d_stiffness=0.0, d_width=0.0, by_rest=int(rest_dot is not None), has_planes=int(has_planes))
         if self.kinematic:
@@ -271,7 +279,7 @@ class SurfacePairs:
         elif parameters_dot is not None:
             change = parameters_dot[self.a.parameters_of_self_contact][:2]
             numbers |= dict(zip(("d_stiffness", "d_width"), map(float, change)))
-        (self.run_acting if has_planes else self.run)(self.kernels.products, at, slot=slot, **numbers)
+        return at, numbers
 
     def clear_sums(self) -> None:
         """Begin a reverse sweep."""

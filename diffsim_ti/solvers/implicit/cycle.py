@@ -58,28 +58,25 @@ class Level:
         self.b, self.x, self.d, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(4))
         self.diagonal, self.inverse = (runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2))
         self.kernels = kernels_of(LevelKernels, self.numbers, "f32", parallel)
-        shape = self.nodes, self.numbers, self.inverse.element_shape[0]
-        self._columns = [np.zeros(shape, np.float32) for _ in range(2)]  # of blocks, filled up with zeros
         self._measure(M)
 
     def _measure(self, M) -> None:
         blocks = diagonal_blocks(M)
         largest = getattr(M, "largest", None)  # known since it was made
         self.theta = THETA * MARGIN * (largest or largest_eigenvalue(M, blocks))
-        self.put(blocks)
+        for target, own in ((self.diagonal, blocks), (self.inverse, inverses(blocks) / self.theta)):
+            runtime.fill(target, rows_of(own))
 
     def put_numbers(self, M) -> None:
         """Set those of another matrix with the same places."""
         runtime.fill(self.values, rows_of(M.data[self._off]))
         self._measure(M)
 
-    def put(self, diagonal: np.ndarray, nodes=slice(None)) -> None:
-        """Set the diagonal blocks of some nodes."""
-        for target, columns, blocks in zip(
-            (self.diagonal, self.inverse), self._columns, (diagonal, inverses(diagonal) / self.theta)
-        ):
-            columns[nodes, :, : self.numbers] = np.swapaxes(blocks, 1, 2)
-            runtime.fill(target, columns.reshape(-1, columns.shape[2]))
+    def invert(self, nodes: np.ndarray) -> None:
+        """Anew the inverses of the diagonal blocks of some nodes of three numbers."""
+        blocks, inverse = (runtime.fetch(x).reshape(-1, 3, 3) for x in (self.diagonal, self.inverse))
+        inverse[nodes] = inverses(np.swapaxes(blocks[nodes].astype(np.float64), 1, 2)) / self.theta  # symmetric
+        runtime.fill(self.inverse, inverse.reshape(-1, 3))
 
 
 def largest_eigenvalue(M, diagonal: np.ndarray) -> float:
@@ -182,11 +179,6 @@ class Cycle:
             runtime.fill(between["up"].values, rows_of(P.data))
         runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
         return True
-
-    def put_diagonal(self, blocks: np.ndarray, nodes=slice(None)) -> None:
-        """Set the diagonal blocks of some nodes of the finest level."""
-        if len(self.levels) > 1:
-            self.levels[0].put(blocks, nodes)
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""

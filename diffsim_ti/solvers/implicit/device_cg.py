@@ -18,7 +18,7 @@ class DeviceCG:
 
     free: what vertices may do (free.py), not of sets that move by few numbers.
     cycle: the preconditioner, z = cycle(r) (cycle.py); None: `put_inverse` sets its blocks, one for each vertex.
-    An iteration is one kernel, unless surfaces meet or the backend is Vulkan, and a launch makes many.
+    An iteration is one kernel, but on Vulkan, and a launch makes many.
     """
 
     most_chunks, shortest = 256, 32
@@ -44,13 +44,14 @@ class DeviceCG:
         if cycle is None:
             self.inverse = runtime.array(self._vector, 3, n)
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
-        self._is_one_kernel = potential.is_one_kernel and Repeated.is_possible(parallel)
+        self._is_one_kernel = Repeated.is_possible(parallel)
         whole = runs_on_cpu() and not parallel and self._is_one_kernel
         # whether rounds of Newton's method are on the device, too
         self.takes_rounds = self._is_one_kernel and self.precision == "f64"
         # iterations between looks at the state; on a card so many as the solve before took
         self._look, self.last = self.many if whole else 1 if runs_on_cpu() else 0, 10
-        self._iterations = {}  # (with a matrix, convex) -> iterate(times, rounding)
+        # (with a matrix, convex) -> iterate(times, rounding), numbers of its products, what tells whether arrays are others
+        self._iterations, self._served = {}, None
         self._room = -1  # blocks of that matrix
         self._filled: np.ndarray | None = None  # what `mass` holds
 
@@ -81,26 +82,29 @@ class DeviceCG:
         runtime.fill(self.start, more.indptr)
         runtime.fill(self.column, np.pad(more.indices, (0, self._room - len(more.indices))))
 
-    def parts(self, more: bool) -> list:
-        """An iteration, as [(kernel, records, numbers)] of `Repeated`."""
+    def parts(self, more: bool, products: list) -> list:
+        """An iteration, as [(kernel, records, numbers)] of `Repeated`; products: those of the potential."""
         potential, own = self.potential, dict(cg=self, at=self.potential)
         kind = self.kernels_kind
         kernels = kernels_of(kind, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
         before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
-        return [*before, (*potential.multiplying, None), (kernels.step, own, None)]
+        return [*before, *products, (kernels.step, own, None)]
 
     def serve(self, iterate: Callable) -> None:
         """Let what serves Newton's method, too, make iterations: (times, rounding) -> so many."""
-        self._iterations[False, False] = iterate
+        self._served = iterate
 
-    def _iteration(self, more: bool, convex: bool):
+    def _iteration(self, more: bool, convex: bool, products: list):
         """(times, rounding) -> so many iterations."""
-        parts, potential, lanes = self.parts(more), self.potential, runs_on_cpu()
+        parts, potential, lanes = self.parts(more, products), self.potential, runs_on_cpu()
         if self._is_one_kernel:
             repeated = Repeated("cg", [parts], self.parallel, lanes)
             return lambda times, rounding: repeated(times, **potential.sizes(), **self._sizes, rounding=rounding)
-        launches = [(kernel.bind(lanes, **records), numbers or self._sizes) for kernel, records, numbers in parts[1:-2]]
+        launches = [
+            (kernel.bind(lanes, **records), numbers or self._sizes)
+            for kernel, records, numbers in parts[1 : -1 - len(products)]
+        ]
         step = parts[-1][0].bind(lanes, **parts[-1][1])
 
         def iterate(times: int, rounding: float) -> None:
@@ -120,9 +124,18 @@ class DeviceCG:
 
     def iterations(self, more: bool, convex: bool) -> Callable:
         """(times, rounding) -> so many iterations; more: whether a matrix joins the Hessian."""
-        if (more, convex) not in self._iterations:
-            self._iterations[more, convex] = self._iteration(more, convex)
-        return self._iterations[more, convex]
+        if self._served and not (more or convex):
+            return self._served
+        kept, pairs = self._iterations.get((more, convex)), self.potential.pairs
+        if kept is None or pairs:
+            products = self.potential.multiplying(convex)
+            numbers, bound = [own for *_, own in products], (len(products), pairs and pairs.list.buffers.renewals)
+            if kept is None or kept[2] != bound:
+                kept = self._iterations[more, convex] = self._iteration(more, convex, products), numbers, bound
+            for own, now in zip(kept[1], numbers):
+                if own is not None:
+                    own.update(now)
+        return kept[0]
 
     def iterate(self, done: int, most: int, eps: float, more: bool = False, convex: bool = False) -> None:
         """Some of at most so many iterations, of which some are done."""

@@ -4,11 +4,14 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
+import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.energy.assembled import assemble
-from diffsim_ti.mechanics.stress.projection import Projection, without_negative
+from diffsim_ti.mechanics.stress.projection import Projection
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, projectors_of
+from diffsim_ti.runtime import kernels_of
+from diffsim_ti.solvers.implicit.contact_kernels import ContactKernels
 from diffsim_ti.solvers.implicit.cycle import (
     Cycle,
     diagonal_blocks,
@@ -91,6 +94,25 @@ class Multigrid(Preconditioner):
         self.place = None
         self.cycle = Cycle(matrices, ways, self.frames, parallel)
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
+        if self._changes:
+            self._make_join(parallel)
+
+    def _make_join(self, parallel: bool) -> None:
+        a, n, precision = self.potential.arrays, len(self.mass), self.solver.precision
+        own = runtime.array(runtime.array_types(precision)["vectors"].dtype, 3, n)
+        self._joined = SimpleNamespace(own=own, touched=runtime.array(ti.i32, n), hard=runtime.array(ti.i32, n))
+        records = dict(at=self.potential.barriers, frames=self.frames, turning=self.frames.body, body=self._joined)
+        records["level"] = self.cycle.levels[0]
+        kernel = kernels_of(ContactKernels, a.precision, precision, parallel).join
+        self._join = kernel, records, dict(vertices=n)
+        self._launch = kernel.bind(**records)
+        self._begin_join()
+
+    def _begin_join(self) -> None:
+        """The finest level has other numbers."""
+        runtime.fill(self._joined.own, np.moveaxis(self._diagonal - self._known, 2, 0))
+        runtime.fill(self._joined.touched, self._known.any((1, 2)))
+        self._join[2]["theta"] = self.cycle.levels[0].theta
 
     def begin(self) -> None:
         super().begin()
@@ -105,6 +127,8 @@ class Multigrid(Preconditioner):
             with self.potential.at_rest():
                 self.frames.update()
                 self.cycle.put(*self._levels())
+            if self._changes:
+                self._begin_join()
             return
         self.potential.place(place)
         self.frames.update()
@@ -116,6 +140,8 @@ class Multigrid(Preconditioner):
         self._follows = self.cycle.put(matrices, ways)
         if not self._follows:  # entries lie in other places: from here on as at rest
             self._go_to(None)
+        elif self._changes:
+            self._begin_join()
         self.potential.place(u)
 
     def _levels(self, more=()) -> tuple[list, list]:
@@ -134,7 +160,7 @@ class Multigrid(Preconditioner):
         self._known = np.zeros((len(x), 3, 3))  # of what `update` adds
         for _, own in hosts:
             self._known = self._known + (free.around(own) if isinstance(free, FreeDirections) else own)
-        self._contact, aggregated, allowed, above, ways = None, matrix, free, [], []
+        aggregated, allowed, above, ways = matrix, free, [], []
         if mesh.order == 2:
             aggregated, allowed, x, up = of_corners(matrix, free, mesh, x, self._ties)
             ways, above = [turned(as_blocks(up), R, R[mesh.corners])], [turned(matrix, R, R)]
@@ -181,7 +207,9 @@ class Multigrid(Preconditioner):
         return bool(self.potential.arrays.contacts or self.potential.pairs or self.potential.hosts)
 
     def updating(self) -> tuple[list, object]:
-        return ([], None) if self._changes else ([self.frames.part], self.frames.body)
+        return (
+            ([self.frames.part, self._join], self._joined) if self._changes else ([self.frames.part], self.frames.body)
+        )
 
     def follow(self, u: np.ndarray) -> None:
         if self._is_poor(u):
@@ -192,19 +220,13 @@ class Multigrid(Preconditioner):
         """Adapt to the displacement at which the potential is placed."""
         self.follow(u)
         self.frames.update()
-        contact = self.potential.contact_blocks()
-        if contact is None:
+        if not self._changes:
             return
-        contact = without_negative(contact)  # edges and points yield sideways, for which a cycle has no place
-        if isinstance(self.free, FreeDirections):
-            contact = self.free.around(contact)
-        R = self.frames.matrices()
-        contact = np.swapaxes(R, 1, 2) @ contact @ R - self._known
-        before = np.zeros_like(contact) if self._contact is None else self._contact
-        changed = np.flatnonzero((contact != before).any((1, 2)))
-        if len(changed):
-            self.cycle.put_diagonal(self._diagonal[changed] + contact[changed], changed)
-        self._contact = contact
+        self.potential.put_contact_blocks()
+        self._launch(**self._join[2])
+        hard = np.flatnonzero(runtime.fetch(self._joined.hard))
+        if len(hard):
+            self.cycle.levels[0].invert(hard)
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         solver, T = self.solver, self._ties

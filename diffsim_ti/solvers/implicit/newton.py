@@ -118,17 +118,18 @@ class Newton:
         """
         self.report = report = NewtonReport()
         self.reports.append(report)
-        self._turning = False
+        self.turning = False  # pairs whose friction a direction has turned round
         self.pose((mass, inertial, loads))
         u = self.potential.place(start)
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
         E, norm, rough, solved, far = None, np.inf, False, False, np.abs(u).max(1, keepdims=True)
-        most, floor, self.upright, on_host = self.max_iterations if rounds is None else rounds, 0.0, None, bool(rounds)
+        most, floor, self.upright, on_host = self.max_iterations if rounds is None else rounds, 0.0, None, False
         while self._goes_on(most, rounds is None):
             device = None if on_host else self._on_device()
             if device:
-                u, numbers = device(self, max(most - len(report.residuals), 1), rough)
+                left = max(most - len(report.residuals), 1)
+                u, numbers = device(self, left, rough, 0.0 if rounds is None else self.roughly)
                 if numbers[PHASE] == DONE and not leave_saddles:
                     return u
                 u, E, norm, floor = self.potential.place(u), None, numbers[BEFORE] or np.inf, numbers[FLOOR]
@@ -136,7 +137,7 @@ class Newton:
                     report.residuals.pop()
                 on_host = True  # goes on with this round
                 continue
-            on_host = bool(rounds)
+            on_host = False
             if E is None:
                 E = self._evaluate(u)
                 self.upright = bool(np.all(E[2] > 0)) if self.upright is None else self.upright
@@ -182,17 +183,20 @@ class Newton:
         raise NotConverged(self._why(report.residuals), report.residuals)
 
     def _on_device(self) -> DeviceNewton | None:
-        """What takes rounds without the host; None where that takes part in forces or in linear solves."""
+        """What takes rounds on the device; None where the host takes part in linear solves."""
         potential, preconditioner, static = self.potential, self.preconditioner, not diagonal_of(self.mass).any()
         plain = self.detection and (isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections)
-        on_host = potential.pairs or potential.hosts or self.others or self.volumes or self.rigid or potential.joints
-        if not plain or on_host or isinstance(self.mass, ConsistentMass) or not preconditioner.solver.takes_rounds:
+        on_host = self.others or self.volumes or self.rigid or potential.joints
+        if not plain or on_host or not preconditioner.solver.takes_rounds:
             return None
         if preconditioner.given_up or static and preconditioner.spent > 2 * preconditioner.patience:
             return None
         if preconditioner.rounds is None:
-            preconditioner.rounds = DeviceNewton(potential, preconditioner, self.detection)
-        return preconditioner.rounds
+            beside = bool(potential.pairs or potential.hosts or isinstance(self.mass, ConsistentMass))
+            known = len(potential.hosts.matrices(potential.held_at)) == len(potential.hosts)
+            of = potential, preconditioner, self.detection, beside
+            preconditioner.rounds = DeviceNewton(*of) if known else False
+        return preconditioner.rounds or None
 
     def _why(self, done: list) -> str:
         """What a solve that failed says, and what helps: more rounds where they gained to the last."""
@@ -279,10 +283,10 @@ class Newton:
         """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by. Friction that
         the direction before turned round is bounded (mechanics/surfaces/lagged_friction.py)."""
         friction = self.potential.surface_friction
-        with friction.bounded(self._turning) if friction else nullcontext():
+        with friction.bounded(self.turning) if friction else nullcontext():
             direction, R = self._direction_of(u, R, forcing)
         if friction:
-            self._turning = friction.turns(u, u + direction)
+            self.turning = friction.turns(u, u + direction)
         return cleaned(linear_of(self.free), direction), R
 
     def _direction_of(self, u, R, forcing):

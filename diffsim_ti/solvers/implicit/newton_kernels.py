@@ -14,7 +14,9 @@ A = ti.template()
 (PHASE, NORM, BEFORE, FLOOR, ROUGH, SLOPE, FRACTION, FRESH, DOUBTED, ACCEPTED, RISE) = range(NUMBERS, NUMBERS + 11)
 (E, PARTS, E_TRIED, PARTS_TRIED, UPRIGHT, ROUND, PRODUCTS, TRIALS, HALVINGS, CUTS) = range(RISE + 1, RISE + 11)
 # what a solve is told: tolerances, limits, and numbers of `Newton`
-(TOLERANCE, EPS, MOST, INSIST, INEXACT, ROUGHEST, SHORTEST) = range(CUTS + 1, CUTS + 8)
+(TOLERANCE, EPS, MOST, INSIST, INEXACT, ROUGHEST, SHORTEST, ROUGHLY) = range(CUTS + 1, CUTS + 9)
+# what the host adds to energies, to their sizes and to the change along a step
+(BESIDE, BESIDE_PARTS, BESIDE_CHANGE) = range(ROUGHLY + 1, ROUGHLY + 4)
 COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
 # phases: it is done, or the host has to go on; energies where rises are measured from, and of one; where a solve starts, a
 # trial of the line search, its residual, the preconditioner, conjugate gradients
@@ -25,13 +27,14 @@ WAITS = 4  # of STOPPED: conjugate gradients have not begun
 @dataclass(frozen=True)
 class NewtonKernels:
     """scene: precision of displacements and energies; vectors: of all else; guided: whether vertices are fixed in some
-    directions only; contact: whether there are obstacles."""
+    directions only; contact: whether there is contact; beside: whether the host has forces, too."""
 
     scene: str
     vectors: str
     parallel: bool
     guided: bool
     contact: bool
+    beside: bool
 
     @property
     def fp(self):
@@ -171,10 +174,10 @@ class NewtonKernels:
     def decide(self, cg: A, plan: A):
         """Whether what is tried lowers the potential (`Newton._search`)."""
         self.cg.add_up(cg.part, 6, plan.chunks)
-        value, size = cg.part[0, 0], cg.part[1, 0]
+        value, size = cg.part[0, 0] + cg.state[BESIDE], cg.part[1, 0] + cg.state[BESIDE_PARTS]
         cg.state[E_TRIED], cg.state[PARTS_TRIED], cg.state[DOUBTED] = value, size, ti.cast(0, self.fp)
         cg.state[ACCEPTED] = ti.cast(0, self.fp)
-        change = value - cg.state[E] + cg.part[4, 0]
+        change = value - cg.state[E] + cg.part[4, 0] + cg.state[BESIDE_CHANGE]
         flat = cg.part[2, 0] > 0
         if cg.state[PHASE] == BASE:
             cg.state[E], cg.state[PARTS], cg.state[ACCEPTED] = value, size, ti.cast(1, self.fp)
@@ -237,12 +240,16 @@ class NewtonKernels:
         for i in range(c * plan.length, self.end(c, plan.length, plan.nodes)):
             u, rigidity = self.cg.to(self.fp, at.u[0, i]), newton.stiffness[i]
             inertia = (u + newton.inertial[i] * ti.cast(-1, self.fp)) * cg.mass[i]
-            R = self.cg.to(self.fp, at.y[0, i]) + newton.loads[i] + inertia * ti.cast(-1, self.fp)
+            R, forces = self.cg.to(self.fp, at.y[0, i]) + newton.loads[i], ti.cast(at.size[i], self.fp)
+            if ti.static(self.beside):
+                inertia += newton.carried[i]
+                R += self.cg.to(self.fp, newton.pushes[i])
+                forces += newton.pushes[i][3]
+            R += inertia * ti.cast(-1, self.fp)
             R = self.cg.allowed(i, cg, R)
             newton.R[i] = R
             square += self.cg.dot(R, R)
             slope += self.cg.dot(R, newton.d[i])
-            forces = ti.cast(at.size[i], self.fp)
             size += forces * forces + self.cg.dot(newton.loads[i], newton.loads[i])
             size += self.cg.dot(inertia, inertia) * cg.free[i]
             far = newton.far[i]
@@ -273,7 +280,7 @@ class NewtonKernels:
         newton.history[ti.cast(cg.state[ROUND], ti.i32)] = relative
         cg.state[ROUND] = cg.state[ROUND] + one
         solved = norm <= cg.state[TOLERANCE] * size + floor
-        if solved and (cg.state[ROUGH] == 0 or norm <= floor):
+        if (solved and (cg.state[ROUGH] == 0 or norm <= floor)) or norm <= cg.state[ROUGHLY] * size:
             cg.state[PHASE] = ti.cast(DONE, self.fp)
         elif cg.state[ROUND] > cg.state[MOST] or not norm - norm == 0:
             cg.state[PHASE] = ti.cast(TROUBLE, self.fp)
@@ -329,6 +336,7 @@ class NewtonKernels:
         values = "singles" if self.scene == "f32" else "doubles"
         own = dict.fromkeys(("far", "stiffness", "history"), "scalars")
         own |= dict.fromkeys(("u", "d", "R", "inertial", "loads"), "vectors") | dict(J=values)
+        own |= dict.fromkeys(("pushes", "carried"), "vectors") if self.beside else {}
         at = dict(u=f"vectors2_{self.scene}", y=f"vectors2_{self.scene}", size=values, J=values)
         barriers = dict(blocks=f"vectors2_{self.scene}") if self.contact else {}
         return self._kernel("judge", self.weigh, cg=cg, newton=own, at=at, barriers=barriers)

@@ -259,7 +259,7 @@ class ImplicitWorkspace(PrescribedInPasses):
             u if place is None else self.with_frozen(u, u[self.arrays.held] + (place - u[self.arrays.held]) / stage.c0)
         )
         self.begun = u, held, problem
-        self.begin(j, stage, u, x)
+        self.begin(j, stage, u, x, None if stage.static else self.linear * (problem[1] - u))
         if self.strains:
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
@@ -405,10 +405,10 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     # ---- what a pass is told -----------------------------------------------------------------------------------------
 
-    def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray) -> None:
-        """Tell the potential where obstacles are in pass j and where friction is measured from."""
+    def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray, ahead: np.ndarray | None = None) -> None:
+        """Tell the potential where obstacles are in pass j, where friction is measured from, which step is expected."""
         self.collisions.begin(j, stage)
-        self.potential.begin(u, x, 1 / stage.gamma, self.collisions.rows)
+        self.potential.begin(u, x, 1 / stage.gamma, self.collisions.rows, ahead)
         self.origin = x
         self.apply_loads(j, stage)
         if self.volumes:  # after all that the stiffness at rest is made of
