@@ -54,8 +54,8 @@ class ObstacleForce(VertexForce):
 
     @traced
     def record(self, parameters, first, X, u, of=None):
-        """(graph, all numbers, components of u, d, n) at a point; of: gives another number and vector, of all numbers. Behind
-        these stand those of `corners`, each leaf with the `row` of the parameters where it is."""
+        """(graph, all numbers, components of u, d, n) at a point; of: gives another number and vector, of all numbers.
+        Behind these stand those of `corners`, each leaf with the `row` of the parameters where it is."""
         g = Graph(self.fp, parameters)
         g.first, g.corners = first, []
         p = [g.leaf(x) for x in self._numbers(parameters, first)]
