@@ -232,9 +232,9 @@ class SurfaceDistance:
             while k < 7:
                 if not inside:
                     share = parameters[self.table + self.number(2, parameters) + self.stride * j + 3 + k]
-                    if k == 0 or share != 0:
-                        feature, s, t, square = self.part(j, k, x, begin, parameters)
-                if square < reach * reach and share != 0:
+                if k == 0 or share != 0:
+                    feature, s, t, square = self.part(j, k, x, begin, parameters)
+                if (inside or square < reach * reach) and share != 0:
                     if ti.static(what == ENERGY):
                         y = ((zero - ti.sqrt(square) if inside else ti.sqrt(square)) - radius) / width
                         total[0] += share * width * width * barrier.value(y, self.fp)
