@@ -112,6 +112,14 @@ def test_a_mat_falls_on_knives():
     assert found.error is None and found.done == 6 and found.intersections == found.turned == 0
 
 
+def test_pins_come_in_few_parts_of_a_step():
+    """Pins go on by four of their widths a step, and the body gives way as it did in the part of the step before."""
+    posed = contact_corpus.SCENES["pin cushion of points"](contact_corpus.Meshes())
+    found = contact_corpus.run("pins", posed, 15)
+    assert found.error is None and found.intersections == 0
+    assert 0 < max(found.rounds) <= 25  # 41 where parts begin from where the body is
+
+
 def test_arch_stands():
     posed = contact_corpus.SCENES["arch, friction 0.5"](contact_corpus.Meshes())
     found = contact_corpus.run("arch", posed, 80)

@@ -217,6 +217,30 @@ def test_gradients_by_the_shape_in_implicit_steps_and_equilibria(solver):
     assert ds.dot_product_test(rollout) < 1e-8
 
 
+def test_a_crease_presses_by_both_of_its_sides():
+    """A vertex is pressed to where two faces are equally near. The barrier of what is nearest has a kink there, where
+    Newton's method goes to and fro; the sum over both does not, and its gradients are exact."""
+    body = tetrahedron()
+    x = body.vertices * [1, -1, 1] + [-0.25, 0.56, 0]  # on its tip
+    valley = ds.MeshObstacle(
+        [[x, abs(x), z] for z in (-1, 1.5) for x in (-1, 0, 1)],
+        [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]],
+        radius=0.01,
+        shapeable=True,
+        **BARRIER | dict(width=0.1),
+    )
+    body = ds.TetrahedralMesh(x, body.tetrahedra, fix_orientation=True)
+    law, down = ds.StableNeoHookean(2e4, 0.3), dict(initial_velocities=(0, -1.0, 0))
+    scene = ds.Scene(body, law, 100.0, [ds.Gravity(), valley], precision="f64", **down)
+    solver = ds.ImplicitEulerSolver(scene, dt=1e-2, tolerance=1e-10)
+    simulator = ds.Simulator(solver)
+    simulator.run(8)
+    assert simulator.report.iterations <= 8 * 6
+    rollout = ds.Rollout(solver, 6, gradients=SHAPE)
+    report = ds.check_gradients(rollout, verbose=False)
+    assert report.passed and ds.dot_product_test(rollout) < 1e-9, str(report)
+
+
 def test_resolution_is_not_asked_for():
     with pytest.warns(DeprecationWarning, match="resolution has no meaning, for distances are exact") as caught:
         ds.MeshObstacle(CORNERS, TRIANGLES, (0, 0, 0), 8)

@@ -20,6 +20,7 @@ class Approach:
 
     most_parts, rounds = 300, 12  # of a pass; Newton's in a part
     kept = 0.5  # of the gap in a part: Newton's method doubles a small gap in a round, more or less
+    longer = 4.0  # times the part before that a part may be where the body gives way on
     least, patience = 1e-4, 5  # share of the pass below which a part leads nowhere; so many in a row
 
     def __init__(self, workspace):
@@ -67,23 +68,34 @@ class Approach:
         return share, met
 
     def _in_parts(self, place, step, before, drift, problem):
-        ws, done, stuck = self.ws, 0.0, 0
+        ws, done, stuck, part, gave_way, met = self.ws, 0.0, 0, 0.0, None, None
         moved = ws.arrays.poses.moved
         for _ in range(self.most_parts):
-            left, poses = 1 - done, moved(before, drift, done)
-            share, met = self._share(place, left * step, poses, left * drift, self.kept)
-            place, done = place + share * left * step, done + share * left
-            if share == 1:
+            left, poses, begun, way = 1 - done, moved(before, drift, done), place, step
+            if gave_way is not None:  # it gives way on as in the part before
+                ahead = min(left, self.longer * part)
+                along = ahead * (step + gave_way / part)
+                share, found = self._share(place, along, poses, ahead * drift, self.kept)
+                if share * ahead > part and self._is_sound(place, place + share * along):
+                    left, way, met = ahead, along / ahead, found or met
+            if way is step:
+                share, met = self._share(place, left * step, poses, left * drift, self.kept)
+            part = share * left
+            is_last, place, done = part == 1 - done, place + part * way, done + part
+            if is_last:
                 return place
-            stuck = stuck + 1 if share * left < self.least else 0
+            stuck = stuck + 1 if part < self.least else 0
             if stuck > self.patience:
                 break
             poses = moved(before, drift, done)
-            carried = self._carried(place, (1 - done) * step, poses, (1 - done) * drift, met.obstacle)
+            carried = (
+                self._carried(place, (1 - done) * step, poses, (1 - done) * drift, met.obstacle) if share < 1 else None
+            )
             if carried is not None:
                 return carried
             ws.collisions.put(poses)
             place = ws.newton.solve(place, *problem, rounds=self.rounds)
+            gave_way = (place - begun - part * step) * ws.linear if part > 0 else None
         ws.collisions.put(poses)
         if met.obstacle is None:
             raise NotConverged("prescribed motion drives surfaces through each other: take smaller steps", [])

@@ -103,8 +103,7 @@ class ObstacleFunctions:
         for m in ti.static(range(g.size)):
             adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
         if ti.static(g.force.corners):
-            of_corners = g.force.force_by_corners_vjp(scene.parameters, first, X, u, w)
-            self.add_to_corners(g, 0, i, of_corners, adjoint)
+            g.force.add_by_corners(scene.parameters, first, X, u, w, adjoint.sums, i)
         by_place, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
         return by_place, by_v
 

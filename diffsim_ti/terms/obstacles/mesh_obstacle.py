@@ -17,7 +17,7 @@ from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
 from diffsim_ti.terms.obstacles.primitives import Primitives
-from diffsim_ti.terms.obstacles.surface_distance import SurfaceDistance
+from diffsim_ti.terms.obstacles.surface_distance import ENERGY, FORCE, JVP, VJP, A, SurfaceDistance
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
 from diffsim_ti.terms.obstacles.turning import rotation_matrix
@@ -38,9 +38,12 @@ class MeshObstacle(Obstacle):
     `resolution` has no meaning, for nothing is sampled.
 
     Inputs with gradient: "mesh_position", shape (3,), "mesh_radius", "mesh_vertices", shape (k, 3), if it is shapeable, and
-    those of every `Obstacle`, whose other arguments it takes. The distance is C1 but where two parts are equally near;
-    where the nearest goes from a face to an edge or a corner the contact's stiffness jumps.
+    those of every `Obstacle`, whose other arguments it takes. Implicit steps sum the barrier over all that is nearer than
+    its width, what triangles share once: in a crease, where two faces are equally near, both press, and force and energy
+    have no kink; over flat and convex parts it is the barrier of the distance. Explicit steps, friction and gaps go by what
+    is nearest. Where that goes from a face to an edge or a corner the contact's stiffness jumps.
     Raises ValueError for vertices or indices that do not fit.
+    Li, Kaufman, Jiang 2023, Convergent Incremental Potential Contact, arXiv:2307.15908.
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
     """
 
@@ -207,6 +210,50 @@ class MeshForce(ObstacleForce):
     def may_touch(self, parameters: ti.template(), first, X, u):
         return True
 
+    # as a force the barrier acts by all that is near: by what is nearest it would jump where two parts are equally near
+
+    @ti.func
+    def over_parts(self, what: A, parameters: A, first, X, u, w, dot: A, sums: A, i):
+        radius, width = parameters[first + 3], self.width(parameters, first)
+        x, begin = self.place(parameters, first, X, u), self.begin(parameters, first)
+        return self.nearest.over_parts(what, x, w, radius, width, begin, parameters, dot, sums, i)
+
+    @ti.func
+    def energy(self, parameters: A, first, X, u):
+        total = self.over_parts(ENERGY, parameters, first, X, u, 0, parameters, parameters, 0)
+        return parameters[first + self.index.stiffness] * total[0]
+
+    @traced
+    def _record_force(self, parameters, first, X, u):
+        def pushed(g, p, X, u):
+            local = [(x - c) + y for x, c, y in zip(X, p, u)]
+            x, begin = ti.types.vector(3, self.fp)(*(k.value for k in local)), self.begin(parameters, first)
+            (r, k, w), none = (p[m] for m in (3, self.index.stiffness, self.index.width)), parameters
+            at_x = let(self.nearest.over_parts(FORCE, let(x), 0, r.value, w.value, begin, parameters, none, none, 0))
+            by_x = (4, 5, 6), (5, 7, 8), (6, 8, 9)
+
+            def force(a):
+                partials = [(y, lambda b=b: k.value * at(at_x, by_x[a][b])) for b, y in enumerate(local)]
+                partials += [(k, lambda: at(at_x, 1 + a)), (w, lambda: k.value * at(at_x, 10 + a))]
+                return g.function(k.value * at(at_x, 1 + a), *partials, (r, lambda: k.value * at(at_x, 13 + a)))
+
+            return None, [force(a) for a in range(3)]
+
+        g, p, moved, _, f = self.record(parameters, first, X, u, pushed)
+        return g, p, moved, f
+
+    @traced
+    def force_by_corners(self, parameters, first, X, u, parameters_dot):
+        total = let(self.over_parts(JVP, parameters, first, X, u, 0, parameters_dot, parameters, 0))
+        k = at(parameters, first + self.index.stiffness)
+        return self.vector_of([k * x for x in self.turned(X, [at(total, 1 + a) for a in range(3)], False)])
+
+    @traced
+    def add_by_corners(self, parameters, first, X, u, w, sums, i):
+        k = at(parameters, first + self.index.stiffness)
+        own = ti.types.vector(3, self.fp)(*self.turned(X, [k * at(w, a) for a in range(3)], True))
+        let(self.over_parts(VJP, parameters, first, X, u, let(own), parameters, sums, i))
+
     @ti.func
     def reached(self, parameters: ti.template(), first, X, u, move, d, approach):
         """By the plane of what is nearest, and by all triangles on the way."""
@@ -228,10 +275,15 @@ class MeshForce(ObstacleForce):
         """A place as the tree sees it."""
         x, y = ([at(vector, d) for d in range(3)] for vector in (X, u))
         if self.turns:
-            R = rotation_matrix([at(X, 3 + k) for k in range(4)])
             c = [at(parameters, first + self.index.about + d) for d in range(3)]
-            x, y = (
-                [sum_of(R[e][d] * z[e] for e in range(3)) for d in range(3)] for z in ([a - b for a, b in zip(x, c)], y)
-            )
+            x, y = (self.turned(X, z, True) for z in ([a - b for a, b in zip(x, c)], y))
             x = [a + b for a, b in zip(x, c)]
         return let(ti.types.vector(3, self.fp)(*((x[d] - at(parameters, first + d)) + y[d] for d in range(3))))
+
+    @traced
+    def turned(self, X, z, back):
+        """R z of the pose in X, or back, R^T z."""
+        if not self.turns:
+            return z
+        R = rotation_matrix([at(X, 3 + k) for k in range(4)])
+        return [sum_of((R[e][d] if back else R[d][e]) * z[e] for e in range(3)) for d in range(3)]

@@ -53,18 +53,22 @@ class ObstacleForce(VertexForce):
     # ---- recording --------------------------------------------------------------------------------------------------
 
     @traced
-    def record(self, parameters, first, X, u):
-        """(graph, all numbers, components of u, d, n) at a point. Behind the numbers stand those of `corners`, each leaf
-        with the `row` of the parameters where it is."""
+    def record(self, parameters, first, X, u, of=None):
+        """(graph, all numbers, components of u, d, n) at a point; of: gives another number and vector, of all numbers.
+        Behind these stand those of `corners`, each leaf with the `row` of the parameters where it is."""
         g = Graph(self.fp, parameters)
         g.first, g.corners = first, []
         p = [g.leaf(x) for x in self._numbers(parameters, first)]
         rest, moved = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (X, u))
         if self.turns and length_of(X) == 7:  # else X + u is a place as the obstacle was made
-            moved, d, n = self._record_turned(g, p, let(X), rest, moved)
+            moved, d, n = self._record_turned(g, p, let(X), rest, moved, of or self._by_shape)
         else:
-            d, n = self.distance_and_normal(g, p[: self.count], rest, moved)
+            d, n = (of or self._by_shape)(g, p, rest, moved)
         return g, [*p, *g.corners], moved, d, n
+
+    @traced
+    def _by_shape(self, g, p, X, u):
+        return self.distance_and_normal(g, p[: self.count], X, u)
 
     @traced
     def rows_of(self, p):
@@ -72,7 +76,7 @@ class ObstacleForce(VertexForce):
         return [q.row for q in p[self.size :: 3]]
 
     @traced
-    def _record_turned(self, g, p, X, rest, moved):
+    def _record_turned(self, g, p, X, rest, moved, of):
         """(leaves of u and theta, d, n) from the place as the obstacle was made, c + R^T (X - c) + R^T u."""
         R = rotation_matrix([at(X, 3 + k) for k in range(4)])
         c = [x.value for x in p[self.index.about :]]
@@ -86,7 +90,7 @@ class ObstacleForce(VertexForce):
             )
             for d in range(3)
         ]
-        d, own = self.distance_and_normal(g, p[: self.count], made, back)
+        d, own = of(g, p, made, back)
         n = [let(sum_of(R[e][k] * own[k].value for k in range(3))) for e in range(3)]
         by_theta = (0, n[2], -n[1]), (-n[2], 0, n[0]), (n[1], -n[0], 0)  # of theta x n
         rows = [
@@ -253,15 +257,10 @@ class ObstacleForce(VertexForce):
     @traced
     def force_by_corners(self, parameters, first, X, u, parameters_dot):
         """Change of the force for those of its corners."""
-        g, p, _, f = self._record_force(parameters, first, X, u)
-        return self.vector_of(g.forward([(q, at(parameters_dot, q.row)) for q in p[self.size :]], f))
 
     @traced
-    def force_by_corners_vjp(self, parameters, first, X, u, w):
-        """(adjoints of its corners, rows of these) for the adjoint w of the force."""
-        g, p, _, f = self._record_force(parameters, first, X, u)
-        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], p[self.size :])
-        return (*adjoints, *self.rows_of(p))
+    def add_by_corners(self, parameters, first, X, u, w, sums, i):
+        """Add to sums[.., i] the adjoints of its corners for the adjoint w of the force."""
 
     # ---- friction as a stage of explicit passes ----------------------------------------------------------------------
 

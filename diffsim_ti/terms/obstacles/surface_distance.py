@@ -14,9 +14,11 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.runtime import number_type
+from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.surface_tree import FLAT, GROUP, HEADER, NODE
 
 A = ti.template()  # an array handed to a Taichi function
+ENERGY, FORCE, JVP, VJP = range(4)
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class SurfaceDistance:
     @property
     def stride(self) -> int:
         """Numbers of a primitive."""
-        return 13 if self.sided else 3
+        return 20 if self.sided else 10
 
     @property
     def flat(self) -> float:
@@ -131,11 +133,149 @@ class SurfaceDistance:
                         b = self.vector(begin + self.corner(j, 1, parameters), parameters)
                         c = self.vector(begin + self.corner(j, 2, parameters), parameters)
                         out = ti.min(out, self.share_before(x, there, a, b, c))
-                node += 1
-                while (node & 1) == 0:
-                    node >>= 1
-                if node == 1:
-                    node = 0
+                node = self.after(node)
+        return out
+
+    @ti.func
+    def after(self, node):
+        """The node that a walk from left to right has behind all that is below a node; 0: none."""
+        node += 1
+        while (node & 1) == 0:
+            node >>= 1
+        return ti.select(node == 1, 0, node)
+
+    @ti.func
+    def following(self, j, x, reach, parameters: A):
+        """The next primitive behind j, or the first behind -1, of leaves whose boxes are within reach of x; -1: none."""
+        leaves, count, out, node = self.number(0, parameters), self.number(1, parameters), j + 1, 0
+        if (j + 1) % GROUP == 0 or j + 1 == count:
+            out, node = -1, 1
+            if j >= 0:
+                node = self.after(leaves + j // GROUP)
+        while node > 0:
+            if not self.square(node, x, parameters) < reach * reach:
+                node = self.after(node)
+            elif node < leaves:
+                node = 2 * node
+            else:
+                out, node = GROUP * (node - leaves), 0
+        return out
+
+    @ti.func
+    def part(self, j, k, x, begin, parameters: A):
+        """(feature, s, t, squared distance) of part k of primitive j: itself (0), its sides with their ends, its corners."""
+        zero, one = ti.cast(0, self.fp), ti.cast(1, self.fp)
+        feature, s, t, square = k, zero, zero, zero
+        first = self.first_of(k)
+        a = self.vector(begin + self.corner(j, first, parameters), parameters)
+        b = self.vector(begin + self.corner(j, (first + 1) % 3, parameters), parameters)
+        if k == 0:
+            c = self.vector(begin + self.corner(j, 2, parameters), parameters)
+            feature, s, t, square = self.nearest(x, a, b, c)
+        else:
+            if k < 4:
+                s = (x - a).dot(b - a) / ti.max((b - a).norm_sqr(), ti.cast(self.tiny, self.fp))
+                if s <= zero:
+                    feature, s = 3 + k, zero
+                if s >= one:
+                    feature, s = 4 + k % 3, zero
+                    a = b
+            square = (x - a - s * (b - a)).norm_sqr()
+        return feature, s, t, square
+
+    @ti.func
+    def pushed(self, x, j, feature, s, t, share, behind: A, radius, width, begin, parameters: A):
+        """Of a feature, with a share of a barrier of stiffness one: (energy, f = -dE/dx, df/dx: xx, xy, xz, yy, yz, zz,
+        df/dwidth, df/dradius), and rows, s, t, g, h of `seen`. behind: whether it is felt from the other side."""
+        out = ti.Vector.zero(self.fp, 16)
+        found, rows, s_of_it, t_of_it, g, h = self.seen(x, j, feature, s, t, begin, parameters)
+        side = ti.cast(1, self.fp)
+        if found[0] < 0 and not behind:
+            side = side - 2
+        y = (side * found[0] - radius) / width
+        slope, curvature = barrier.slope_and_curvature(y, self.fp)
+        slope, curvature = share * slope, share * curvature
+        for a in ti.static(range(3)):
+            n = side * found[1 + a]
+            out[1 + a] = 0 - width * slope * n
+            out[10 + a] = (y * curvature - slope) * n
+            out[13 + a] = curvature * n
+        for b in ti.static(range(6)):
+            i, e = ti.static(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))[b])
+            out[4 + b] = 0 - side * width * slope * found[4 + b] - curvature * found[1 + i] * found[1 + e]
+        return out, rows, s_of_it, t_of_it, g, h
+
+    @ti.func
+    def is_inside(self, x, m, feature, s, t, begin, parameters: A):
+        """Whether x is behind what is nearest to it."""
+        first = self.first_of(feature)
+        p = self.vector(begin + self.corner(m, first, parameters), parameters)
+        q = self.vector(begin + self.corner(m, (first + 1) % 3, parameters), parameters)
+        r = self.vector(begin + self.corner(m, (first + 2) % 3, parameters), parameters)
+        away, n = x - p - s * (q - p) - t * (r - p), (q - p).cross(r - p)
+        return (feature == 0 and away.dot(n) < 0) or (feature > 0 and self.sign(m, feature, away, parameters) < 0)
+
+    @ti.func
+    def over_parts(self, what: A, x, w, radius, width, begin, parameters: A, dot: A, sums: A, i):
+        """The sum over all that is within reach, with SurfaceMesh.shares, or at a place that has got inside what is nearest
+        alone; what: ENERGY; FORCE, `pushed`; JVP, the change of f for changes `dot` of all parameters, by corners; VJP adds
+        to sums[.., i] for the adjoint w of f."""
+        total, reach, zero, one = ti.Vector.zero(self.fp, 16), radius + width, ti.cast(0, self.fp), ti.cast(1, self.fp)
+        j, feature, s, t, share, square, inside = -1, 0, zero, zero, one, zero, False
+        if ti.static(self.sided):
+            j, feature, s, t = self.find(x, begin, parameters)
+            inside = self.has_inside(j, parameters) and self.is_inside(x, j, feature, s, t, begin, parameters)
+        if not inside:
+            j = self.following(-1, x, reach, parameters)
+        while j >= 0:
+            k = 0
+            while k < 7:
+                if not inside:
+                    share = parameters[self.table + self.number(2, parameters) + self.stride * j + 3 + k]
+                if k == 0 or share != 0:
+                    feature, s, t, square = self.part(j, k, x, begin, parameters)
+                if (inside or square < reach * reach) and share != 0:
+                    if ti.static(what == ENERGY):
+                        y = ((zero - ti.sqrt(square) if inside else ti.sqrt(square)) - radius) / width
+                        total[0] += share * width * width * barrier.value(y, self.fp)
+                    else:
+                        more, rows, s_of, t_of, g, h = self.pushed(
+                            x, j, feature, s, t, share, inside, radius, width, begin, parameters
+                        )
+                        if ti.static(what == FORCE):
+                            total += more
+                        else:
+                            f, turn = self.vec3(more[1], more[2], more[3]), 0 - g - h
+                            for c in ti.static(range(3)):
+                                weight = (one - s_of - t_of, s_of, t_of)[c]
+                                if ti.static(c > 0):
+                                    turn = (g, h)[c - 1]
+                                if ti.static(what == JVP):
+                                    dy = self.vector(rows[c], dot)
+                                    change = self.symmetric(more, dy)
+                                    for a in ti.static(range(3)):
+                                        total[1 + a] += 0 - weight * change[a] - turn[a] * f.dot(dy)
+                                else:
+                                    Hw = self.symmetric(more, w)
+                                    for a in ti.static(range(3)):
+                                        by = 0 - weight * Hw[a] - f[a] * turn.dot(w)
+                                        sums[rows[c] + a, i] = sums[rows[c] + a, i] + by
+                k += 1
+                if inside or (k == 1 and not square < reach * reach):
+                    k = 7  # no part of it is nearer
+            if inside:
+                j = -1
+            else:
+                j = self.following(j, x, reach, parameters)
+        return total
+
+    @ti.func
+    def symmetric(self, found, w):
+        """The product of df/dx with a vector."""
+        out = self.vec3(0)
+        for a in ti.static(range(3)):
+            for b in ti.static(range(3)):
+                out[a] += found[4 + ti.static(((0, 1, 2), (1, 3, 4), (2, 4, 5))[a][b])] * w[b]
         return out
 
     @ti.func
@@ -191,10 +331,14 @@ class SurfaceDistance:
 
     @ti.func
     def look(self, x, begin, parameters: A):
+        """`seen` of what is nearest."""
+        return self.seen(x, *self.find(x, begin, parameters), begin, parameters)
+
+    @ti.func
+    def seen(self, x, m, feature, s, t, begin, parameters: A):
         """((d without the radius, n, dn / dx: xx, xy, xz, yy, yz, zz), where its corners p, q, r begin in the parameters,
-        s, t, those columns g of q and r that p balances)"""
+        s, t, those columns g of q and r that p balances) of a feature of primitive m, where s and t say."""
         one, zero = ti.cast(1, self.fp), ti.cast(0, self.fp)
-        m, feature, s, t = self.find(x, begin, parameters)
         first = self.first_of(feature)
         rows = ti.Vector([begin + self.corner(m, (first + k) % 3, parameters) for k in ti.static(range(3))])
         p = self.vector(rows[0], parameters)
@@ -233,7 +377,7 @@ class SurfaceDistance:
     def has_inside(self, m, parameters: A):
         out = False
         if ti.static(self.sided):
-            out = parameters[self.table + self.number(2, parameters) + self.stride * m + 3] > 0
+            out = parameters[self.table + self.number(2, parameters) + self.stride * m + 10] > 0
         return out
 
     @ti.func
@@ -242,7 +386,7 @@ class SurfaceDistance:
         out = ti.cast(1, self.fp)
         if ti.static(self.sided):
             if self.has_inside(m, parameters):
-                first = self.table + self.number(2, parameters) + self.stride * m + 4 + 3 * (feature - 1)
+                first = self.table + self.number(2, parameters) + self.stride * m + 11 + 3 * (feature - 1)
                 if feature > 3:
                     first = self.vertices(parameters) + self.number(4, parameters)
                     first += self.corner(m, self.first_of(feature), parameters)

@@ -56,7 +56,8 @@ class SurfaceTree:
     def moved(self, x: np.ndarray) -> "SurfaceTree":
         """That of vertices elsewhere, with the same edges and sides."""
         surface = replace(self.surface, vertices=x)
-        vars(surface).update({name: getattr(self.surface, name) for name in ("one", "is_sided", "_edges_of_triangles")})
+        topology = ("one", "is_sided", "shares", "_edges_of_triangles")
+        vars(surface).update({name: getattr(self.surface, name) for name in topology})
         return SurfaceTree(surface, np.zeros(3))
 
     @cached_property
@@ -75,7 +76,8 @@ class SurfaceTree:
         """What kernels read (surface_distance.py): HEADER, boxes of nodes from 0 on, primitives, vertices, and where some
         have an inside outward directions there."""
         sided = self.is_sided
-        primitives = np.column_stack([self.corners, self.pseudonormals]) if sided else self.corners
+        shares = self.surface.shares[self.order]
+        primitives = np.column_stack([self.corners, shares, *([self.pseudonormals] if sided else [])])
         vertices = [self.x.ravel(), *([self.surface.pseudonormals[1].ravel()] if sided else [])]
         nodes = np.zeros((len(self.boxes), NODE))
         nodes[:, :6], middles = self.boxes, 0.5 * (self.boxes[:, :3] + self.boxes[:, 3:])
