@@ -41,9 +41,16 @@ def l_bfgs_b(search: Search, record: Callable, tolerance: float) -> tuple[str, b
         if len(costs) > SMALL_STEPS and costs[-1 - SMALL_STEPS] - costs[-1] < SMALL_STEPS * least:
             raise StopIteration
 
+    bounds = search.problem.reach.T
     options = dict(maxiter=10**6, maxfun=10**6, maxcor=20, ftol=0.0, gtol=0.0)
     found = minimize(
-        cost_and_gradient, search.point.t, jac=True, method="L-BFGS-B", callback=note_iteration, options=options
+        cost_and_gradient,
+        search.point.t,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        callback=note_iteration,
+        options=options,
     )
     if len(costs) > SMALL_STEPS and costs[-1 - SMALL_STEPS] - costs[-1] < SMALL_STEPS * least:
         return "converged", True

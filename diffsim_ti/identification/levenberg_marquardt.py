@@ -29,6 +29,11 @@ class LevenbergMarquardt:
             self.hessian = J.T @ J + self.prior_hessian
         else:
             self.gradient = search.half_gradient(at)
+        low, high = search.problem.reach  # numbers at an end that the cost pushes outwards stay there
+        ended = (at.t <= low) & (self.gradient > 0) | (at.t >= high) & (self.gradient < 0)
+        self.gradient[ended] = 0.0
+        if self.dense:
+            self.hessian[ended], self.hessian[:, ended] = 0.0, 0.0
 
     def step(self) -> np.ndarray:
         """The damped Gauss-Newton step."""
@@ -47,10 +52,10 @@ class LevenbergMarquardt:
         return _conjugate_gradients(product, -self.gradient, solve, share)
 
     def limited(self, step: np.ndarray) -> np.ndarray:
-        """A step that changes no logarithm and no bounded number by more than LONGEST."""
+        """A step that changes no logarithm and no bounded number by more than LONGEST, and ends within their reach."""
         free = np.concatenate([np.full(f.size, f.kind != "linear") for f in self.search.problem.unknowns])
-        longest = np.abs(step[free]).max(initial=0.0)
-        return step * min(1.0, LONGEST / longest) if longest > 0 else step
+        step, t = np.where(free, np.clip(step, -LONGEST, LONGEST), step), self.search.point.t
+        return np.clip(t + step, *self.search.problem.reach) - t
 
     def try_step(self, step: np.ndarray) -> str | None:
         """Take the step if the cost falls; else damp more, and say why."""
