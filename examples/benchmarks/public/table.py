@@ -45,7 +45,7 @@ def environment(folder: Path, name: str, *pins: str) -> tuple[str, str]:
     return str(python), ""
 
 
-def asked(python: str, script: Path, *arguments, timeout: float = 300, env: dict | None = None) -> dict:
+def asked(python: str, script: Path, *arguments, timeout: float = 1500, env: dict | None = None) -> dict:
     """The last line that a script prints, read as JSON, from a process of its own; {"error": reason} if it fails."""
     command = [python, str(script), *map(str, arguments)]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
