@@ -7,15 +7,14 @@ from the same meshes and steps); an equilibrium of a beam (static_peers.py: torc
 stretch of a plate that torch-fem publishes (torch_fem_stretch.py).
 
 Method. Each run is a point (seconds, error). A tool's time to an error is that of its fastest run which is at least so
-accurate. Equal accuracy is the least error that both tools reach: the larger of the two tools' best. The ratio of a peer on a
-task is its time to that error over ours. The geometric mean goes over tasks, each counted once; its spread is the factor by
-which ratios scatter about it, exp of the standard deviation of their logarithms. Errors are against closed forms, converged
+accurate. Equal accuracy is the least error that both tools reach: the larger of the two tools' best. The ratio of a peer on
+a task is its time to that error over ours. The geometric mean goes over tasks, each counted once; its spread is the factor
+by which they scatter about it, exp of the standard deviation of their logarithms. Errors are against closed forms, converged
 motions, or a solution to tolerance 1e-10. Times are wall times, compiling left out, BLAS on one thread, the processes one
 after the other. Tasks that a peer does not solve are named and are in no mean.
 """
 
 import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -31,7 +30,7 @@ import compare_peers  # noqa: E402
 import static_peers  # noqa: E402
 import torch_fem_stretch  # noqa: E402
 from peers import work  # noqa: E402
-from table import ONE_THREAD, ROOT, number, parser, report  # noqa: E402
+from table import ONE_THREAD, ROOT, asked, number, parser, report  # noqa: E402
 
 from diffsim_ti.study import charts  # noqa: E402
 
@@ -56,7 +55,9 @@ def beam(peers: dict, tetrahedra: int) -> dict:
 
     out = {OURS: [point(*static_peers.best(lambda t=t: ours(t), repeats)) for t in (1e-2, 1e-4, 1e-6)]}
     direct = static_peers.Direct(scene, static_peers.lu)
-    out["SciPy LU"] = [point(*static_peers.best(lambda: static_peers.Direct(scene, direct.factorised).solve(), repeats))]
+    out["SciPy LU"] = [
+        point(*static_peers.best(lambda: static_peers.Direct(scene, direct.factorised).solve(), repeats))
+    ]
     if "torch-fem" in peers:
         job = static_peers.job_of(scene, repeats)
         answers = [
@@ -72,16 +73,12 @@ def stretch(peers: dict, vertices: int) -> dict:
     exact = torch_fem_stretch.FORCE
     out = {OURS: [(forward + gradient, max(abs(force / exact - 1), 1e-6))]}  # the exact force has six digits
     if "torch-fem" in peers:
-        command = [peers["torch-fem"], str(HERE / "stretch_by_peers.py"), str(vertices)]
-        said = subprocess.run(command, capture_output=True, text=True, env=os.environ | ONE_THREAD)
-        if said.returncode:
-            print(f"torch-fem left the stretch: {said.stderr.strip().splitlines()[-1:]}")
+        told = asked(peers["torch-fem"], HERE / "torch_fem_peer.py", "stretch", vertices, "tetrahedra", env=ONE_THREAD)
+        if "error" in told:
+            print(f"torch-fem left the stretch: {told['error']}")
         else:
-            numbers = [part.split()[-2] for part in said.stdout.split(",")[1:]]
-            seconds = float(said.stdout.split(": ")[1].split()[0]) + float(said.stdout.split("gradient ")[1].split()[0])
-            force = next(float(a) for a, b in zip(said.stdout.split(), said.stdout.split()[1:]) if b.startswith("N"))
-            out["torch-fem"] = [(seconds, max(abs(force / exact - 1), 1e-6))]
-            del numbers
+            seconds = told["setup"] + told["forward"] + told["gradient"]
+            out["torch-fem"] = [(seconds, max(abs(told["value"] / exact - 1), 1e-6))]
     return out
 
 
@@ -90,10 +87,10 @@ def ratios(found: dict) -> list[tuple]:
     out = []
     for task, tools in found.items():
         best = {who: min((e for _, e in points), default=np.inf) for who, points in tools.items()}
-        for who, points in tools.items():
+        for who in tools:
             error = 1.001 * max(best[OURS], best[who])
             if who != OURS and np.isfinite(error):
-                out.append((task, who, error, compare_peers.time_to(tools[OURS], error), compare_peers.time_to(points, error)))
+                out.append((task, who, error, *(compare_peers.time_to(tools[w], error) for w in (OURS, who))))
     return out
 
 
@@ -110,7 +107,7 @@ def draw(found: dict, rows: list, path) -> None:
     figure = Figure(figsize=(12, 5.6), dpi=110, layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
     tasks = list(found)
-    for k, tools in enumerate(found.values()):
+    for tools in found.values():
         for who, points in tools.items():
             if points:
                 color, marker = STYLES[who]
@@ -145,7 +142,8 @@ def draw(found: dict, rows: list, path) -> None:
     for axes in (left, right):
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
-    figure.text(0.01, -0.01, "\n".join(f"{k + 1}  {task}" for k, task in enumerate(tasks)), fontsize=8, va="top")
+    told = "\n".join(f"{k + 1}  {task}" for k, task in enumerate(tasks))
+    figure.supxlabel(told, x=0.02, ha="left", multialignment="left", fontsize=9)
     charts.save(figure, path)
 
 
