@@ -25,7 +25,6 @@ PINNED = {
     "JAX": ("jax==0.10.2",),
     "Newton": ("newton==1.8.0", "warp-lang==1.19.0"),
     "torch-fem": ("torch==2.13.0", "torch-fem==0.14.0"),
-    "JAX-FEM": ("jax-fem==0.0.11",),
 }
 
 
