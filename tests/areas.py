@@ -26,7 +26,7 @@ AREAS = {
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction "
     "contact_corpus",
     "PyTorch, optimisations": "ensemble torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",
-    "charts, maps, advice": "accuracy sweep study study_stability peers",
+    "charts, maps, advice": "accuracy sweep study study_stability peers public_benchmarks",
     "pictures, films, the window": "picture_drawing picture_film camera marks "
     "optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "types release reference words examples environment contact_examples static_examples "

@@ -308,6 +308,21 @@ def test_stopped_and_resumed(swing, tmp_path):
         identify(swing, data, dict(youngs_modulus=1e5), resume=part.state)
 
 
+def test_a_number_that_was_driven_to_its_bound_comes_back():
+    """Far from E the best nu lies at a bound; near E it does not. Where the cost does fall beyond a bound, nu ends there."""
+    rollout = body(steps=100, save_every=1)
+    seen = {"positions": rollout.forward(**TRUE).positions}
+
+    def found(low):
+        unknowns = ds.Unknown(2.4e3, range=(1e3, 1e6)), ds.Unknown(low + 0.03, range=(low, 0.45))
+        return identify(rollout, seen, dict(zip(TRUE, unknowns)), noise=1e-5, covariance=False, starts=1)
+
+    inside, ended = found(0.2), found(0.31)
+    assert inside.converged and inside.simulations < 80
+    assert inside.estimates == pytest.approx(TRUE, rel=1e-6)
+    assert ended.converged and ended.estimates["poissons_ratio"] == pytest.approx(0.31, abs=2e-3 * 0.14)
+
+
 def test_expected_intervals_and_the_best_markers(swing):
     foreseen = ds.expected(swing, ds.Measurement("positions", np.zeros((11, 4, 3)), NOISE, MARKERS), TRUE)
     found = identify(swing, tracks(swing.forward(**TRUE), np.random.default_rng(8)), TRUE)

@@ -19,21 +19,25 @@ def stress_at(scene, place, i: int, at: str) -> float:
     return frames["stress"][-1, np.linalg.norm(scene.mesh.vertices - place, axis=1).argmin(), i, i]
 
 
-def test_le10_a_thick_elliptic_plate_under_pressure():
-    box = graded_box((6, 8, 4), (1, 1, 1), 1.5, 1.3)
+def le10(cells=(6, 8, 4)) -> ds.Scene:
+    """A thick elliptic plate under pressure."""
+    box = graded_box(cells, (1, 1, 1), 1.5, 1.3)
     r, t, z = box.vertices.T
     angle = np.pi / 2 * t
     mesh = with_vertices(box, np.stack([(2 + 1.25 * r) * np.cos(angle), (1 + 1.75 * r) * np.sin(angle), 0.6 * z], 1))
     mesh = mesh.with_vertex_set("edge", (r > 1 - 1e-9) & (np.abs(z - 0.5) < 1e-9))
     fixed = {"ymin": "y", "ymax": "x", "xmax": "xy", "edge": "z"}
     load = ds.Traction((0, 0, -1e6), "zmax")
-    scene = ds.Scene(mesh, ds.LinearElastic(E=210e9, nu=0.3), terms=[load], fixed=fixed, precision="f64")
-    assert stress_at(scene, (2, 0, 0.6), 1, "recovered") == pytest.approx(-5.38e6, rel=0.02)
+    return ds.Scene(mesh, ds.LinearElastic(E=210e9, nu=0.3), terms=[load], fixed=fixed, precision="f64")
 
 
-def test_le11_a_thick_shell_of_revolution_that_is_heated():
-    """T = r + z; its section follows a sphere, a cone and a cylinder."""
-    box = graded_box((3, 6, 8), (1, 1, 4))
+def test_le10():
+    assert stress_at(le10(), (2, 0, 0.6), 1, "recovered") == pytest.approx(-5.38e6, rel=0.02)
+
+
+def le11(cells=(3, 6, 8)) -> ds.Scene:
+    """A thick shell of revolution, heated to T = r + z; its section follows a sphere, a cone and a cylinder."""
+    box = graded_box(cells, (1, 1, 4))
     q, t, s = box.vertices.T
     inner = lambda s: (  # noqa: E731 - r and z, s from 0 at the equator to 4 at the top
         np.where(s < 2, np.cos(np.pi / 8 * np.minimum(s, 2)), 0.5**0.5),
@@ -49,8 +53,11 @@ def test_le11_a_thick_shell_of_revolution_that_is_heated():
     x = mesh.vertices[mesh.tetrahedra]
     heated = ds.Grown(ds.LinearElastic(E=210e9, nu=0.3), 2.3e-4 * (np.hypot(x[..., 0], x[..., 1]) + x[..., 2]).mean(1))
     fixed = {"ymin": "y", "ymax": "x", "zmin": "z", "zmax": "z"}
-    scene = ds.Scene(mesh, heated, fixed=fixed, precision="f64")
-    assert stress_at(scene, (1, 0, 0), 2, "vertices") == pytest.approx(-105e6, rel=0.02)
+    return ds.Scene(mesh, heated, fixed=fixed, precision="f64")
+
+
+def test_le11():
+    assert stress_at(le11(), (1, 0, 0), 2, "vertices") == pytest.approx(-105e6, rel=0.02)
 
 
 @pytest.mark.parametrize("of", ([], range(20)))

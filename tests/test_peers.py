@@ -13,7 +13,13 @@ from diffsim_ti.study import problem
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "benchmarks"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "benchmarks" / "peers"))
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "benchmarks" / "public"))
+
+import all_peers  # noqa: E402
 import compare_peers  # noqa: E402
+import diffpd_identification  # noqa: E402
+import gradient_quality  # noqa: E402
+import table  # noqa: E402
 from job import Job  # noqa: E402
 from peers import work  # noqa: E402
 
@@ -122,3 +128,63 @@ def test_table_and_picture_of_equal_accuracy(tmp_path):
     assert "| problem 0 | 0.01 | 1 s (1x) | 4 s (4x) |" in table and "| 0.001 | 1 s (1x) | not reached |" in table
     compare_peers.draw(found, tmp_path / "peers.png")
     assert (tmp_path / "peers.png").stat().st_size > 10_000
+
+
+def test_peers_are_installed_apart_or_left_out_with_the_reason(tmp_path, monkeypatch, capsys):
+    answers = {"JAX": ("python of JAX", ""), "Warp": ("", "no such version")}
+    monkeypatch.setattr(
+        compare_peers, "environment", lambda folder, name, *pins: answers[{"jax": "JAX", "warp": "Warp"}[name]]
+    )
+    assert compare_peers.interpreters(tmp_path, ["JAX", "Warp"]) == {"JAX": "python of JAX"}
+    told = capsys.readouterr().out
+    assert f"JAX: {work.PINNED['JAX'][0]}" in told and "Warp is left out: no such version" in told
+    assert set(work.PEERS) <= set(work.PINNED)
+
+
+def test_ratios_are_at_the_error_that_both_reach(tmp_path):
+    """Of a peer that is four times as slow, and of one that wins by twice; who reaches nothing is in no mean."""
+    ours = [(1.0, 1e-1), (2.0, 1e-2), (8.0, 1e-4)]
+    found = {
+        "slow": {"diffsim_ti": ours, "JAX": [(4.0, 1e-1), (8.0, 1e-2)], "Warp": []},
+        "fast": {"diffsim_ti": ours, "JAX": [(1.0, 1e-2)]},
+    }
+    rows = all_peers.ratios(found)
+    assert [(task, who, *times) for task, who, _, *times in rows] == [("slow", "JAX", 2, 8), ("fast", "JAX", 2, 1)]
+    assert all_peers.mean_of(rows) == pytest.approx((2**0.5, 8**0.5))
+    cells, said = all_peers.table_of(rows)
+    assert cells[0][0] == "fast" and cells[0][-1] == "0.5" and "JAX 1.41 times as long, times or over 2.8, of 2" in said
+    all_peers.draw(found, rows, tmp_path / "all.png")
+    assert (tmp_path / "all.png").stat().st_size > 10_000
+
+
+def test_differences_of_order_six():
+    """Exact to degree six; a gradient that is wrong by a factor keeps its cosine and shows its error."""
+    sixth, fourth = gradient_quality.central(
+        np.array([np.polyval([1.0, 3.0, -2.0, 1.0, 5.0, 2.0], gradient_quality.OFFSETS)])
+    )
+    assert sixth == pytest.approx([5.0]) and abs(fourth[0] - 5.0) > 1
+    exact = np.array([1.0, 2.0, -1.0])
+    assert gradient_quality.compared(1.5 * exact, exact, exact) == pytest.approx((1.0, 0.5, 0.0))
+
+
+@pytest.mark.parametrize("task", gradient_quality.TASKS[3:5], ids=lambda task: task.name)
+def test_gradients_of_ours_are_those_of_our_motion(task):
+    """A thrown block with friction, and a beam at rest: to what differences of float64 tell."""
+    ours = gradient_quality.moving_by_us if hasattr(task, "held") else gradient_quality.still_by_us
+    [(cosine, error, doubt)] = ours("f64", task, [0])
+    assert cosine > 1 - 1e-6 and error < max(1e-5, 10 * doubt) and doubt < 1e-2
+
+
+def test_identifications_of_diffpd(capsys):
+    """The truth is found from twice E; a search that does not arrive is told as that."""
+    task = diffpd_identification.Task(diffpd_identification.cantilever(quick=True), 1)
+    runs = diffpd_identification.by_identify(task, (2.08e6, 0.352))
+    assert runs[0] and 4 <= runs[1] <= 40
+    rows = diffpd_identification.rows_of({"cantilever": {"one": [runs], "none": [(False, 150, 9.0)]}})
+    assert rows[0][2] == "1 of 1" and rows[1][2:] == ["0 of 1", "", ""]
+
+
+def test_every_table_of_these_scripts_has_marks_on_the_page():
+    page = table.PAGE.read_text()
+    for name in ("diffpd_identification", "gradient_quality", "all_peers"):
+        assert f"<!-- {name} -->" in page and f"<!-- end of {name} -->" in page

@@ -45,6 +45,7 @@ class Problem:
         ends = np.cumsum([0, *(free.size for free in self.unknowns)])
         self.parts, self.size = [slice(a, b) for a, b in zip(ends, ends[1:])], int(ends[-1])
         self.labels = [f"{f.label}[{i}]" if f.size > 1 else f.label for f in self.unknowns for i in range(f.size)]
+        self.reach = np.concatenate([free.reach() for free in self.unknowns], 1)
         self.num_data = sum(int(m.seen.sum()) for given in data for m in given)
 
     def _of(self, k: int) -> Iterable[tuple[Free, slice]]:

@@ -121,6 +121,11 @@ class LevenbergMarquardt:
             self.hessian = J.T @ J + self.prior_hessian
         else:
             self.gradient = search.half_gradient(at)
+        low, high = search.problem.reach  # numbers at an end that the cost pushes outwards stay there
+        ended = (at.t <= low) & (self.gradient > 0) | (at.t >= high) & (self.gradient < 0)
+        self.gradient[ended] = 0.0
+        if self.dense:
+            self.hessian[ended], self.hessian[:, ended] = 0.0, 0.0
 
     def step(self) -> np.ndarray:
         """The damped Gauss-Newton step."""
@@ -139,10 +144,10 @@ class LevenbergMarquardt:
         return _conjugate_gradients(product, -self.gradient, solve, share)
 
     def limited(self, step: np.ndarray) -> np.ndarray:
-        """A step that changes no logarithm and no bounded number by more than LONGEST."""
+        """A step that changes no logarithm and no bounded number by more than LONGEST, and ends within their reach."""
         free = np.concatenate([np.full(f.size, f.kind != "linear") for f in self.search.problem.unknowns])
-        longest = np.abs(step[free]).max(initial=0.0)
-        return step * min(1.0, LONGEST / longest) if longest > 0 else step
+        step, t = np.where(free, np.clip(step, -LONGEST, LONGEST), step), self.search.point.t
+        return np.clip(t + step, *self.search.problem.reach) - t
 
     def try_step(self, step: np.ndarray) -> str | None:
         """Take the step if the cost falls; else damp more, and say why."""
@@ -237,7 +242,13 @@ def l_bfgs_b(search: Search, record: Callable, tolerance: float) -> tuple[str, b
 
     options = dict(maxiter=10**6, maxfun=10**6, maxcor=20, ftol=0.0, gtol=0.0)
     found = minimize(
-        cost_and_gradient, search.point.t, jac=True, method="L-BFGS-B", callback=note_iteration, options=options
+        cost_and_gradient,
+        search.point.t,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=search.problem.reach.T,
+        callback=note_iteration,
+        options=options,
     )
     if len(costs) > SMALL_STEPS and costs[-1 - SMALL_STEPS] - costs[-1] < SMALL_STEPS * least:
         return "converged", True

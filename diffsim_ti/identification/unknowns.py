@@ -14,13 +14,14 @@ from diffsim_ti.mesh.geometry import inner_faces, triangle_normals
 from diffsim_ti.rollout import Rollout
 
 TIME_OFFSET = "time_offset"  # of measurements with times of their own [s]
+EDGE = 7.0  # |s| of bounded numbers at most: a thousandth of their range from its ends, from where they still come back
 
 
 class Unknown(metaclass=Public):
     """Numbers x of an input, found through free variables t in which no bound exists:
 
         logarithm  x = start exp(t)                      (default where start > 0)
-        bounded    x = low + (high - low) / (1 + e^-s),  s = t + s(start)        (with `range`)
+        bounded    x = low + (high - low) / (1 + e^-s),  s = t + s(start)        (with `range`; |s| is at most 7)
         linear     x = start + scale t                   (with `scale`, and where start <= 0)
 
     start: a guess, one number or one per group, or of the input's shape, which then are numbers of their own. range: (low,
@@ -138,6 +139,14 @@ class Free:
             return (x - self.start) / self.scale
         low, high = self.unknown.range
         return np.log((x - low) / (high - x)) - np.log((self.start - low) / (high - self.start))
+
+    def reach(self) -> np.ndarray:
+        """The least and the largest t of each number, shape (2, size)."""
+        if self.kind != "bounded":
+            return np.outer((-np.inf, np.inf), np.ones(self.size))
+        low, high = self.unknown.range
+        at = np.log((self.start - low) / (high - self.start))
+        return np.stack([np.minimum(-EDGE - at, 0.0), np.maximum(EDGE - at, 0.0)])
 
     def spread(self, k: int, x: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The input of experiment k with these numbers where they go, and `into` elsewhere."""

@@ -1,6 +1,6 @@
 """Common work on whatever of torch-diffsim, NVIDIA Warp and JAX is installed, next to ours, in one run.
 
-    python examples/benchmarks/compare_peers.py [--peer-python PATH] [--part common|batch|accuracy|charts|all] [--quick]
+    python examples/benchmarks/compare_peers.py [--peers FOLDER] [--part common|batch|accuracy|charts|all] [--quick]
 
 common: the work of speed.py, equal steps; prints ns per tetrahedron and substep.
 batch: many bodies at once, as worlds of Warp (pieces of one mesh), by JAX's vmap, and ds.Batch.
@@ -8,8 +8,10 @@ accuracy: time to a given error, with and without gradients, of a Lamé mode aga
     on a floor against its own converged motion; draws peers.png and prints the times to 1e-2 and 1e-3.
 charts: the work-precision diagrams of `diffsim-ti chart` with torch-diffsim's runs in them.
 
-Each peer runs in a process of its own (peers/ beside this file), one after the other. --peer-python names an interpreter
-whose environment holds the peers (they need not share ours). Pictures and records go to --output.
+Each peer runs in a process of its own (peers/ beside this file), one after the other. --peers installs each into an
+environment of its own in FOLDER, at the versions of peers/work.py, which are printed, and leaves out what does not install,
+with the reason; a second run finds them there. Or --peer-python names an interpreter whose environment holds the peers.
+Pictures and records go to --output.
 """
 
 import argparse
@@ -20,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from peers import work
+from public.table import environment
 from speed import BATCH_STEPS, SUBSTEPS, H, common_rollout, measure, measure_batch
 
 import diffsim_ti as ds
@@ -32,10 +35,21 @@ EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
 ERRORS = (1e-2, 1e-3)
 
 
+def interpreters(folder: Path, names) -> dict[str, str]:
+    """{peer: interpreter} of those that install into folder, each with its versions; of the others the reason is printed."""
+    out = {}
+    for who in names:
+        python, reason = environment(folder, who.lower(), *work.PINNED[who])
+        print(f"{who} is left out: {reason}" if reason else f"{who}: {', '.join(work.PINNED[who])}", flush=True)
+        if python:
+            out[who] = python
+    return out
+
+
 # ---- equal steps --------------------------------------------------------------------------------------------------------
 
 
-def common(python: str, sizes, rounds: int) -> dict:
+def common(peers: dict, sizes, rounds: int) -> dict:
     """{(who, tetrahedra): [forward, forward and gradient]} in ns per tetrahedron and substep, the best of the rounds."""
     best: dict = {}
 
@@ -48,7 +62,7 @@ def common(python: str, sizes, rounds: int) -> dict:
             row = measure(n, "f32", 10)
             note("diffsim_ti", row["tets"], 0, row["forward_ns"])
             note("diffsim_ti", row["tets"], 1, row["forward_backward_ns"])
-        for who in work.installed(python):
+        for who, python in peers.items():
             for n in sizes:
                 jobs, tets = common_jobs(n)
                 for k, answer in enumerate(work.ask(who, python, jobs)):
@@ -69,7 +83,7 @@ def common_jobs(vertices_a_side: int, repeats: int = 5, **more) -> tuple[list[di
 BATCHES = (6, 64), (11, 16)  # vertices a side, bodies
 
 
-def at_once(python: str, rounds: int) -> dict:
+def at_once(peers: dict, rounds: int) -> dict:
     """{(who, "bodies x tetrahedra"): [forward, forward and gradient]} in ns per tetrahedron, substep and body."""
     best: dict = {}
     for _ in range(rounds):
@@ -77,7 +91,7 @@ def at_once(python: str, rounds: int) -> dict:
             row = measure_batch(n, worlds, "f32", False, 5)
             size = f"{worlds} x {row['tets']}"
             found = {"diffsim_ti": [row["forward_ns"], row["forward_backward_ns"]]}
-            for who in work.installed(python):
+            for who, python in peers.items():
                 if who != "torch-diffsim":
                     jobs, tets = common_jobs(n, worlds=worlds, substeps=BATCH_STEPS * SUBSTEPS)
                     answers = work.ask(who, python, jobs)
@@ -136,9 +150,10 @@ def drop(gradient: bool = False, duration: float = 0.05) -> Problem:
     )
 
 
-def accuracy(python: str, quick: bool, folder) -> dict:
+def accuracy(peers: dict, quick: bool, folder, cubes=(4, 8, 12, 16, 24), time: float = 0.05) -> dict:
     """{problem: {who: [(seconds per simulated second, error), ...]}}; peers.png and peers.json grow with each problem."""
-    cubes, time = ((4, 8), 0.012) if quick else ((4, 8, 12, 16, 24), 0.05)
+    if quick:
+        cubes, time = (4, 8), 0.012
     out = {}
     for asked, cells, levels in (
         (problem("lame"), cubes, 1),
@@ -151,7 +166,7 @@ def accuracy(python: str, quick: bool, folder) -> dict:
             warnings.simplefilter("ignore", UserWarning)  # coarse steps through contact are what is measured
             result = chart(ours, EXPLICIT, ("f32",), levels=levels + 1, limit=60.0, repeats=3, say=print)
         out[asked.title] = {"diffsim_ti": [(p.seconds, p.error) for p in result.points if np.isfinite(p.error)]}
-        for who in work.installed(python):
+        for who, python in peers.items():
             out[asked.title][who] = work.peer_points(asked, who, python, cells, 1 if quick else levels)
         draw(out, folder / "peers.png")
         charts.write_json(out, folder / "peers.json")
@@ -242,7 +257,7 @@ def peers_of(name: str, who: str, python: str, quick: bool) -> list[tuple[float,
     return work.peer_points(asked, who, python, cells[:2] if quick else cells, 1 if quick else levels, right)
 
 
-def charted(python: str, quick: bool, folder) -> str:
+def charted(peers: dict, quick: bool, folder) -> str:
     """Write the charts with torch-diffsim's runs; Markdown of the times to an error."""
     found = {}
     for name in ("lame", "beam", "bounce", "bounce-gradient", "identify"):
@@ -258,17 +273,18 @@ def charted(python: str, quick: bool, folder) -> str:
                 say=print,
             )
             result = result.with_points(fine.points)
-        peers = {who: peers_of(name, who, python, quick) for who in work.installed(python) if who == "torch-diffsim"}
-        charts.write_chart(result, folder, peers)
+        theirs = {who: peers_of(name, who, python, quick) for who, python in peers.items() if who == "torch-diffsim"}
+        charts.write_chart(result, folder, theirs)
         ours = [(p.seconds, p.error) for p in result.points if np.isfinite(p.error)]
-        found[result.problem.title] = {"diffsim_ti": ours, **peers}
+        found[result.problem.title] = {"diffsim_ti": ours, **theirs}
         print(accuracy_table(found), flush=True)
     return accuracy_table(found)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--peer-python", default=sys.executable, help="interpreter with the peers")
+    parser.add_argument("--peers", type=Path, help="a folder that holds or gets an environment of each peer")
+    parser.add_argument("--peer-python", default=sys.executable, help="or an interpreter with the peers")
     parser.add_argument("--part", default="all", choices=["common", "batch", "accuracy", "charts", "all"])
     parser.add_argument("--sizes", type=int, nargs="+", default=[6, 11, 21], help="vertices a side of the common work")
     parser.add_argument("--rounds", type=int, default=3, help="of the common work")
@@ -276,15 +292,19 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("output/peers"), help="folder for pictures and records")
     options = parser.parse_args()
     ds.init(precision="f32")
-    print("peers:", ", ".join(work.installed(options.peer_python)) or "none is installed; see --peer-python")
+    if options.peers:
+        peers = interpreters(options.peers, work.PEERS)
+    else:
+        peers = dict.fromkeys(work.installed(options.peer_python), options.peer_python)
+        print("peers:", ", ".join(peers) or "none is installed; see --peers")
     if options.part in ("common", "all"):
-        print(common_table(common(options.peer_python, options.sizes, options.rounds)))
+        print(common_table(common(peers, options.sizes, options.rounds)))
     if options.part in ("batch", "all"):
-        print(common_table(at_once(options.peer_python, options.rounds)))
+        print(common_table(at_once(peers, options.rounds)))
     if options.part in ("accuracy", "all"):
-        print(accuracy_table(accuracy(options.peer_python, options.quick, options.output)))
+        print(accuracy_table(accuracy(peers, options.quick, options.output)))
     if options.part in ("charts", "all"):
-        print(charted(options.peer_python, options.quick, options.output))
+        print(charted(peers, options.quick, options.output))
 
 
 if __name__ == "__main__":

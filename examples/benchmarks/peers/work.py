@@ -18,6 +18,14 @@ PEERS = {
     "Warp": ("run_warp.py", "warp"),
     "JAX": ("run_jax.py", "jax"),
 }
+# what `pip install` is given for each, in an environment of its own
+PINNED = {
+    "torch-diffsim": ("torch==2.13.0", "torch-diffsim==0.2.0"),
+    "Warp": ("warp-lang==1.19.0", "numpy==2.4.6"),
+    "JAX": ("jax==0.10.2",),
+    "Newton": ("newton==1.8.0", "warp-lang==1.19.0"),
+    "torch-fem": ("torch==2.13.0", "torch-fem==0.14.0"),
+}
 
 
 def installed(python: str) -> list[str]:

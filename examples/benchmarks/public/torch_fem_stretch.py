@@ -1,21 +1,18 @@
 """torch-fem's published stretch of a plate to ten times its thickness, with the gradient of the force by both moduli.
 
-    python examples/benchmarks/public/torch_fem_stretch.py [--quick] [--vertices 35 65] [--peers PYTHON]
+    python examples/benchmarks/public/torch_fem_stretch.py [--quick] [--vertices 35 65]
 
 4 x (N-1) x (N-1) cubic cells, 4/(N-1) x 1 x 1 m, psi = mu/2 (I_C - 3) - mu ln J + lambda/2 ln^2 J, E = 1000 Pa, nu = 0.3.
 Both ends are fixed along x, the two middle planes by symmetry; in ten increments, geometric in stretch, the body gets ten
 times as long, in float64. The force is exactly 3839.48 N. Forward: the ten equilibria, with all that a solve sets up,
 without compiling; gradient: the force's by Young's modulus and Poisson's ratio, after that. Cells are cut into five
-tetrahedra, where torch-fem has hexahedra. A table in Markdown, with torch-fem's published seconds; the exponent with which
-time grows with unknowns; with --peers, an interpreter that has it, the same stretch of the same tetrahedra by torch-fem.
-torch-fem: https://github.com/meyer-nils/torch-fem (its benchmark of large deformations).
+tetrahedra, where torch-fem has hexahedra. Prints a table, and the exponent with which time grows with unknowns.
+torch_fem_suite.py has the same beside torch-fem.
 """
 
 import argparse
-import subprocess
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -26,8 +23,6 @@ from diffsim_ti.materials import EnergyLaw, Material
 from diffsim_ti.materials.calculus.tensor import invariants
 
 E, NU, STRETCH, INCREMENTS, FORCE = 1000.0, 0.3, 10.0, 10, 3839.48
-# seconds, forward and gradient, by unknowns: an i7-13700K, a Threadripper Pro 9975, an RTX 5090
-PUBLISHED = {18_375: ((24.8, 7.4), (14.9, 4.0), (12.4, 2.4)), 63_375: ((77.9, 19.9), (37.3, 9.1), (18.5, 3.7))}
 
 
 @dataclass(frozen=True)
@@ -93,26 +88,18 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a small plate, once")
     parser.add_argument("--vertices", type=int, nargs="+", default=[35, 65], help="along the long edges, odd")
     parser.add_argument("--repeats", type=int, default=2)
-    parser.add_argument("--peers", help="an interpreter that has torch-fem")
     options = parser.parse_args()
     sizes, repeats = ([9, 13], 1) if options.quick else (options.vertices, options.repeats)
     rows = []
-    print(
-        "| unknowns | forward [s] | gradient [s] | products | force [N] | torch-fem: i7, Threadripper, RTX 5090 [s] |"
-    )
-    print("| ---: | ---: | ---: | ---: | ---: | --- |")
+    print("| unknowns | forward [s] | gradient [s] | products | force [N] |\n" + 5 * "| ---: " + "|")
     for n in sizes:
         forward, gradient, products, force, _ = measured(n, repeats)
         rows.append((15 * n * n, forward))
-        published = "; ".join(f"{a}, {b}" for a, b in PUBLISHED.get(15 * n * n, ()))
-        print(f"| {15 * n * n} | {forward:.2f} | {gradient:.2f} | {products} | {force:.2f} | {published} |", flush=True)
+        print(f"| {15 * n * n} | {forward:.2f} | {gradient:.2f} | {products} | {force:.2f} |", flush=True)
         assert abs(force - FORCE) < 0.01, f"the force is {FORCE} N"
     if len(rows) > 1:
         power = np.polyfit(*np.log(np.array(rows)).T, 1)[0]
         print(f"\nforward grows with the power {power:.2f} of the unknowns")
-    if options.peers:
-        script = Path(__file__).parent / "stretch_by_peers.py"
-        subprocess.run([options.peers, str(script), *map(str, sizes)], check=True)
 
 
 if __name__ == "__main__":
