@@ -44,6 +44,8 @@ def result(name: str, meshes: corpus.Meshes, steps: int | None, seconds: float) 
         return corpus.run(name, corpus.SCENES[name](meshes), steps, say=say)
     except TimeIsUp:
         return last[0]
+    except AttributeError:
+        return "needs a surface of the paper's repository"
     except (ValueError, TypeError, RuntimeError) as error:
         return f"not posed: {error}"
 
