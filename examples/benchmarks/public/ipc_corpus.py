@@ -62,7 +62,8 @@ def main(quick: bool, folders=(), names=None, minutes: float = 9.0) -> tuple[lis
             warnings.simplefilter("ignore")
             found = result(name, meshes, QUICK.get(name) if quick else None, share)
         runs.append(found)
-        rows.append([name, *[""] * (len(corpus.HEAD) - 2), found] if isinstance(found, str) else corpus.row(found))
+        shown = [name, *[""] * (len(corpus.HEAD) - 2), found] if isinstance(found, str) else corpus.row(found)
+        rows.append(["" if cell == "nan" else cell for cell in shown])
         print(f"{name}: {rows[-1][-1]}", file=sys.stderr, flush=True)
     report("ipc_corpus", corpus.HEAD, rows, quick or names is not None)
     return rows, runs

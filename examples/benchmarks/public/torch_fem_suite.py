@@ -151,12 +151,12 @@ def main(quick: bool, peers) -> list:
 
     def row(case, n, what, found, ours=None):
         if "error" in found:
-            rows.append((f"{case} {n}", what, "", "", "", "", "", found["error"]))
+            rows.append((f"{case} {n}", what, "", "", "", "", "", found["error"], ""))
             return
         shown = [ratio(found[key], ours[key]) if ours else found[key] for key in ("forward", "gradient", "memory")]
-        rows.append(
-            (f"{case} {n}", what, str(found.get("unknowns", "")), found.get("setup"), *shown, found.get("value"))
-        )
+        value, right = found.get("value"), EXACT.get(case)
+        seen = ("", "") if value is None else (f"{value:.6g}", f"{100 * abs(value / right - 1):.2g}" if right else "")
+        rows.append((f"{case} {n}", what, str(found.get("unknowns", "")), found.get("setup"), *shown, *seen))
 
     for case, n in QUICK if quick else PUBLISHED:
         ours = asked(sys.executable, HERE / "torch_fem_suite.py", "--one", case, n)
