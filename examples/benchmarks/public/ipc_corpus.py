@@ -44,6 +44,8 @@ def result(name: str, meshes: corpus.Meshes, steps: int | None, seconds: float) 
         return corpus.run(name, corpus.SCENES[name](meshes), steps, say=say)
     except TimeIsUp:
         return last[0]
+    except AttributeError:
+        return "needs a surface of the paper's repository"
     except (ValueError, TypeError, RuntimeError) as error:
         return f"not posed: {error}"
 
@@ -60,7 +62,8 @@ def main(quick: bool, folders=(), names=None, minutes: float = 9.0) -> tuple[lis
             warnings.simplefilter("ignore")
             found = result(name, meshes, QUICK.get(name) if quick else None, share)
         runs.append(found)
-        rows.append([name, *[""] * (len(corpus.HEAD) - 2), found] if isinstance(found, str) else corpus.row(found))
+        shown = [name, *[""] * (len(corpus.HEAD) - 2), found] if isinstance(found, str) else corpus.row(found)
+        rows.append(["" if cell == "nan" else cell for cell in shown])
         print(f"{name}: {rows[-1][-1]}", file=sys.stderr, flush=True)
     report("ipc_corpus", corpus.HEAD, rows, quick or names is not None)
     return rows, runs
