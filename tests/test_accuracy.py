@@ -199,7 +199,7 @@ def test_what_cannot_be_estimated_is_refused():
 
 def test_refinement_ends_below_the_tolerance_with_gradients_there():
     start = block()
-    found = ds.refine(start, "end", 0.4, (0.0, 0.0, 1.0))
+    found = ds.refine(start, "end", 0.4, (0.0, 0.0, 1.0), ten_nodes=False)
     unknowns = [n for n, _ in found.history]
     assert found.reached and found.accuracy.relative <= 0.4 < found.history[0][1].relative
     assert unknowns == sorted(unknowns) and 3 * found.mesh.num_vertices == unknowns[-1]
@@ -212,3 +212,13 @@ def test_refinement_ends_below_the_tolerance_with_gradients_there():
     by_load = (gradients["traction"] * [0, 0, -2e3]).sum()
     assert gradients["youngs_modulus"] * 1e6 == pytest.approx(-by_load, rel=1e-6)
     assert not ds.refine(start, "end", 1e-9, (0.0, 0.0, 1.0), rounds=0).reached
+
+
+def test_a_linear_mesh_is_given_ten_nodes_first():
+    start, down = block(), (0.0, 0.0, 1.0)
+    found = ds.refine(start, "end", 0.01, down, rounds=1)
+    assert [start.scene.mesh.order, found.mesh.order] == [1, 2]
+    assert found.mesh.num_tetrahedra == start.scene.mesh.num_tetrahedra
+    cut = ds.refine(start, "end", 0.01, down, rounds=1, ten_nodes=False)
+    assert cut.mesh.order == 1 and cut.mesh.num_tetrahedra > start.scene.mesh.num_tetrahedra
+    assert found.accuracy.bar < 0.5 * cut.accuracy.bar

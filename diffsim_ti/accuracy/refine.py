@@ -60,6 +60,7 @@ def refine(
     weights: ArrayLike | Callable | None = None,
     rounds: int = 20,
     most: int = 300_000,
+    ten_nodes: bool = True,
     onto: Callable[[np.ndarray], ArrayLike] | None = None,
     values: dict | None = None,
 ) -> Refined:
@@ -68,9 +69,11 @@ def refine(
     problem: a Rollout of equilibria or implicit steps. output, weights: the number, as in `Rollout.accuracy`.
     tolerance: of the bar over the number's change since the first frame. rounds: of refinement at most.
     most: unknowns of the finer mesh that says the error, beyond which no round begins.
+    ten_nodes: whether the first round of a linear mesh gives its tetrahedra ten nodes and cuts none, which brings most for
+        each unknown: the error falls by a higher power of the length of edges. False: all meshes are linear.
     onto: as in `TetrahedralMesh.refined`. values: of inputs, as in `Rollout.forward`.
 
-    In each round the fewest tetrahedra that have half of the error by size are cut in two at their longest edges, states are
+    In each other round the fewest tetrahedra that have half of the error by size are cut in two at their longest edges, states are
     carried to the new mesh and Newton's method begins there. What the steps cost is not refined.
     Doerfler 1996, A convergent adaptive algorithm for Poisson's equation, doi:10.1137/0733054.
     """
@@ -83,7 +86,10 @@ def refine(
         if reached or len(history) > rounds or found.cost["finer unknowns"] > most:
             return Refined(problem, history, reached, values)
         where = largest(found.shares)
-        problem, values, P, _ = on_finer_mesh(problem, lambda mesh: mesh.refined(where, "longest", onto), values)
+        finer = lambda mesh: mesh.refined(where, "longest", onto)  # noqa: E731
+        if ten_nodes and problem.scene.mesh.order == 1:
+            finer = TetrahedralMesh.quadratic
+        problem, values, P, _ = on_finer_mesh(problem, finer, values)
         given = [P @ u for u in run.each("places")]
 
 

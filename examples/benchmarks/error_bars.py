@@ -209,7 +209,7 @@ def l_body(n, order):
 
 def refine() -> None:
     """Unknowns until the estimate, and the error itself of uniform meshes, is below a tolerance."""
-    for problem, order, tolerance in ((cook, 2, 0.01), (l_body, 2, 0.005)):
+    for problem, order, tolerance in ((cook, 1, 0.01), (cook, 2, 0.01), (l_body, 2, 0.005)):
         rollout, _, weights, exact = problem(2, order)
         begin = time.perf_counter()
         print(f"{problem.__name__}, {(4, 10)[order - 1]} nodes, to {tolerance:g}:")
