@@ -225,6 +225,28 @@ def test_forces_on_a_body_are_what_its_momentum_gains():
     np.testing.assert_allclose(frames["normal"] + frames["friction"], force, atol=1e-12)
 
 
+def test_forces_on_supports_are_counted_however_these_hold():
+    """Fixed vertices take forces, beside others that are fixed in some directions too; a simulator notes what is read."""
+    low = ds.TetrahedralMesh.create_box(2, size=0.1)
+    up = ds.TetrahedralMesh.create_box(2, size=0.08, origin=(0.01, 0.104, 0.02)).rotated([0, 1, 0], 0.1)
+    mesh, fall = ds.TetrahedralMesh.joined([low, up]), np.repeat([[0, 0, 0], [0, -0.5, 0]], 8, axis=0)
+    terms = [ds.SelfContact(2e4, 5e-3, friction=0.3), ds.Ground(-0.01, stiffness=1e4, width=5e-3)]
+    named = [ds.SelfContactForce("body_0", name="low"), ds.SelfContactForce(name="each", per_vertex=True)]
+    for fixed in ({"body_0": "xyz"}, {"body_0": "xyz", "body_1": "x"}, {"body_0": "y"}):
+        options = dict(fixed=fixed, initial_velocities=fall, precision="f64")
+        scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 1000.0, terms, **options)
+        solver = ds.SemiImplicitSolver(scene, dt=1e-3, contact="force")  # whose obstacles cannot be noted
+        frames = ds.Rollout(solver, 16, save_every=16, outputs=named, gradients=[]).forward()
+        assert frames["low"][-1, 1] < -10
+        np.testing.assert_allclose(frames["each"].sum(1), 0, atol=1e-10)
+        assert np.isnan(frames.contact_forces[:, 0]).all()
+    simulator = ds.Simulator(solver, contact_forces="surfaces")
+    simulator.step()
+    assert simulator.output(named[1]).shape == (16, 3)
+    with pytest.raises(ValueError, match="contact_forces must be"):
+        ds.Simulator(solver, contact_forces="all")
+
+
 def test_forces_have_derivatives():
     named = [
         ds.SelfContactForce("body_1", name="on"),
@@ -283,7 +305,7 @@ def test_friction_at_rest_balances_the_supports(load_steps):
     np.testing.assert_allclose(frames["reaction"], -total, atol=1e-8 * size)
     np.testing.assert_allclose(frames["each"].sum(1), 0, atol=1e-12 * size)
     simulator = ds.Simulator(solver, contact_forces=True)
-    with pytest.raises(ValueError, match="contact_forces=True"):
+    with pytest.raises(ValueError, match="contact_forces=.surfaces"):
         ds.Simulator(solver).output(named[1])
     for k in range(5):
         np.testing.assert_allclose(simulator.output(named[1]), frames["friction"][k], atol=1e-8 * size)

@@ -172,8 +172,9 @@ class Workspace:
         """From now on note what the law remembers in each frame; the frames are made."""
         self.law_frames = LawFrames(self)
 
-    def record_contacts(self, of_obstacles: bool = True) -> None:
-        """From now on note, for each frame, what obstacles do to each vertex; the frames are made."""
+    def record_contacts(self, wanted: frozenset) -> None:
+        """From now on note, for each frame, what contact does to each vertex; the frames are made. wanted: whether of obstacles
+        (True), of surfaces to each other ("surfaces"), or both."""
         raise NotImplementedError
 
     def forget_contacts(self) -> None:

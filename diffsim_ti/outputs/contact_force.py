@@ -30,7 +30,8 @@ class ContactForce(Output):
     so that with save_every=1 it is the force of each step, and T f is what the obstacle added to the body's momentum: to
     round-off in explicit steps, in backward Euler and the midpoint rule to the tolerance of their solves; of implicit steps
     the forces are those where they take them. In static solves it is the force of the last equilibrium.
-    Obstacles act on fixed vertices in implicit steps and static solves alone, and what holds them takes that up.
+    Obstacles act on fixed vertices in implicit steps, static solves and where they act by pairs; what holds them takes that
+    up.
     The gradient is exact by all inputs: moduli, density, rest shape, the obstacle's stiffness, friction, shape, path.
 
     Raises ValueError, when a Rollout is made, for an obstacle that the scene has not, another part, a name that is taken,

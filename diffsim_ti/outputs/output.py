@@ -3,7 +3,7 @@ and the states themselves as outputs, which every rollout has."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -139,7 +139,7 @@ class Output(metaclass=Public):
     linear = False  # whether it is linear in positions and velocities
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
     # whether runs must note frames.contact_forces for it: what obstacles do (True), or "surfaces" to each other
-    reads_contact_forces: bool | str = False
+    reads_contact_forces: bool | Literal["surfaces"] = False
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
     reads_law_state = False  # the same of frames.law_state, where the law remembers
     reads_joint_states = False  # whether it reads frames.joint_states, which runs of robots note

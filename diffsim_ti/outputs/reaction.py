@@ -26,8 +26,8 @@ class Reaction(Output):
     is no name in the scene's `fixed`, all do.
     So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero where
     supports share no vertices, or hold them in directions perpendicular to each other.
-    What obstacles and self-contact do to fixed vertices themselves is not in it (ContactForce has the first), nor is the
-    inertia of vertices that a prescribed motion accelerates. An incompressible fluid pushes with what `ChamberPressure`
+    What obstacles and self-contact do to fixed vertices themselves is not in it (ContactForce has the first,
+    SelfContactForce the second), nor is the inertia of vertices that a prescribed motion accelerates. An incompressible fluid pushes with what `ChamberPressure`
     says of it.
 
     support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.

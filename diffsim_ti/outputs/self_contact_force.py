@@ -17,7 +17,7 @@ class SelfContactForce(ContactForce):
 
     n: the pair's normal, w_i: the weights of its four corners (whose sum is 0), N: what its barrier presses with; f, mu,
     eps: of friction (terms/self_contact.py). So the sum over all vertices is zero, and that over one body is what all
-    others do to it.
+    others do to it. What acts on fixed vertices is in it.
 
     on: whose sum is taken, by a vertex set's name, indices, a mask or a list of names, as of `mesh.vertex_indices`; of a
         joined mesh "body_0", "body_1" and so on.

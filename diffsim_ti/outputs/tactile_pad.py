@@ -63,7 +63,8 @@ class TactilePad(Output):
         x, y = np.meshgrid(*(l + s * (h - l) for l, h, s in zip(low, high, shares)))
         out.corners, out.weights = _within(np.stack([x, y], -1).reshape(-1, 2), p, out.triangles)
         out.inside = (out.weights.sum(1) > 0).reshape(self.size)
-        out.places = np.einsum("pc,pcd->pd", out.weights, X[out.corners]).reshape(*self.size, 3)
+        on_set = np.einsum("pc,pcd->pd", out.weights, X[out.corners]).reshape(*self.size, 3)
+        out.places = np.where(out.inside[..., None], on_set, middle + np.stack([x, y], -1) @ np.stack([a, b]))
         lever = p[corners, 0] - p[corners, 0].mean()
         out.along = np.zeros(mesh.num_vertices)
         out.along[corners] = lever / (lever @ lever)  # of places: how much the set's coordinate along a leads them on

@@ -105,8 +105,7 @@ class Rollout(metaclass=Public):
         options = dict(save_every=save_every, checkpoint_every=checkpoint_every, memory=memory, gradients=gradients)
         options |= dict(clip=clip, truncate=truncate, health=health, raise_errors=raise_errors)
         given = (outputs,) if isinstance(outputs, Output) else tuple(listed("outputs", outputs, "Outputs"))
-        read = {getattr(output, "reads_contact_forces", False) for output in given}
-        contacts = True in read or "surfaces" in read and "surfaces"
+        contacts = frozenset(getattr(output, "reads_contact_forces", False) for output in given) - {False}
         chambers = any(getattr(output, "reads_chamber_pressures", False) for output in given)
         law_states = any(getattr(output, "reads_law_state", False) for output in given)
         noted = dict(contacts=contacts, chambers=chambers, law_states=law_states)

@@ -1,7 +1,7 @@
 """Simulator: the step-by-step interface of a solver."""
 
 import weakref
-from typing import overload
+from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,7 +36,7 @@ class Simulator(metaclass=Public):
     """Advances a scene step by step and shows its state.
 
     `Simulator(solver)`, or, for a solver made without a scene, `Simulator(mesh, material, solver)`. contact_forces: note in
-    each step what obstacles do, for `output(ContactForce(...))`.
+    each step what contact does, for `output(ContactForce(...))`; "surfaces": what surfaces do to each other alone.
 
     positions, displacements [m] and velocities [m/s] are NumPy copies of shape (num_vertices, 3) in the scene's
     precision (positions far from the origin in float64, origin.py); time [s] and step_count say where it is. A run that
@@ -53,11 +53,16 @@ class Simulator(metaclass=Public):
     """
 
     @overload
-    def __init__(self, solver: Solver, *, contact_forces: bool = False): ...
+    def __init__(self, solver: Solver, *, contact_forces: bool | Literal["surfaces"] = False): ...
 
     @overload
     def __init__(
-        self, mesh: TetrahedralMesh, material: Material, solver: SemiImplicitSolver, *, contact_forces: bool = False
+        self,
+        mesh: TetrahedralMesh,
+        material: Material,
+        solver: SemiImplicitSolver,
+        *,
+        contact_forces: bool | Literal["surfaces"] = False,
     ): ...
 
     def __init__(
@@ -66,7 +71,7 @@ class Simulator(metaclass=Public):
         material: Material | None = None,
         solver: Solver | None = None,
         *,
-        contact_forces: bool = False,
+        contact_forces: bool | Literal["surfaces"] = False,
     ):
         if material is None and solver is None:
             mesh, solver = None, mesh
@@ -83,9 +88,12 @@ class Simulator(metaclass=Public):
         self._first_solver = solver  # whose substeps a reset goes back to
         solver.simulator = weakref.ref(self)
         self._start = solver.start_values()
-        self._notes, self._settled = bool(contact_forces), {}
+        if contact_forces not in (True, False, "surfaces"):
+            raise ValueError(f'contact_forces must be True, False or "surfaces", got {contact_forces!r}')
+        self._notes = frozenset({True, "surfaces"} if contact_forces is True else {contact_forces}) - {False}
+        self._settled = {}
         self._changes = self.scene.inputs.change_in_time
-        if contact_forces:
+        if True in self._notes:
             solver.check_contact_forces()
         self._make_workspace()
         self.reset()
@@ -94,7 +102,7 @@ class Simulator(metaclass=Public):
         self.workspace = self.solver.workspace(self._start, bend)
         if self._notes:
             self.workspace.make_frames(2)
-            self.workspace.record_contacts()
+            self.workspace.record_contacts(self._notes)
         self._guard = Guard(self.workspace)
         self._before = self.workspace.history(1)
 
@@ -180,7 +188,7 @@ class Simulator(metaclass=Public):
             self.workspace.forget_contacts()
         try:
             with self.workspace.report.of_passes(passes):
-                self._guard.advance(0, passes, passes, int(self._notes))
+                self._guard.advance(0, passes, passes, int(bool(self._notes)))
         except FacesBend as bent:
             self._take_bent(bent.bend)
             return False
@@ -356,11 +364,14 @@ class Simulator(metaclass=Public):
         """Value of an output such as `Reaction("left")` or `Stress()` at the present state, as a Rollout's frame has it.
 
         ContactForce, SelfContactForce and ContactTraction are the mean over the last step, zero before the first, and need
-        `Simulator(solver, contact_forces=True)`.
+        `Simulator(solver, contact_forces=True)`; SelfContactForce alone "surfaces".
         Raises ValueError for one without, and as the output does.
         """
-        if output.reads_contact_forces and not self._notes:
-            raise ValueError(f"{output!r} is of a step: make the simulator with Simulator(solver, contact_forces=True)")
+        reads = output.reads_contact_forces
+        if reads and reads not in self._notes:
+            raise ValueError(
+                f"{output!r} is of a step: make the simulator with Simulator(solver, contact_forces={reads!r})"
+            )
         if output.cumulative:
             raise ValueError(f"{output!r} counts from the start of a run: pass it to Rollout(..., outputs=[...])")
         frames = self._frames()

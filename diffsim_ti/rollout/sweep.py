@@ -42,15 +42,17 @@ class Sweep:
         clip: float | None = None,
         truncate: int | None = None,
         health: bool = False,
-        contacts: bool | str = False,
+        contacts: frozenset = frozenset(),
         chambers: bool = False,
         law_states: bool = False,
         raise_errors: bool = True,
     ):
-        if contacts is True:
+        if True in contacts:
             solver.check_contact_forces()
         self.raise_errors, self.last_error = raise_errors, None  # what stopped the last run
-        self.contacts = contacts  # whether runs note what contact does to each vertex in each frame (outputs/output.py)
+        self.contacts = (
+            contacts  # what runs note of contact, of each vertex in each frame (`Output.reads_contact_forces`)
+        )
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
         self.law_states = law_states and bool(solver.scene.law.state_names)  # whether what the law remembers is
         self.joints = bool(solver.scene.terms_of(Robot))
@@ -229,7 +231,7 @@ class Sweep:
                 self.workspace = self.make_workspace(derived)
                 self.workspace.make_frames(self.num_frames)
                 if self.contacts:
-                    self.workspace.record_contacts(self.contacts is True)
+                    self.workspace.record_contacts(self.contacts)
                 if self.law_states:
                     self.workspace.record_law_states()
                 self._snapshots = self.workspace.history(self.checkpoints.snapshots)

@@ -50,8 +50,9 @@ class SelfContact(Term):
     "self_contact_friction", of a dict shape (pairs,); or "<name>.stiffness" and so on.
     One per scene. In explicit steps it is a stage that no step is too large for (`contact_damping` of their solvers): what
     the stiffness cannot hold is lost as in an inelastic impact. A substep with near pairs then takes several times as long
-    as one without, of small bodies the most. Reduced sets go with it there, and keep their momenta to round-off; what an
-    impulse may do to a whole set bounds its friction, so that sets creep more than free bodies do.
+    as one without, of small bodies the most. Reduced sets go with it there; they keep linear momentum, and without
+    friction angular momentum, to round-off, a basis where it has these motions. What an impulse may do to a whole set bounds
+    its friction, so that sets creep more than free bodies do.
     stage: has no effect, and goes with the next version.
     Implicit solvers keep surfaces apart during the whole motion of every step; ImplicitMidpointSolver raises Tunnelling
     where the end of a step lies beyond a contact.

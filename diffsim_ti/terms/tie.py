@@ -31,8 +31,8 @@ class Tie(Term):
         facets of a curved surface, stays as it is at rest and does not turn with the body.
     Weights are those of the mesh's places and flat faces, whatever rest_positions a run takes. Vertices of a and b may be
     fixed along axes, where they stand still at rest. `Reaction(tie)` is the force on b. Explicit solvers take obstacles
-    beside it by contact="force", at vertices (by_pairs=False) and without friction; SelfContact, for which the surfaces
-    touch, goes with it in no solver.
+    beside it by contact="force" without friction, or by pairs; SelfContact, for which the surfaces touch, goes with it in no
+    solver.
 
     Raises ValueError for surfaces that do not meet, share vertices, or of which b lies on a in part only, for vertices of b
     that another tie has, and for fixed vertices that move or are fixed along a direction that is no axis.

@@ -117,7 +117,8 @@ class ForwardRun:
             steps //= self.parts
             solver = solver_class(scene, dt=steps * dt, substeps=steps, **options)
         self.outputs = tuple(outputs)
-        self._noted = dict(contact_forces=any(output.reads_contact_forces for output in self.outputs))
+        reads = {output.reads_contact_forces for output in self.outputs}
+        self._noted = dict(contact_forces=True in reads or "surfaces" in reads and "surfaces")
         self.simulator = self._last = Simulator(solver, **self._noted)
         self.frame_time = self.parts * solver.dt
         ws = self.simulator.workspace

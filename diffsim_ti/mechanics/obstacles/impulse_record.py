@@ -10,21 +10,22 @@ class ImpulseRecord:
     and those of pairs in `of_pairs`, shape (frames, contacts by pairs, 2: by push and by friction, num_vertices, 3), whose
     `rows` are those of obstacles, and a row behind them for surfaces on each other; `contacts`: their numbers.
 
-    of_obstacles: whether those are wanted, too; then it raises ValueError where obstacles act as forces.
+    wanted: whether those of obstacles (True), where these act as forces a ValueError; of "surfaces", or of both. The others
+    are NaN in what is collected.
     """
 
-    def __init__(self, workspace, of_obstacles: bool):
+    def __init__(self, workspace, wanted: frozenset):
         self.arrays, a, features = workspace.arrays, workspace.arrays, workspace.arrays.features()
-        self.of_obstacles = of_obstacles
+        self.wanted, of_obstacles = wanted, True in wanted
         if of_obstacles and len(features.staged) < len(features.groups):
             raise ValueError(
                 "explicit solvers note what obstacles with a distance do, and one of this scene is a force alone: take an "
                 "implicit solver for ContactForce and ContactTraction"
             )
-        obstacles = workspace.pairs.obstacles if workspace.pairs else None
+        obstacles = workspace.pairs.obstacles if workspace.pairs and of_obstacles else None
         self.rows = [part.k for part in obstacles.corners.parts] if obstacles else []
         self.contacts = [*range(1, 1 + len(self.rows))]
-        if a.self_contact:
+        if a.self_contact and "surfaces" in wanted:
             self.rows, self.contacts = [*self.rows, len(a.obstacles)], [*self.contacts, 0]
         self.num_frames, self.num_obstacles = (
             workspace.frames.frames_u.shape[0],
@@ -50,14 +51,12 @@ class ImpulseRecord:
     def collect(self) -> np.ndarray:
         """Shape (frames, obstacles and surfaces on each other, 2: by push and by friction, num_vertices, 3), float64; the
         first frame has none."""
-        out = np.zeros(self._shape)
+        out = np.full(self._shape, np.nan)
+        if True in self.wanted:
+            out[:, : len(self.arrays.obstacles)] = 0.0
         if self.num_obstacles:
             own = out[:, : self.num_obstacles]
             own += runtime.fetch(self.impulse).astype(np.float64).reshape(own.shape)
         for k, row in enumerate(self.rows):
-            out[:, row] += self.of_pairs[:, k]
+            out[:, row] = np.nan_to_num(out[:, row]) + self.of_pairs[:, k]
         return out
-
-    def frame_of(self, numbers: dict) -> int | None:
-        """The frame that counts the pass of a launch, if one does."""
-        return numbers["counted"] if numbers["counted"] >= 0 else None

@@ -247,9 +247,9 @@ class PartSolver:
         at.friction = self._friction(part, of, at) if of.rough else 0 * at.delta
         blend = 0.5 * (1 + part.c)
         at.w_drift = part.b + blend * at.delta + at.friction
-        e, at.given = part.e + at.alpha * at.w_drift, at.h * near.freed(at.pressed)
+        e, at.given = part.e + at.alpha * at.w_drift, at.h * at.pressed
         if of.rough:
-            at.given = at.given + near.freed(at.friction_sum)
+            at.given = at.given + at.friction_sum
         for node, own, moved in near.twist(part, of, at):
             e[node] += np.cross(moved, at.given[own]).sum(0)
         return e, part.b + at.delta + at.friction
@@ -259,7 +259,7 @@ class PartSolver:
         B = at.B[np.flatnonzero(own)]
         pushed = at.h * (B.T @ (at.P[own, None] * at.n[own]))
         by_friction = B.T @ at.impulse[own] if of.rough else 0 * pushed
-        return self.near.freed(pushed), self.near.freed(by_friction)
+        return pushed, by_friction
 
     def _follow(self, part: Part, of, at) -> None:
         real = SimpleNamespace(**{k: x.real if isinstance(x, np.ndarray) else x for k, x in vars(at).items()})
@@ -329,7 +329,7 @@ class PartSolver:
         by.w += at.P[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(pulled))
         near.lightened_vjp(of, adj, at.h * freed, at.pressed)
         for own, pushed, _ in seeds:
-            q = at.h * near.freed(pushed)
+            q = at.h * pushed
             Bq = own[:, None] * (at.B @ q)
             by.P += dot(at.n, Bq)
             by.n += at.P[:, None] * Bq
@@ -384,8 +384,7 @@ class PartSolver:
         near.lightened_vjp(of, adj, freed, at.friction_sum)
         r_adj = at.B @ pulled
         by.w += np.einsum("pd,pkd->pk", at.impulse, at_corners(pulled))
-        for own, _, by_friction in seeds:
-            q = near.freed(by_friction)
+        for own, _, q in seeds:
             r_adj = r_adj + own[:, None] * (at.B @ q)
             by.w += own[:, None] * np.einsum("pd,pkd->pk", at.impulse, at_corners(q))
         e = at.t / np.maximum(at.s, TINY)[:, None]

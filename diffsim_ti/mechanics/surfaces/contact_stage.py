@@ -211,7 +211,7 @@ class PairContact(Stage):
             self._refuse(at, now)
         if at.stride:
             self.kept[at.end] = one
-        if one and at.ws.impulses:
+        if one and self._frame_of(at.ws.impulses, at) is not None:
             of = self._numbers(one, now)
             self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
 
@@ -223,7 +223,7 @@ class PairContact(Stage):
     def _contact(self, at: Passes, now, start, u, v, lost: bool) -> tuple[ContactPass | None, bool]:
         """The stage, with the list as it is, of the pairs that would come near, and of those that do by what it does;
         (what was done, whether pairs beyond the list may have crossed)."""
-        near, recording = self.set, bool(at.stride or at.ws.impulses)
+        near, recording = self.set, bool(at.stride or self._frame_of(at.ws.impulses, at) is not None)
         one, parts, b, led_to = None, [], None, u
         for tries in range(MOST_TRIES):
             flagged = np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
@@ -263,9 +263,15 @@ class PairContact(Stage):
         self.whole.start = self.whole.u if self.whole.near.sets else self.whole.u[self.whole.nodes]
         self.set.fill(self.whole, self._numbers(self.whole, now))
 
+    @staticmethod
+    def _frame_of(impulses, at: Passes) -> int | None:
+        """The frame that counts what pairs do in a pass, if one does."""
+        counted = at.numbers["counted"] if impulses and impulses.contacts else -1
+        return counted if counted >= 0 else None
+
     def _of_contacts(self, impulses, at: Passes, one: ContactPass):
         """(frame, place among the contacts, which pairs are its) of each that is noted."""
-        frame = impulses.frame_of(at.numbers)
+        frame = self._frame_of(impulses, at)
         for k, number in enumerate(impulses.contacts if frame is not None else ()):
             own = one.rest[2].contact == number
             if own.any():

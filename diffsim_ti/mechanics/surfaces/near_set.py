@@ -47,7 +47,8 @@ class NearSet:
         """one, of: a ContactPass of pairs of the list, those that were in the set among them, and what its parts read."""
         near, numbers, count = one.near, one.numbers, len(one.numbers)
         (start, index, weight), n, edges = near.rows, len(of.inverse), int(near.edges.sum())
-        room = 4 * int(np.diff(start).max(initial=1)) + sum(sorted(len(x.at) - len(x.here) for x in near.sets)[-4:])
+        most = 4 * int(np.diff(start).max(initial=1))  # nodes of a pair
+        room = most + sum(sorted(len(x.at) - len(x.here) for x in near.sets)[-most:])
         chosen = np.zeros(count, np.int32)
         if self.builds == self.inner.builds:
             chosen[np.searchsorted(numbers, self.numbers)] = self.chosen

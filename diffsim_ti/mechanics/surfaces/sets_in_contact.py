@@ -75,9 +75,8 @@ class SetInContact:
     """
 
     follows_places = False  # whether N is of where it is
-    twist = (
-        False  # whether its last vector is the sum of dx x f, dx from the places that N is of to where impulses f act
-    )
+    # whether its last vector is the sum of dx x f, dx from the places that N is of to where impulses f act
+    twist = False
 
     def __init__(self, body: Together, at: np.ndarray):
         self.vertices, self.at, self.basis = body.vertices, at, body.basis
@@ -89,7 +88,7 @@ class SetInContact:
     def factors(self, here: np.ndarray, x0, x1, m: np.ndarray) -> Factors:
         """Of some of its vertices."""
         weighed = self.own * m[:, None, None]
-        K = np.einsum("via,vib->ab", weighed, self.own) + np.diag(1.0 * ~self.basis.any(0))
+        K = np.tensordot(weighed, self.own, 2 * [(0, 1)]) + np.diag(1.0 * ~self.basis.any(0))
         N, inverse = self.own[here].reshape(-1, len(K)), np.linalg.inv(K)
         return Factors(np.concatenate([N, np.eye(len(K))]), inverse, self._sizes(N, inverse, len(here))[0])
 
@@ -105,7 +104,7 @@ class SetInContact:
         sizes, W = self._sizes(N, own.inverse, count)
         by_W = ((by.sizes / sizes)[:, None, :, None] * W).reshape(len(N), len(N))
         by_K = -own.inverse @ (by.inverse + N.T @ by_W @ N) @ own.inverse
-        return 0.0, np.einsum("via,ab,vib->v", self.own, by_K, self.own)
+        return 0.0, ((self.own @ by_K) * self.own).sum((1, 2))
 
     def settle(self, x0, x1, v, e: np.ndarray, b: np.ndarray, decay, m):
         """(how places change, velocities) where contact has done e, and b to velocities before they decay."""
@@ -160,13 +159,12 @@ class RigidInContact(SetInContact):
 
     def factors_vjp(self, here, x0, x1, m, own, by):
         r, J = self._arms(x0, x1, m)
-        A, M, by_r, near = own.inverse[3:6, 3:6], m.sum(), np.zeros_like(r), r[here]
+        A, M, near = own.inverse[3:6, 3:6], m.sum(), r[here]
         turning = by.N[:-9].reshape(-1, 3, 9)[:, :, 3:6]
         rho, both = self._turns(near, A), by.sizes + by.sizes.T
         share = 0.5 * (both @ rho) / rho
         by_A = by.inverse[3:6, 3:6] + 0.5 * spread(near, 2 * share)
-        at_r, by_m = spread_vjp(r, m, -A @ by_A @ A)
-        by_r += at_r
+        by_r, by_m = spread_vjp(r, m, -A @ by_A @ A)
         by_r[here] += -np.stack([axial(x) for x in turning]) + 2 * share[:, None] * (np.trace(A) * near - near @ A)
         by_c = -by_r.sum(0)
         by_M = -(np.trace(by.inverse[:3, :3]) + by.sizes.sum()) / M**2

@@ -39,7 +39,7 @@ class ExplicitAdjoint:
         self._of_bodies = a.bodies.adjoint() if a.bodies else {}
         self._arrays |= self._of_bodies
         vars(self).update(self._arrays)
-        self.impulses = ImpulseRecord(workspace, workspace.impulses.of_obstacles) if workspace.impulses else None
+        self.impulses = ImpulseRecord(workspace, workspace.impulses.wanted) if workspace.impulses else None
         self.stages = with_buffers("adjoint", workspace.stages, self)
 
     def fits(self, workspace) -> bool:
@@ -181,7 +181,7 @@ class ExplicitTangent:
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
         self.law_frames = LawFrames(workspace) if workspace.law_frames else None
-        self.impulses = ImpulseRecord(workspace, workspace.impulses.of_obstacles) if workspace.impulses else None
+        self.impulses = ImpulseRecord(workspace, workspace.impulses.wanted) if workspace.impulses else None
         if a.bodies:
             vars(self).update(a.bodies.tangent(tangent))
         if self.z is not None:

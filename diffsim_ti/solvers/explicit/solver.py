@@ -193,11 +193,11 @@ class ExplicitWorkspace(Workspace):
         self._launches.clear()
         return OwnWork(self)
 
-    def record_contacts(self, of_obstacles: bool = True) -> None:
-        if of_obstacles:
+    def record_contacts(self, wanted: frozenset) -> None:
+        if True in wanted:
             self.arrays.record_contacts()
             self._launches.clear()
-        self.impulses = ImpulseRecord(self, of_obstacles)
+        self.impulses = ImpulseRecord(self, wanted)
         self.contact.impulse = self.impulses.impulse
 
     def forget_contacts(self) -> None:

@@ -370,11 +370,11 @@ class ImplicitWorkspace(PrescribedInPasses):
         """Raise Overlap if a vertex is in an obstacle."""
         self.collisions.check_apart()
 
-    def record_contacts(self, of_obstacles: bool = True) -> None:
-        self.impulses = ContactRecord(self)
+    def record_contacts(self, wanted: frozenset) -> None:
+        self.forget_contacts()
 
     def forget_contacts(self) -> None:
-        self.record_contacts()
+        self.impulses = ContactRecord(self)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         return self.impulses.forces
