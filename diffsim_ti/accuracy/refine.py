@@ -73,8 +73,8 @@ def refine(
         each unknown: the error falls by a higher power of the length of edges. False: all meshes are linear.
     onto: as in `TetrahedralMesh.refined`. values: of inputs, as in `Rollout.forward`.
 
-    In each other round the fewest tetrahedra that have half of the error by size are cut in two at their longest edges. States
-    are carried to the new mesh, and Newton's method begins there. What the steps cost is not refined.
+    In each other round the fewest tetrahedra that have half of the error by size are cut in two at their longest edges.
+    States are carried to the new mesh, and Newton's method begins there. What the steps cost is not refined.
     Doerfler 1996, A convergent adaptive algorithm for Poisson's equation, doi:10.1137/0733054.
     """
     tolerance, rounds = number("tolerance", tolerance), whole("rounds", rounds, 0)

@@ -173,7 +173,7 @@ class Workspace:
         self.law_frames = LawFrames(self)
 
     def record_contacts(self, wanted: frozenset) -> None:
-        """From now on note, for each frame, what contact does to each vertex; the frames are made. wanted: whether of obstacles
+        """From now on note, for each frame, what contact does to each vertex; the frames are made. wanted: of obstacles
         (True), of surfaces to each other ("surfaces"), or both."""
         raise NotImplementedError
 

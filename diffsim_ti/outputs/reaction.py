@@ -27,8 +27,8 @@ class Reaction(Output):
     So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero where
     supports share no vertices, or hold them in directions perpendicular to each other.
     What obstacles and self-contact do to fixed vertices themselves is not in it (ContactForce has the first,
-    SelfContactForce the second), nor is the inertia of vertices that a prescribed motion accelerates. An incompressible fluid pushes with what `ChamberPressure`
-    says of it.
+    SelfContactForce the second), nor is the inertia of vertices that a prescribed motion accelerates. An incompressible
+    fluid pushes with what `ChamberPressure` says of it.
 
     support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
         Or a `Tie` of the scene: the force on its surface b, which acts on the vertices there where no support holds them,

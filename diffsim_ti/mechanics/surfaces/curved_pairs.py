@@ -10,7 +10,6 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.surfaces.buffers import Launches
 from diffsim_ti.mechanics.surfaces.curved_friction import CurvedLaggedFriction
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleCorners, ObstacleMotion, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
@@ -145,8 +144,7 @@ class CurvedPairs:
         self._u, self._w, self._blocks = (runtime.array(vector, k, surface.num_vertices) for k in (1, 1, 3))
         self._row, self._rest_dot = runtime.array(vector, 1, n), runtime.array(vector, surface.num_vertices)
         self.step, self.next = runtime.array(vector, 1, n), runtime.array(vector, 1, n)
-        self._launch = Launches()
-        self.launch = self._launch.run
+        self._launch, self.launch = self.inner.list.launch, self.inner.launch  # cleared where arrays of the list are others
         self.friction = CurvedLaggedFriction(self) if self.inner.friction else None
 
     # ---- between nodes and points ------------------------------------------------------------------------------------
@@ -237,7 +235,6 @@ class CurvedPairs:
         return self.inner.look(self.fine(u, 0))
 
     def unbind(self) -> None:
-        self._launch.clear()
         self.inner.unbind()
 
     def forces(self, u, slot: int, out, exact: bool = False) -> None:

@@ -270,7 +270,5 @@ class DeviceNewton:
         report.residuals += runtime.fetch(self.history)[: int(state[nk.ROUND])].tolist()
         for name, place in nk.COUNTED.items():
             setattr(report, name, getattr(report, name) + int(state[place]))
-        if state[nk.CUTS]:
-            report.met = self.detection.read()
         newton.upright = state[nk.UPRIGHT] == 1
         return self._here() if solved else runtime.fetch(self.u).astype(np.float64)

@@ -383,7 +383,7 @@ class Newton:
     def _safe_share(self, u, d) -> float:
         """The longest step along d in which surfaces stay apart, from obstacles and from each other."""
         pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
-        free, self.report.met = self.collisions(u, d, most)
+        free = self.collisions(u, d, most)[0]
         free = min(free, pairs.safe_share(u, d, free)) if pairs else free
         self.report.cuts += free < 1
         return free

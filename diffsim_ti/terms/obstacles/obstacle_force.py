@@ -254,14 +254,6 @@ class ObstacleForce(VertexForce):
         for m, target in enumerate(by):
             assign(target, self.vector_of([row[m] for row in rows]))
 
-    @traced
-    def force_by_corners(self, parameters, first, X, u, parameters_dot):
-        """Change of the force for those of its corners."""
-
-    @traced
-    def add_by_corners(self, parameters, first, X, u, w, sums, i):
-        """Add to sums[.., i] the adjoints of its corners for the adjoint w of the force."""
-
     # ---- friction as a stage of explicit passes ----------------------------------------------------------------------
 
     @traced
