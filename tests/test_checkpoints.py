@@ -245,7 +245,7 @@ def test_backward_after_an_exception(options):
 @by_options
 def test_an_interrupted_sweep(monkeypatch, options):
     """Ctrl-C in the middle of a sweep leaves nothing behind."""
-    from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
+    from diffsim_ti.solvers.explicit.sweeps import ExplicitAdjoint
 
     r = rollout(**options)
     frames, calls, reverse = r.forward(), [], ExplicitAdjoint.reverse

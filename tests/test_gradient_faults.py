@@ -14,7 +14,7 @@ from diffsim_ti.materials.stable_neo_hookean import StableNeoHookeanLaw
 from diffsim_ti.mechanics.obstacles.contact_stage import ContactStage
 from diffsim_ti.runtime import traced
 from diffsim_ti.solvers.explicit import vertex_parts
-from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
+from diffsim_ti.solvers.explicit.sweeps import ExplicitAdjoint
 from diffsim_ti.terms.obstacles.ground import GroundForce
 
 # ---- mutations: each must fail the dot-product test or the table of gradients -----------------------------------------

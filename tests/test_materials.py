@@ -203,7 +203,7 @@ def norm(A):
 def test_stress_and_differential_are_the_derivatives_of_the_documented_energy(material, kind):
     H, dH = states(kind) - np.eye(3), directions(len(states(kind)))
     got, (psi, P, dP) = evaluate(material, H, dH), oracle(material, H, dH)
-    # gate 1e-10 of REFERENCES.md, relative to the stiffness times 1, the size of F, where the stress itself vanishes
+    # gate 1e-10, relative to the stiffness times 1, the size of F, where the stress itself vanishes
     assert np.all(np.abs(got.psi - psi) <= 1e-12 * (np.abs(psi) + E))
     assert np.all(norm(got.P - P) <= 1e-12 * (norm(P) + E))
     assert np.all(norm(got.dP - dP) <= 1e-10 * norm(dP))

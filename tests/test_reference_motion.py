@@ -1,4 +1,4 @@
-"""Motion against closed forms (REFERENCES.md): oscillators, free fall, momentum, patch test, modes, waves, contact."""
+"""Motion against closed forms: oscillators, free fall, momentum, patch test, modes, waves, contact."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the library takes from its host: import, start-up, memory, kernels, files (TORTURE.md 70, 71; design, section 3)."""
+"""What the library takes from its host: import, start-up, memory, kernels, files."""
 
 import gc
 import os

@@ -1,4 +1,4 @@
-"""The stable step: bounds, the tight limit, refusals, and runs that go wrong (TORTURE.md 22-24, 28, 66)."""
+"""The stable step: bounds, the tight limit, refusals, and runs that go wrong."""
 
 import pickle
 import re

@@ -44,8 +44,8 @@ app = typer.Typer(
     "in one line on stderr; 130 interrupted.",
 )
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
-measuring = study.chart, study.stability, study.growth, study.recommend, study.sweep, identify, fit, selftest
-for command in (*measuring, view.render, view.view):
+measuring = study.chart, study.stability, study.growth, study.recommend, study.sweep
+for command in (*measuring, view.render, view.view, identify, fit, selftest):
     app.command()(command)
 
 

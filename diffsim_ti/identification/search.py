@@ -252,6 +252,8 @@ def l_bfgs_b(search: Search, record: Callable, tolerance: float) -> tuple[str, b
     )
     if len(costs) > SMALL_STEPS and costs[-1 - SMALL_STEPS] - costs[-1] < SMALL_STEPS * least:
         return "converged", True
+    if found.status == 0:  # at a minimum to rounding
+        return "converged", True
     return f"L-BFGS-B finds no lower cost ({found.message})", False
 
 

@@ -246,7 +246,8 @@ class Material(metaclass=Public):
         """The components of some numbers, one after the other, each of shape () or (num_tetrahedra,)."""
         columns = []
         for name in names:
-            value, shape = np.asarray(values[name], np.result_type(values[name], np.float64)), self.shape_of(name)
+            value, shape = np.asarray(values[name]), self.shape_of(name)
+        value = value.astype(np.result_type(value, np.float64), copy=False)
             columns += [value[..., k] for k in range(shape[0])] if shape else [value]
         return columns
 

@@ -26,7 +26,10 @@ class PatchLaw(Law):
                 'take volume="tetrahedra"'
             )
         if not self.base.has_dilatation:
-            name = type(getattr(self.base, "added", self.base)).__name__
+            law = self.base
+            while hasattr(law, "base"):
+                law = law.base
+            name = type(law).__name__
             raise ValueError(
                 f'volume="patches" averages the part lam/2 theta^2 of an energy, but {name} does not say what its theta is; '
                 'write theta(H) and make lam its last coefficient, or take volume="tetrahedra"'

@@ -1,6 +1,6 @@
-"""Loads, contacts and damping: one per file."""
+"""Loads, contacts, damping, robots: what a user declares."""
 
-from diffsim_ti.terms.body_forces import Drag, Gravity, RotatingFrame
+from diffsim_ti.terms.whole_body import Drag, Gravity, RotatingFrame
 from diffsim_ti.terms.chambers import Chamber, FilledChamber, GasChamber
 from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.growth import Growth

@@ -1,5 +1,5 @@
-"""Arrows, lines, points and cones as lit triangles; how long arrows are; the key that says what they mean, other words,
-and the colour bar."""
+"""Arrows, lines, points and cones as lit triangles; how long arrows are; the key that says what they mean, the
+legend's words, and the colour bar."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache

@@ -2,7 +2,7 @@
 
 Space plays and pauses, the arrows step, R goes to the first frame, W shows edges, C changes the colours, S saves; the right
 button turns, the left one pulls a body that is being simulated, + and - zoom, Escape closes. Frames are drawn as pictures
-are (`Drawing`), so the window shows what a film would. Below stands what takes hold of a body.
+are (`Drawing`), so the window shows what a film would. At the end: what takes hold of a body with the mouse.
 """
 
 import time

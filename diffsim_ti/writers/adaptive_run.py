@@ -123,9 +123,8 @@ class ForwardRun:
         self.frame_time = self.parts * solver.dt
         ws = self.simulator.workspace
         self._balance = ws.balance()
-        self.drift: float | None = (
-            None if self._balance is None else 0.0
-        )  # [J], the steps' own (monitor/energy_balance.py)
+        # [J], the steps' own (monitor/energy_balance.py)
+        self.drift: float | None = None if self._balance is None else 0.0
         self._start = ws.history(1)
         ws.save(self._start, 0)
         ws.advance(0, 1, solver.num_passes(1))  # compiles

@@ -1,5 +1,5 @@
 """What formats of animated surfaces share: places of the body's surface and of the obstacles wait until the run is
-over; PLY."""
+over; and PLY files."""
 
 from collections.abc import Iterator
 from pathlib import Path

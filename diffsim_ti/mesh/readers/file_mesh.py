@@ -87,7 +87,7 @@ def beside(path: Path, name: str, says: str, remedy: str, suffix: str = "") -> P
     """The file that another one names, in its folder or below. Raises ValueError where it is not there."""
     target, folder = (path.parent / name).resolve(), path.parent.resolve()
     if not name or not target.is_relative_to(folder) or suffix and target.suffix.lower() != suffix:
-        kind = f"no {suffix} file within its folder" if suffix else "outside of its folder"
+        kind = f"no {suffix} file within its folder" if suffix else f"outside of the folder of {path.name}"
         raise ValueError(f"{says} {name!r}, which is {kind}; {remedy}")
     if not target.is_file():
         raise ValueError(f"{says} {name!r}, which is not there; {remedy}")

@@ -12,7 +12,7 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.mesh.face_points import bow
-from diffsim_ti.terms.body_forces import Gravity
+from diffsim_ti.terms.whole_body import Gravity
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
 from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.shapes import Triangles
