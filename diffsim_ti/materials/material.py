@@ -247,7 +247,7 @@ class Material(metaclass=Public):
         columns = []
         for name in names:
             value, shape = np.asarray(values[name]), self.shape_of(name)
-        value = value.astype(np.result_type(value, np.float64), copy=False)
+            value = value.astype(np.result_type(value, np.float64), copy=False)
             columns += [value[..., k] for k in range(shape[0])] if shape else [value]
         return columns
 

@@ -1,6 +1,5 @@
 """Loads, contacts, damping, robots: what a user declares."""
 
-from diffsim_ti.terms.whole_body import Drag, Gravity, RotatingFrame
 from diffsim_ti.terms.chambers import Chamber, FilledChamber, GasChamber
 from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.growth import Growth
@@ -20,6 +19,7 @@ from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.surface_drag import SurfaceDrag
 from diffsim_ti.terms.term import Term, VertexForce
 from diffsim_ti.terms.tie import Tie
+from diffsim_ti.terms.whole_body import Drag, Gravity, RotatingFrame
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
 LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, Muscle)

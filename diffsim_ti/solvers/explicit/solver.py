@@ -23,9 +23,9 @@ from diffsim_ti.mechanics.reduced.projected_sets import ProjectedSets
 from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance, OwnWork
-from diffsim_ti.solvers.explicit.sweeps import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.explicit.stages import stages_of
+from diffsim_ti.solvers.explicit.sweeps import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.pass_table import PassTable

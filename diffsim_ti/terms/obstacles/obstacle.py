@@ -12,7 +12,6 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.mesh.face_points import bow
-from diffsim_ti.terms.whole_body import Gravity
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
 from diffsim_ti.terms.obstacles.primitives import Primitives
 from diffsim_ti.terms.obstacles.shapes import Triangles
@@ -20,6 +19,7 @@ from diffsim_ti.terms.obstacles.stiffness import approach, over_time, pressed_by
 from diffsim_ti.terms.over_time import Motion
 from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_path
 from diffsim_ti.terms.term import Term, chosen_width, place, positive
+from diffsim_ti.terms.whole_body import Gravity
 
 PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
 STRETCH = 1.2  # of a body's longest edge: how far it may be stretched
