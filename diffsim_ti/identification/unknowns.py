@@ -21,7 +21,7 @@ class Unknown(metaclass=Public):
     """Numbers x of an input, found through free variables t in which no bound exists:
 
         logarithm  x = start exp(t)                      (default where start > 0)
-        bounded    x = low + (high - low) / (1 + e^-s),  s = t + s(start)        (with `range`; |s| is at most 7, but for torch)
+        bounded    x = low + (high - low) / (1 + e^-s),  s = t + s(start)    (with `range`; |s| is at most 7, but of torch)
         linear     x = start + scale t                   (with `scale`, and where start <= 0)
 
     start: a guess, one number or one per group, or of the input's shape, which then are numbers of their own. range: (low,

@@ -40,11 +40,11 @@ class MeshObstacle(Obstacle):
     Inputs with gradient: "mesh_position", shape (3,), "mesh_radius", "mesh_vertices", shape (k, 3), if it is shapeable, and
     those of every `Obstacle`, whose other arguments it takes. Implicit steps sum the barrier over all that is nearer than
     its width, what triangles share once: in a crease, where two faces are equally near, both press, and force and energy
-    have no kink. Over flat parts, and convex ones that are thicker than the width and have no edges sharper than 90 degrees, it
-    is the barrier of the distance; of thinner ones the far side presses, too. Explicit steps, friction and gaps go by what is
-    nearest, so that friction in a crease is at most mu times what the nearest part presses with, and the energy of contact
-    that explicit runs report counts all parts. Where what is nearest goes from a face to an edge or a corner the contact's
-    stiffness jumps.
+    have no kink. Over flat parts, and convex ones that are thicker than the width and have no edges sharper than 90 degrees,
+    it is the barrier of the distance; of thinner ones the far side presses, too. Explicit steps, friction and gaps go by
+    what is nearest. So friction in a crease is at most mu times what the nearest part presses with, and the energy of
+    contact that explicit runs report counts all parts. Where what is nearest goes from a face to an edge or a corner the
+    contact's stiffness jumps.
     Raises ValueError for vertices or indices that do not fit.
     Li, Kaufman, Jiang 2023, Convergent Incremental Potential Contact, arXiv:2307.15908.
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
