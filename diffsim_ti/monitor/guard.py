@@ -62,8 +62,8 @@ class Chatter:
 
     Steps that damp nothing let the vibrations of a stiff body grow where it rests on an obstacle: contact opens and
     closes in most substeps, vertices move to and fro as fast as the body slides, and it slides too far. A block of 1 MPa
-    that stopped from 2 m/s on mu = 0.7 went 5 % too far, one of 10 MPa 0.5 %; with a KelvinVoigt time of a tenth of the stable
-    step, -0.15 %.
+    that stopped from 2 m/s on mu = 0.7 went 5 % too far, one of 10 MPa 0.5 %; with a KelvinVoigt time of a tenth of the
+    stable step, -0.15 %.
     """
 
     def __init__(self, workspace):
