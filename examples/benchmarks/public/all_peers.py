@@ -177,7 +177,7 @@ def measured(peers: dict, quick: bool, folder: Path) -> dict:
     found = compare_peers.accuracy(others, quick, folder, cubes=(4, 8, 12), time=0.02)
     size, vertices = (1_000, 7) if quick else (10_000, 13)
     found[f"Equilibrium of a beam of {size:,} tetrahedra"] = beam(peers, size)
-    found[f"Stretch of a plate to ten times its length, {15 * vertices**2:,} unknowns"] = stretch(peers, vertices)
+    found[f"Stretch of a plate to ten times its thickness, {15 * vertices**2:,} unknowns"] = stretch(peers, vertices)
     return found
 
 
