@@ -184,7 +184,7 @@ def main(quick: bool, peers) -> list:
         "off [%]",
     )
     notes = "" if python else f"torch-fem is left out: {reason.rstrip('.')}."
-    report("torch_fem_suite", head, rows, quick, notes, **(work.versions("torch-fem") if python else {}))
+    report("torch_fem_suite", head, rows, quick or not peers, notes, **(work.versions("torch-fem") if python else {}))
     return rows
 
 
