@@ -35,7 +35,7 @@ def versions(*names: str) -> dict[str, str]:
     return {package: version for package, version in pins if package != "numpy"}
 
 
-def ran(command, timeout: float = 600.0, **environment: str) -> tuple[str, str]:
+def ran(command, timeout: float = 3600.0, **environment: str) -> tuple[str, str]:
     """(what a command prints, why it failed or "")"""
     try:
         words = list(map(str, command))
