@@ -35,11 +35,10 @@ NONE = np.zeros((0, 3), int)
 
 
 class Meshes:
-    """Meshes by their names in the paper's repository, of folders, of which the first has the paper's, or of our own."""
+    """Meshes by their names in the paper's repository, of the first folder that has them, or of our own."""
 
-    def __init__(self, folder: str | None = None, *more: str):
-        self.folder = None if folder is None else Path(folder)
-        self.folders = [Path(f) for f in (folder, *more) if f is not None]
+    def __init__(self, *folders: str):
+        self.folders = [Path(f) for f in folders]
 
     def __call__(self, name: str) -> ds.TetrahedralMesh:
         for folder in self.folders:
@@ -51,20 +50,25 @@ class Meshes:
 
     def arch(self) -> list[ds.TetrahedralMesh]:
         """Blocks, one after the other from foot to foot."""
-        if self.folder is not None:
-            blocks = [self(f"arch/{path.stem}") for path in sorted((self.folder / "arch").glob("*.msh"))]
-            return [shrunk(block, 0.005) for block in blocks]  # they touch each other
+        for folder in self.folders:
+            if found := sorted((folder / "arch").glob("*.msh")):
+                return [shrunk(self(f"arch/{path.stem}"), 0.005) for path in found]  # they touch each other
+        if self.folders:
+            raise ValueError(f"no arch/*.msh in {', '.join(map(str, self.folders))}")
         return _half_ring(blocks=7, inner=1.0, outer=1.4, gap=0.004)
 
     def surface(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(vertices, triangles) of NAME.obj."""
-        if self.folder is None:
+        if not self.folders:
             if name == "funnel":
                 return _funnel()
             mesh = self(name)
             return mesh.vertices, mesh.surface_triangles
+        file = next((f for folder in self.folders if (f := folder / f"{name}.obj").exists()), None)
+        if file is None:
+            raise ValueError(f"no {name}.obj in {', '.join(map(str, self.folders))}")
         vertices, triangles = [], []
-        for line in (self.folder / f"{name}.obj").read_text().splitlines():
+        for line in file.read_text().splitlines():
             words = line.split()
             if words[:1] == ["v"]:
                 vertices.append([float(x) for x in words[1:4]])
@@ -406,7 +410,7 @@ def _arch(friction: float, stands: bool):
             return None if fell != stands else f"its key stone went down by {fall:.3g} m"
 
         contact = ds.SelfContact(0.1 * weight / width, width, friction=friction)
-        E = 2e10 if meshes.folder else 1e7
+        E = 2e10 if meshes.folders else 1e7
         return posed(blocks, E, 0.4, 0.01, 200, contact=contact, fixed=feet, expected=expected)
 
     return make
@@ -566,7 +570,7 @@ def knives(meshes: Meshes) -> Posed:
 
 def _cushion(as_segments: bool):
     def make(meshes: Meshes) -> Posed:
-        n, ball = (21, 10) if meshes.folder else (5, 3)
+        n, ball = (21, 10) if meshes.folders else (5, 3)
         body = _ball(ball, radius=0.4)
         grid = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, n)] * 2, indexing="ij"), -1).reshape(-1, 2)
         beds = []
@@ -604,7 +608,7 @@ def funnel(meshes: Meshes) -> Posed:
     """A body is pulled into a tube of 40 mm by what of it is lowest."""
     vertices, triangles = meshes.surface("funnel")
     tube, speed = Surface(vertices, triangles), 0.06
-    if meshes.folder:
+    if meshes.folders:
         body = meshes("Armadillo13K")
         body = ds.TetrahedralMesh(body.vertices * (0.15 / np.ptp(body.vertices, 0).max()), body.tetrahedra)
     else:
@@ -639,7 +643,7 @@ def funnel(meshes: Meshes) -> Posed:
 def rollers(meshes: Meshes) -> Posed:
     """A ball that falls is drawn through two pairs of rollers, each of segments around a circle."""
     radius, gap, width, rate = 0.15, 0.25, 2e-3, 1.5
-    body = _ball(10 if meshes.folder else 3, radius=0.25)
+    body = _ball(10 if meshes.folders else 3, radius=0.25)
     angle = 2 * np.pi * np.arange(24) / 24
     circle = radius * np.stack([np.cos(angle), np.sin(angle)], 1)
     pairs = []
@@ -682,7 +686,7 @@ def rollers(meshes: Meshes) -> Posed:
 @scene("rods")
 def rods(meshes: Meshes) -> Posed:
     """Four rods side by side, both ends of all turned against each other about what is between them, 0.2 turns a second."""
-    n, long = (5, 41) if meshes.folder else (3, 17)
+    n, long = (5, 41) if meshes.folders else (3, 17)
     rod = ds.TetrahedralMesh.create_box((long, n, n), size=(1.0, 0.08, 0.08)).translated([-0.5, -0.04, -0.04])
     bodies = [rod.translated([0, 0.045 * y, 0.045 * z]) for y in (-1, 1) for z in (-1, 1)]
     x = np.concatenate([body.vertices for body in bodies])
@@ -728,7 +732,7 @@ def row(run: Run) -> list[str]:
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--meshes", nargs="+", default=(), help="folders of meshes, first that of the paper's")
+    parser.add_argument("--meshes", nargs="+", default=(), help="folders of meshes, searched in this order")
     parser.add_argument("--scene", nargs="+", default=None, help="names, or what they begin with")
     parser.add_argument("--steps", type=int, default=None, help="at most so many of each scene")
     parser.add_argument("--list", action="store_true", help="print names and end")

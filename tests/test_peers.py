@@ -131,14 +131,16 @@ def test_table_and_picture_of_equal_accuracy(tmp_path):
 
 
 def test_peers_are_installed_apart_or_left_out_with_the_reason(tmp_path, monkeypatch, capsys):
+    """No version of NumPy is among those of peers, for ours stands beside them."""
     answers = {"JAX": ("python of JAX", ""), "Warp": ("", "no such version")}
     monkeypatch.setattr(
         compare_peers, "environment", lambda folder, name, *pins: answers[{"jax": "JAX", "warp": "Warp"}[name]]
     )
-    assert compare_peers.interpreters(tmp_path, ["JAX", "Warp"]) == {"JAX": "python of JAX"}
+    pythons, reasons = compare_peers.interpreters(tmp_path, ["JAX", "Warp"])
+    assert pythons == {"JAX": "python of JAX"} and reasons == ["Warp is left out: no such version."]
     told = capsys.readouterr().out
     assert f"JAX: {work.PINNED['JAX'][0]}" in told and "Warp is left out: no such version" in told
-    assert set(work.PEERS) <= set(work.PINNED)
+    assert set(work.PEERS) <= set(work.PINNED) and list(work.versions("Warp")) == ["warp-lang"]
 
 
 def test_ratios_are_at_the_error_that_both_reach(tmp_path):
@@ -155,6 +157,23 @@ def test_ratios_are_at_the_error_that_both_reach(tmp_path):
     assert cells[0][0] == "fast" and cells[0][-1] == "0.5" and "JAX 1.41 times as long, times or over 2.8, of 2" in said
     all_peers.draw(found, rows, tmp_path / "all.png")
     assert (tmp_path / "all.png").stat().st_size > 10_000
+    assert all_peers.unsolved(found) == ['Warp did not solve "slow".']
+
+
+@pytest.mark.parametrize("words", [["--scenes", "1"], ["--tools", "Newton"], ["--show"], ["--quick"], []])
+def test_a_partial_run_leaves_the_page(words, tmp_path, monkeypatch):
+    """So does a run without --peers; with it, and all else as it comes, the table is written."""
+    put = []
+    monkeypatch.setattr(table, "put", lambda name, text: put.append(text))
+    monkeypatch.setattr(gradient_quality, "interpreters", lambda *_: ({"Newton": ""}, ["torch-fem is left out: no."]))
+    monkeypatch.setattr(gradient_quality, "measured", lambda *_: ([], ["a task, Newton: not done"]))
+    for peers in [], ["--peers", str(tmp_path)]:
+        monkeypatch.setattr(sys, "argv", ["gradient_quality.py", *words, *peers])
+        gradient_quality.main()
+    assert len(put) == (not words)
+    if put:
+        said = " ".join(put[0].split())
+        assert "torch-fem is left out: no. a task, Newton: not done." in said and "newton 1.8.0" in said
 
 
 def test_differences_of_order_six():
@@ -165,6 +184,8 @@ def test_differences_of_order_six():
     assert sixth == pytest.approx([5.0]) and abs(fourth[0] - 5.0) > 1
     exact = np.array([1.0, 2.0, -1.0])
     assert gradient_quality.compared(1.5 * exact, exact, exact) == pytest.approx((1.0, 0.5, 0.0))
+    words = [gradient_quality.off_one(x) for x in (0.0, -2.2e-16, 3e-9, 0.5, np.nan)]
+    assert words == ["1", "1", "1 - 3e-09", "0.50", "not finite"]
 
 
 @pytest.mark.parametrize("task", gradient_quality.TASKS[3:5], ids=lambda task: task.name)
@@ -182,9 +203,3 @@ def test_identifications_of_diffpd(capsys):
     assert runs[0] and 4 <= runs[1] <= 40
     rows = diffpd_identification.rows_of({"cantilever": {"one": [runs], "none": [(False, 150, 9.0)]}})
     assert rows[0][2] == "1 of 1" and rows[1][2:] == ["0 of 1", "", ""]
-
-
-def test_every_table_of_these_scripts_has_marks_on_the_page():
-    page = table.PAGE.read_text()
-    for name in ("diffpd_identification", "gradient_quality", "all_peers"):
-        assert f"<!-- {name} -->" in page and f"<!-- end of {name} -->" in page

@@ -47,12 +47,40 @@ def test_a_peer_says_why_it_did_not_run(tmp_path, monkeypatch):
     assert table.asked(sys.executable, script) == {"error": "no such device"}
     assert "absent.py" in table.asked(sys.executable, script.with_name("absent.py"))["error"]
     monkeypatch.setattr(sys, "executable", "false")  # the command
-    assert table.environment(tmp_path, "none", "a-package==1.0") == ("", "pip failed")
+    assert table.environment(tmp_path, "none", "a-package==1.0") == ("", "it failed and gave no reason")
+
+
+def test_the_reason_is_what_pip_calls_an_error(tmp_path):
+    """The lines after it are hints; and a last line that is not JSON is no answer."""
+    script = tmp_path / "pip.py"
+    script.write_text("import sys; sys.exit('looking\\nERROR: no such file\\n\\nHint: It looks like a path')")
+    assert table.asked(sys.executable, script) == {"error": "ERROR: no such file"}
+    script.write_text("print('done')")
+    assert table.asked(sys.executable, script) == {"error": "its last line is not JSON: 'done'"}
+    script.write_text("import time; time.sleep(60)")
+    assert table.asked(sys.executable, script, timeout=0.5)["error"].startswith("not done after")
+
+
+def test_meshes_are_searched_in_all_folders(tmp_path):
+    """As they lie in the paper's repository; what is in none is said and ends no run."""
+    surfaces = tmp_path / "surfaces"
+    surfaces.mkdir()
+    (surfaces / "spike.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    meshes = ipc_corpus.corpus.Meshes(str(tmp_path), str(surfaces))
+    vertices, triangles = meshes.surface("spike")
+    assert vertices.shape == (3, 3) and triangles.tolist() == [[0, 1, 2]]
+    for name, lacking in (("spike on wedge.obj", "no wedge.obj in"), ("arch, friction 0.5", "no arch/")):
+        assert ipc_corpus.result(name, meshes, 1, 1.0).startswith(f"not posed: {lacking}")
+    nothing = ipc_corpus.corpus.Meshes()
+    assert ipc_corpus.result("spike on hole.obj", nothing, 1, 1.0) == "needs a surface of the paper's repository"
 
 
 def test_every_table_of_these_scripts_has_marks_on_the_page():
     page = table.PAGE.read_text()
-    for name in ("torch_fem_suite", "ipc_corpus", "vbd_beam", "vbd_contrast", "closed_forms"):
+    names = (
+        "torch_fem_suite ipc_corpus vbd_beam vbd_contrast closed_forms diffpd_identification gradient_quality all_peers"
+    )
+    for name in names.split():
         assert f"<!-- {name} -->" in page and f"<!-- end of {name} -->" in page
 
 

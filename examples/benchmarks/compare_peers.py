@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np
 from peers import work
-from public.table import environment
 from speed import BATCH_STEPS, SUBSTEPS, H, common_rollout, measure, measure_batch
 
 import diffsim_ti as ds
@@ -30,20 +29,26 @@ from diffsim_ti.study import chart, charts, pareto_front, problem, problems
 from diffsim_ti.study.problem import FrameLoss, Problem
 from diffsim_ti.study.work_precision import reference
 
+sys.path.insert(0, str(Path(__file__).parent / "public"))
+from table import environment  # noqa: E402
+
 ROOT = Path(__file__).parents[2]
 EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
 ERRORS = (1e-2, 1e-3)
 
 
-def interpreters(folder: Path, names) -> dict[str, str]:
-    """{peer: interpreter} of those that install into folder, each with its versions; of the others the reason is printed."""
-    out = {}
+def interpreters(folder: Path, names) -> tuple[dict[str, str], list[str]]:
+    """({peer: interpreter} of those that install into folder, sentences why the others do not); both are printed."""
+    out, reasons = {}, []
     for who in names:
         python, reason = environment(folder, who.lower(), *work.PINNED[who])
-        print(f"{who} is left out: {reason}" if reason else f"{who}: {', '.join(work.PINNED[who])}", flush=True)
+        said = f"{who} is left out: {reason.rstrip('.')}." if reason else f"{who}: {', '.join(work.PINNED[who])}"
+        print(said, flush=True)
         if python:
             out[who] = python
-    return out
+        else:
+            reasons.append(said)
+    return out, reasons
 
 
 # ---- equal steps --------------------------------------------------------------------------------------------------------
@@ -142,7 +147,7 @@ def drop(gradient: bool = False, duration: float = 0.05) -> Problem:
     return replace(
         out,
         name="drop-gradient",
-        title="Gradient by E of where that bunny is then",
+        title="Gradient by E of the mean height of a bunny that meets a floor",
         quantity=lambda _, g: np.atleast_1d(g["youngs_modulus"]),
         adjoint=mean,
         inputs=("youngs_modulus",),
@@ -293,7 +298,7 @@ def main() -> None:
     options = parser.parse_args()
     ds.init(precision="f32")
     if options.peers:
-        peers = interpreters(options.peers, work.PEERS)
+        peers, _ = interpreters(options.peers, work.PEERS)
     else:
         peers = dict.fromkeys(work.installed(options.peer_python), options.peer_python)
         print("peers:", ", ".join(peers) or "none is installed; see --peers")

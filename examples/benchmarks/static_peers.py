@@ -5,19 +5,18 @@
 The beam of implicit_steps.py, E = 5e6 Pa, in float64, hangs from one end under its weight, in one load step. All that a
 solve sets up is timed, compiling is not (the best of some repetitions in one process). CHOLMOD is taken where scikit-sparse
 is installed. PYTHON: an interpreter whose environment holds the peer, which runs in a process of its own (peers/). Each
-chooses its linear solver by itself, JAX-FEM by PETSc. BLAS has one thread. Prints a table in Markdown, with the largest
-difference from ours in shares of the largest displacement.
+chooses its linear solver by itself, JAX-FEM by PETSc. Peers may use all cores; of ours BLAS has one thread, as the factors
+have. Prints a table in Markdown, with the largest difference from ours in shares of the largest displacement.
 """
 
 import argparse
-import os
-import subprocess
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 from implicit_steps import TOLERANCE, DirectEuler, beam, print_table, scene_of
+from peers import work
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
@@ -25,7 +24,6 @@ import diffsim_ti as ds
 
 PEERS = Path(__file__).parent / "peers"
 E = 5e6  # Pa; Newton's method with factors alone does not find what hangs farther
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 def best(solve, repeats: int) -> tuple:
@@ -103,9 +101,9 @@ def asked(script: str, python: str, job: dict) -> tuple | None:
     with tempfile.TemporaryDirectory() as folder:
         paths = [str(Path(folder) / name) for name in ("job.npz", "answer.npz")]
         np.savez(paths[0], **job)
-        done = subprocess.run([python, str(PEERS / script), *paths], capture_output=True, env=os.environ | ONE_THREAD)
-        if done.returncode:
-            print(f"{script}: {done.stderr.decode()[-300:]}")
+        _, why = work.ran([python, PEERS / script, *paths])
+        if why:
+            print(f"{script}: {why}")
             return None
         with np.load(paths[1]) as answer:
             return float(answer["seconds"]), answer["displacements"]

@@ -1,5 +1,6 @@
 """Jobs for the peers made from scenes and problems of diffsim_ti, the peers run on them, their errors."""
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -26,6 +27,26 @@ PINNED = {
     "Newton": ("newton==1.8.0", "warp-lang==1.19.0"),
     "torch-fem": ("torch==2.13.0", "torch-fem==0.14.0"),
 }
+
+
+def versions(*names: str) -> dict[str, str]:
+    """{package: version} of what these peers are measured with; NumPy's is left to ours."""
+    pins = (pin.split("==") for who in names for pin in PINNED[who])
+    return {package: version for package, version in pins if package != "numpy"}
+
+
+def ran(command, timeout: float = 3600.0, **environment: str) -> tuple[str, str]:
+    """(what a command prints, why it failed or "")"""
+    try:
+        words = list(map(str, command))
+        said = subprocess.run(words, capture_output=True, text=True, timeout=timeout, env=os.environ | environment)
+    except subprocess.TimeoutExpired:
+        return "", f"not done after {timeout:.0f} s"
+    if not said.returncode:
+        return said.stdout, ""
+    lines = [line for line in said.stderr.splitlines() if line.strip()]
+    named = [line for line in lines if line.startswith("ERROR")]  # pip's; its last lines are hints
+    return said.stdout, (named[:1] or lines[-1:] or ["it failed and gave no reason"])[0]
 
 
 def installed(python: str) -> list[str]:
@@ -75,10 +96,10 @@ def ask(who: str, python: str, jobs: list[dict]) -> list[dict]:
             np.savez(path, **job)
         answers = []
         for path in paths:  # a process each: one that fails leaves the others
-            done = subprocess.run([python, str(script), str(path)], capture_output=True, text=True)
+            _, why = ran([python, script, path])
             result = Path(str(path).replace(".job.npz", ".answer.npz"))
-            if done.returncode or not result.exists():
-                print(f"{who}: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
+            if why or not result.exists():
+                print(f"{who}: {why or 'it left no answer'}", file=sys.stderr)
                 answers.append(None)
                 continue
             with np.load(result) as file:

@@ -3,12 +3,13 @@
     python examples/benchmarks/public/closed_forms.py [--quick]
 
 Ten-node tetrahedra, float64. Scenes are those of tests/test_nafems.py, tests/test_quadratic_answers.py and
-examples/benchmarks/error_bars.py, so the tests' dependencies are needed; --quick takes coarser meshes. Seconds are those of
-a run with all that it sets up, once kernels are compiled.
+examples/benchmarks/error_bars.py, so the tests' dependencies are needed (pip install ".[test]"); --quick takes coarser
+meshes. Seconds are those of a run with all that it sets up, once kernels are compiled.
 
-NAFEMS, The Standard NAFEMS Benchmarks, TNSB rev. 3, 1990: LE10, LE11, and FV52, whose plate is that of "thick plate"; its
-target there is the exact frequency of three-dimensional elasticity, 45.971 Hz. No hardware is part of these; targets are
-numbers of theory and of NAFEMS's own converged models, given to three digits. Sources of the others stand with the scenes.
+NAFEMS, The Standard NAFEMS Benchmarks, TNSB rev. 3, 1990: LE10, LE11, and FV52, whose plate is that of "thick plate";
+its target there is the exact frequency of three-dimensional elasticity, 45.971 Hz. No hardware is part of these;
+targets are numbers of theory and of NAFEMS's own converged models, given to three digits. Sources of the others stand
+with the scenes.
 """
 
 import sys

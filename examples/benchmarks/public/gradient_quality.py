@@ -2,26 +2,27 @@
 
     python examples/benchmarks/public/gradient_quality.py [--quick] [--peers FOLDER] [--tools NAME ...]
 
-The measure is that of the Mosaic benchmark of differentiable solvers: the cosine between a tool's gradient and differences
-of what the same tool computes forward, and the size of what they differ by, relative to the differences. So no tool is
-judged by the physics of another: each has its own law, floor and friction, and rounds as it rounds.
+The measure is that of the Mosaic benchmark of differentiable solvers: the cosine between a tool's gradient and
+differences of what the same tool computes forward, and the size of what they differ by, relative to the differences. So
+no tool is judged by the physics of another: each has its own law, floor and friction, and rounds as it rounds.
 
-Four tasks move, by symplectic Euler in steps of 0.1 ms: a block that swings, a beam that is let go under its weight, a block
-that falls flat on a floor, a block that is thrown onto it askew. The loss is a random linear function of the vertices'
-places at the end. Its gradient is by log E and by four random fields of 1 cm of the start. Two tasks are equilibria: a beam
-under random loads, and a block pulled to 1.5 times its length; there the gradient is by log E of three thirds of the body,
-by Poisson's ratio, and by three random fields of load. Differences are central and of order six. How well they are known is
-seven times how far those of order four are from them: where rounding makes that difference, the error of order six is seven
-times as large. In float64 their steps are a tenth as long.
+Four tasks move, by symplectic Euler in steps of 0.1 ms: a block that swings, a beam that is let go under its weight, a
+block that falls flat on a floor, a block that is thrown onto it askew. The loss is a random linear function of the
+vertices' places at the end. Its gradient is by log E and by four random fields of 1 cm of the start. Two tasks are
+equilibria: a beam under random loads, and a block pulled to 1.5 times its length; there the gradient is by log E of
+three thirds of the body, by Poisson's ratio, and by three random fields of load. Differences are central and of order
+six. How well they are known is seven times how far those of order four are from them: where rounding makes that
+difference, the error of order six is seven times as large. In float64 their steps are a tenth as long.
 
-Tools: torch-diffsim's own classes; Newton's soft body (what Warp's own simulator became); a tape over Taichi's kernels, as
-DiffTaichi's examples are written (peers/run_tape.py); torch-fem in statics (JAX-FEM's solver needs PETSc, which pip has to
-build from source). With --peers each is installed into an environment of its own in FOLDER, and what does not install is
-left out with the reason. A row can be made again by itself with --tools, and --show prints each scene.
+Tools: torch-diffsim's own classes; Newton's soft body (what Warp's own simulator became); a tape over Taichi's kernels,
+which is ours, in the manner of DiffTaichi's examples (peers/run_tape.py); torch-fem in statics (JAX-FEM's solver needs
+PETSc, which pip has to build from source). torch-diffsim, Newton and the tape compute in float32, torch-fem in float64.
+With --peers each is installed into an environment of its own in FOLDER, and what does not install is left out with the
+reason. --tools takes some of them, --show prints each scene. The page stays as it is with these, with other --scenes,
+and without --peers.
 """
 
 import contextlib
-import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
@@ -36,7 +37,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 from compare_peers import interpreters  # noqa: E402
 from peers import work  # noqa: E402
-from table import ONE_THREAD, parser, report  # noqa: E402
+from table import parser, report  # noqa: E402
 
 H, STEPS = 1e-4, 100  # [s]; of the tasks that move
 FIELDS, BY_LOG_E, BY_FIELD = 4, 0.03, 3e-4  # of the start; steps of differences: of log E, of a field [m]
@@ -94,7 +95,7 @@ class Moving:
             tetrahedra=self.mesh.tetrahedra,
             start=start,
             velocities=velocity,
-            fixed=self.mesh.vertex_indices("xmin") if self.held else np.zeros(0, int),
+            fixed=self.held_vertices,
             density=1000.0,
             E=E,
             nu=nu,
@@ -168,14 +169,7 @@ def answers(python: str, script: Path, jobs: list[dict], timeout: float = 500.0)
         paths = [Path(folder) / f"{k}.job.npz" for k in range(len(jobs))]
         for path, job in zip(paths, jobs):
             np.savez(path, **job)
-        why = ""
-        try:
-            command = [python, str(script), *map(str, paths)]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=timeout)
-            if done.returncode:
-                why = (done.stderr.strip().splitlines() or ["it failed"])[-1]
-        except subprocess.TimeoutExpired:
-            why = f"not done after {timeout:.0f} s"
+        _, why = work.ran([python, script, *paths], timeout)
         out = []
         for path in paths:
             with contextlib.suppress(OSError), np.load(str(path).replace(".job.", ".answer.")) as file:
@@ -244,7 +238,7 @@ class Still:
     """A task: a body held at one end, under random loads, or pulled at the other end."""
 
     def __init__(self, name: str, cells, size, pulled: float = 0.0):
-        self.name, self.pulled, self.floor = name, pulled, False
+        self.name, self.pulled = name, pulled
         self.mesh = ds.TetrahedralMesh.create_box(np.array(cells) + 1, size, "five")
 
     def job(self, seed: int) -> dict:
@@ -393,7 +387,9 @@ def row_of(numbers: np.ndarray) -> list[str]:
 
 def off_one(x: float) -> str:
     """A cosine by how far it is off one."""
-    return "not finite" if not np.isfinite(x) else f"1 - {x:.0e}" if x < 0.01 else f"{1 - x:.2f}"
+    if not np.isfinite(x):
+        return "not finite"
+    return "1" if x < 1e-15 else f"1 - {x:.0e}" if x < 0.01 else f"{1 - x:.2f}"  # below is rounding
 
 
 HEAD = ["task", "tool", "cosine: median, worst", "error: median, worst", "of the differences", "scenes"]
@@ -406,16 +402,20 @@ def main() -> None:
     options.add_argument("--show", action="store_true", help="each scene by itself")
     given = options.parse_args()
     wanted = [who for who in PEERS if who in given.tools and who in work.PINNED]
-    pythons = {"tape over Taichi": sys.executable} | (interpreters(given.peers, wanted) if given.peers else {})
+    peers, notes = interpreters(given.peers, wanted) if given.peers else ({}, [])
+    pythons = {"tape over Taichi": sys.executable} | peers
     scenes, tasks = (2, TASKS[2:5:2]) if given.quick else (given.scenes, TASKS)  # of each kind one
     rows, said = measured(given.tools, pythons, scenes, given.show, tasks)
-    report("gradient_quality", HEAD, rows, given.quick, " ".join(f"{line}." for line in said))
+    asked = (given.tools, given.scenes) != tuple(map(options.get_default, ("tools", "scenes")))
+    partial = given.quick or given.show or asked or not given.peers
+    notes += [f"{line.rstrip('.')}." for line in said]
+    report("gradient_quality", HEAD, rows, partial, " ".join(notes), **work.versions(*peers))
 
 
 if __name__ == "__main__":
     import os
 
-    os.environ.update(ONE_THREAD)
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
     ds.init("cpu", precision="f64")
     with threadpool_limits(1):
         main()

@@ -2,13 +2,15 @@
 
     python examples/benchmarks/public/ipc_corpus.py [--quick] [--meshes FOLDER ...] [--scene NAME ...] [--minutes 9]
 
-FOLDERs hold the meshes of the paper's repository, as tests/contact_corpus.py says; coarser ones of our own stand for them
-without. Scenes share the minutes: each stops at its share of what is left, and its verdict is "stopped". Scenes are those
-of the paper by Li et al. (doi:10.1145/3386569.3392425) and of Erleben (doi:10.1145/3096239); the paper's repository,
-https://github.com/ipc-sim/IPC, has the MIT licence. Equal: shapes, materials, steps and motions as published, as far as the
-paper says them. Not equal: without FOLDERs the meshes, and the paper's columns are microseconds of a step and tetrahedron
-of its own meshes on its authors' machine, of which we found no name. Seconds are those of the processor, without the step
-that compiles and without the exact judge.
+FOLDERs hold the meshes of the paper's repository, as tests/contact_corpus.py says; of a clone named IPC they are
+IPC/input/tetMeshes/erleben IPC/input/tetMeshes IPC/input/triMeshes/erleben IPC/input/triMeshes. Without them coarser
+meshes of our own take their place. The tests' dependencies are needed: pip install ".[test]". Scenes share the minutes:
+each stops at its share of what is left, and its verdict is "stopped". Scenes are those of the paper by Li et al.
+(doi:10.1145/3386569.3392425) and of Erleben (doi:10.1145/3096239); the paper's repository,
+https://github.com/ipc-sim/IPC, has the MIT licence. Equal: shapes, materials, steps and motions as published, as far as
+the paper says them. Not equal: without FOLDERs the meshes, and the paper's columns are microseconds of a step and
+tetrahedron of its own meshes on its authors' machine, of which we found no name. Seconds are those of the processor,
+without the step that compiles and without the exact judge.
 """
 
 import sys
@@ -45,8 +47,10 @@ def result(name: str, meshes: corpus.Meshes, steps: int | None, seconds: float) 
     except TimeIsUp:
         return last[0]
     except AttributeError:
+        if meshes.folders or not name.endswith(".obj"):
+            raise
         return "needs a surface of the paper's repository"
-    except (ValueError, TypeError, RuntimeError) as error:
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
         return f"not posed: {error}"
 
 
@@ -65,13 +69,15 @@ def main(quick: bool, folders=(), names=None, minutes: float = 9.0) -> tuple[lis
         shown = [name, *[""] * (len(corpus.HEAD) - 2), found] if isinstance(found, str) else corpus.row(found)
         rows.append(["" if cell == "nan" else cell for cell in shown])
         print(f"{name}: {rows[-1][-1]}", file=sys.stderr, flush=True)
-    report("ipc_corpus", corpus.HEAD, rows, quick or names is not None)
+    where = "the meshes of the paper's repository" if folders else "coarser meshes of our own"
+    notes = f"On {where}, all scenes within {minutes:g} minutes."
+    report("ipc_corpus", corpus.HEAD, rows, quick or names is not None, notes)
     return rows, runs
 
 
 if __name__ == "__main__":
     arguments = parser(__doc__, peers=False)
-    arguments.add_argument("--meshes", nargs="+", default=(), help="folders of meshes, first that of the paper's")
+    arguments.add_argument("--meshes", nargs="+", default=(), help="folders of meshes, searched in this order")
     arguments.add_argument("--scene", nargs="+", help="names, or what they begin with; the page stays as it is")
     arguments.add_argument("--minutes", type=float, default=9.0, help="for all scenes")
     options = arguments.parse_args()

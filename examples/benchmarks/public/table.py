@@ -9,8 +9,8 @@ import json
 import os
 import platform
 import resource
-import subprocess
 import sys
+import textwrap
 from datetime import date
 from importlib import metadata
 from pathlib import Path
@@ -20,7 +20,9 @@ import diffsim_ti as ds
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
 PAGE = HERE.parent / "README.md"
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+sys.path.insert(0, str(HERE.parent))
+from peers import work  # noqa: E402
 
 
 def parser(description: str, peers: bool = True) -> argparse.ArgumentParser:
@@ -37,32 +39,26 @@ def environment(folder: Path, name: str, *pins: str) -> tuple[str, str]:
     home = folder.resolve() / name
     python, done = home / "bin" / "python", home / "installed.txt"
     if not done.exists() or done.read_text() != "\n".join(pins):
-        for command in ([sys.executable, "-m", "venv", home], [python, "-m", "pip", "install", "-q", *pins]):
-            said = subprocess.run(list(map(str, command)), capture_output=True, text=True)
-            if said.returncode:
-                return "", (said.stderr.strip().splitlines() or ["pip failed"])[-1]
+        install = [python, "-m", "pip", "install", "-q", "--disable-pip-version-check", *pins]
+        for command in ([sys.executable, "-m", "venv", home], install):
+            _, why = work.ran(command, 1500)
+            if why:
+                return "", why
         done.write_text("\n".join(pins))
     return str(python), ""
 
 
-def asked(python: str, script: Path, *arguments, timeout: float = 1500, env: dict | None = None) -> dict:
+def asked(python: str, script: Path, *arguments, timeout: float = 1500) -> dict:
     """The last line that a script prints, read as JSON, from a process of its own; {"error": reason} if it fails."""
-    command = [python, str(script), *map(str, arguments)]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    printed, why = work.ran([python, script, *arguments], timeout, PYTHONPATH=path)
+    last = (printed.strip().splitlines() or [""])[-1]
+    if why:
+        return {"error": why}
     try:
-        said = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-            env=os.environ | dict(PYTHONPATH=path) | (env or {}),
-        )
-    except subprocess.TimeoutExpired:
-        return {"error": f"not done after {timeout:.0f} s"}
-    lines = said.stdout.strip().splitlines()
-    if said.returncode or not lines:
-        return {"error": ([line for line in said.stderr.splitlines() if line.strip()] or ["it printed nothing"])[-1]}
-    return json.loads(lines[-1])
+        return json.loads(last)
+    except json.JSONDecodeError:
+        return {"error": f"its last line is not JSON: {last[:80]!r}" if last else "it printed nothing"}
 
 
 def peak_memory() -> float:
@@ -115,8 +111,11 @@ def put(name: str, text: str, page: Path | None = None) -> None:
 
 
 def report(name: str, head, rows, quick: bool, notes: str = "", **peers: str) -> None:
-    """Print a table with what it was measured on, and put it on the page unless it was a quick run."""
-    text = f"{markdown(head, rows)}\n\n{notes + ' ' if notes else ''}{circumstances(**peers)}"
+    """Print a table with what it was measured on, and put it on the page unless it was a quick or a partial run."""
+    said = textwrap.fill(
+        f"{notes} {circumstances(**peers)}".strip(), 120, break_long_words=False, break_on_hyphens=False
+    )
+    text = f"{markdown(head, rows)}\n\n{said}"
     print(text, flush=True)
     if not quick:
         put(name, text)
