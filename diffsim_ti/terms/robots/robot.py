@@ -55,7 +55,9 @@ class Robot(GivenOverTime, Term):
     Algorithms.
     """
 
-    def __init__(self, model: RobotModel, inputs: Sequence[Input], targets: OverTime, name: str):
+    def __init__(self, model: RobotModel, inputs: Sequence[Input] = (), targets: OverTime = 0.0, name: str = "robot"):
+        if not isinstance(model, RobotModel):
+            raise TypeError("Robot is made by Robot.from_urdf(path)")
         self.model, self.shape = model, (model.size,)
         self.prescribed, self.damping = np.zeros(model.size, bool), np.zeros(model.size)
         self.companions: tuple[Obstacle, ...] = ()
@@ -93,8 +95,12 @@ class Robot(GivenOverTime, Term):
         Raises ValueError for joints of other kinds, mimic joints, closed loops, dry friction, joints that carry no mass, and
         files that cannot be read; ImportError without Pinocchio.
         """
-        urdf = Urdf(path)
-        model = RobotModel(urdf.text, np.asarray(base, np.float64))
+        urdf, pose, known = Urdf(path), np.asarray(base, np.float64), LinkContact.__annotations__
+        if pose.shape not in ((3,), (6,), (7,)) or not np.isfinite(pose).all():
+            raise ValueError(f"Robot.from_urdf: base must be 3, 6 or 7 finite numbers, got {base}")
+        if unknown := contact.keys() - known:
+            raise TypeError(f"Robot.from_urdf: no option {min(unknown)!r}; contact of links takes {', '.join(known)}")
+        model = RobotModel(urdf.text, pose)
         m = model.size
         for joint, mass in zip(model.joints, model.masses):
             if not mass > 0:
