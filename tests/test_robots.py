@@ -105,6 +105,16 @@ def test_what_is_not_supported_is_refused(message):
         ds.Robot.from_urdf(text, **options)
 
 
+def test_values_by_names_come_in_the_order_of_the_joints():
+    robot = ds.Robot.from_urdf(
+        ARM, links=(), positions={"elbow": 2.0, "shoulder": 1.0}, torques={"elbow": [3.0, 4.0], "shoulder": 0.5}
+    )
+    assert robot.joints == ("shoulder", "elbow") and robot.values["joint_positions"].tolist() == [1, 2]
+    assert robot.values["joint_torques"].tolist() == [[0.5, 3], [0.5, 4]] and not robot.values["joint_velocities"].any()
+    with pytest.raises(ValueError, match="velocities must name shoulder, elbow, got elbow"):
+        ds.Robot.from_urdf(ARM, velocities={"elbow": 1.0})
+
+
 def test_wrong_calls_are_named():
     with pytest.raises(TypeError, match=r"made by Robot.from_urdf\(path\)"):
         ds.Robot("arm.urdf")

@@ -101,10 +101,6 @@ class JointTangent(JointSweep):
         """A frame has the change of the present state."""
         self.frames.append(np.stack([self.dq, self.dv], 1))
 
-    def rows(self) -> np.ndarray:
-        """Change of the rows of links, the joints staying where the pass ends."""
-        return self.rows_jvp(np.zeros_like(self.dq), self.dq)
-
     def force(self, shares: np.ndarray, held: np.ndarray, du: np.ndarray) -> np.ndarray:
         """Change of -dPhi/dq, body and joints staying where the pass ends, but for its fixed vertices.
 
