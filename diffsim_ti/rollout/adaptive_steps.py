@@ -58,10 +58,7 @@ def adaptive_steps(
     if not solver.order:
         raise ValueError(f"{type(solver).__name__} finds equilibria, whose error no shorter step makes smaller")
     if solver.scene.terms_of(Robot):
-        raise ValueError(
-            "adaptive_steps: errors of robots' joints are not in its measure: give a Rollout the number of steps, and the "
-            "solver substeps="
-        )
+        raise ValueError("adaptive_steps: errors of robots' joints are not in its measure: give the solver substeps=")
     tolerance, steps = number("tolerance", tolerance, unit="m"), whole("steps", steps, 1)
     if of not in ("vertices", "bodies"):
         raise ValueError(f'of must be "vertices" or "bodies", got {shown(of)}')

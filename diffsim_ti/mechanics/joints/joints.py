@@ -224,9 +224,7 @@ class Joints:
             return
         R, size = self._stand(self._predicted(u), u)
         best, stalled = np.inf, 0
-        scale = np.sqrt(
-            np.diag(self.M) / self.h**2 + self.k + self.c / self.h
-        )  # so that no joint hides behind a stiff one
+        scale = np.sqrt(np.diag(self.M) / self.h**2 + self.k + self.c / self.h)  # of joints, some stiff, some light
         for _ in range(self.most):
             noise = self._rounding()
             left = float(np.max(np.abs(R) / (max(1e-13, 4 * self.eps) * size + noise)))

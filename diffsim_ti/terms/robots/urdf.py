@@ -13,9 +13,7 @@ from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 
 MOVING = "revolute", "continuous", "prismatic"
-SHAPES = dict(
-    sphere=("radius",), box=("size",), cylinder=("radius", "length"), mesh=("filename",)
-)  # and what they need
+SHAPES = dict(sphere=("radius",), box=("size",), cylinder=("radius", "length"), mesh=("filename",))
 
 
 def numbers_of(element, name: str, default: str) -> np.ndarray:
@@ -126,10 +124,9 @@ class Urdf:
     def _file(self, name: str, link: str) -> Path:
         """Where a mesh lies: beside the file, and of package://name/path in the nearest folder above that has `path`."""
         folder = Path.cwd() if self.folder is None else self.folder.resolve()
-        inner = (
-            name.removeprefix("package://").split("/", 1)[-1] if "package://" in name else name.removeprefix("file://")
-        )
-        tried = [above / inner for above in ([folder, *folder.parents] if name.startswith("package://") else [folder])]
+        inner, packaged = name.removeprefix("file://").removeprefix("package://"), name.startswith("package://")
+        inner = inner.split("/", 1)[-1] if packaged else inner
+        tried = [above / inner for above in ([folder, *folder.parents] if packaged else [folder])]
         for path in tried:
             if path.is_file():
                 return path
