@@ -232,6 +232,8 @@ def test_advice_works_when_it_is_followed(pressing):
     assert ds.ContactSlip("arm_tip", what="share").settled(pressing).what == "share"
     with pytest.raises(ValueError, match="leave it out"):
         ds.ImplicitEulerSolver(pressing.replace(terms=[*pressing.terms_of(ds.Robot), ds.RotatingFrame([0, 0, 3.0])]))
+    with pytest.raises(ValueError, match="take no robots"):
+        ds.stable_dt(pressing)
     with pytest.raises(ValueError, match="the solver substeps="):
         ds.adaptive_steps(ds.ImplicitEulerSolver(pressing, dt=5e-3), 2, 1e-3)
     ds.Rollout(ds.ImplicitEulerSolver(pressing, dt=5e-3, substeps=2), 2)
@@ -301,7 +303,7 @@ def pressing():
         width=4e-3,
         stiffness_per_area=3e7,
     )
-    tip = robot.poses(q)[0][1]
+    tip = robot.poses(q)["arm_tip"][:3]
     mesh = moved(tip - [0.02, 0.092, 0.03])
     return scene_of(robot, mesh, [ds.Gravity()], fixed="ymin")
 

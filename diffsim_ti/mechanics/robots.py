@@ -33,7 +33,8 @@ class Robots(Interaction):
     def check_solver(self, solver) -> None:
         if not solver.moves_robots:
             raise ValueError(
-                f"{type(solver).__name__}: robots are unknowns of backward Euler steps alone: take ImplicitEulerSolver"
+                f"{type(solver).__name__}: robots are unknowns of backward Euler steps alone: take ImplicitEulerSolver; "
+                "recommend and stable_dt take no robots"
             )
         if self.scene.term(RotatingFrame):
             raise ValueError("robots do not feel a RotatingFrame: leave it out")

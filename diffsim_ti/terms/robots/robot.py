@@ -159,20 +159,21 @@ class Robot(GivenOverTime, Term):
             parts.append(obstacle)
             places.append((obstacle.name, joint, pose))
         self.companions, self.places = tuple(parts), tuple(places)
-        for obstacle, (q, t) in zip(parts, self.poses(self.values["joint_positions"])):
-            obstacle.led = np.concatenate([t, q])
+        for obstacle, pose in zip(parts, self.poses(self.values["joint_positions"]).values()):
+            obstacle.led = pose
 
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints."""
         return self.model.joints
 
-    def poses(self, q: ArrayLike) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(unit quaternion, position [m]) of each of `companions` at joint positions."""
-        return self.poses_of(self.model.kinematics(np.asarray(q, np.float64))[0])
+    def poses(self, q: ArrayLike) -> dict[str, np.ndarray]:
+        """{name of the obstacle: its pose, 7 numbers as of `base`} of links at joint positions."""
+        found = self.poses_of(self.model.kinematics(np.asarray(q, np.float64))[0])
+        return {part.name: np.concatenate([t, turn]) for part, (turn, t) in zip(self.companions, found)}
 
     def poses_of(self, frames: list) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The same of the joints' frames."""
+        """(unit quaternion, position [m]) of each of `companions` for the joints' frames."""
         base = np.array([1.0, 0, 0, 0]), np.zeros(3)
         return [joined(base if joint < 0 else frames[joint], pose) for _, joint, pose in self.places]
 
