@@ -23,8 +23,7 @@ def link_rows(scene: Scene, joint_states: np.ndarray | None) -> dict[str, np.nda
     """{name of the obstacle: its pose, 7 numbers} of the links of all robots, at joint positions in the first column."""
     out, at = {}, 0
     for robot in scene.terms_of(Robot) if joint_states is not None else ():
-        poses = robot.poses(joint_states[at : at + robot.model.size, 0])
-        out |= {part.name: np.concatenate([t, q]) for part, (q, t) in zip(robot.companions, poses)}
+        out |= robot.poses(joint_states[at : at + robot.model.size, 0])
         at += robot.model.size
     return out
 

@@ -84,10 +84,16 @@ WRONG = {
         urdf(link("a", shape='<mesh filename="hand.stl"/>'), link("b", 1.0), joint("j", "revolute", "a", "b", "0 0 0")),
         {},
     ),
-    "must be sphere, box, cylinder or mesh": (
+    "must be one of sphere with radius, box": (
         urdf(link("a", shape="<cone/>"), link("b", 1.0), joint("j", "revolute", "a", "b", "0 0 0")),
         {},
     ),
+    "link 'a': collision geometry must be one of": (
+        urdf(link("a", shape="<sphere/>"), link("b", 1.0), joint("j", "revolute", "a", "b", "0 0 0")),
+        {},
+    ),
+    "joint 'j' needs a <parent> and a <child>": (urdf(link("a"), '<joint name="j" type="revolute"/>'), {}),
+    "base must be 3, 6 or 7 finite numbers": (ARM, dict(base=[0, 0, 0, 1, 0])),
     r"positions must be 2 numbers .*got shape \(3,\)": (ARM, dict(positions=[1, 2, 3])),
 }
 
@@ -97,6 +103,115 @@ def test_what_is_not_supported_is_refused(message):
     text, options = WRONG[message]
     with pytest.raises(ValueError, match=message):
         ds.Robot.from_urdf(text, **options)
+
+
+def test_values_by_names_come_in_the_order_of_the_joints():
+    robot = ds.Robot.from_urdf(
+        ARM, links=(), positions={"elbow": 2.0, "shoulder": 1.0}, torques={"elbow": [3.0, 4.0], "shoulder": 0.5}
+    )
+    assert robot.joints == ("shoulder", "elbow") and robot.values["joint_positions"].tolist() == [1, 2]
+    assert robot.values["joint_torques"].tolist() == [[0.5, 3], [0.5, 4]] and not robot.values["joint_velocities"].any()
+    with pytest.raises(ValueError, match="velocities must name shoulder, elbow, got elbow"):
+        ds.Robot.from_urdf(ARM, velocities={"elbow": 1.0})
+
+
+def test_wrong_calls_are_named():
+    with pytest.raises(TypeError, match=r"made by Robot.from_urdf\(path\)"):
+        ds.Robot("arm.urdf")
+    with pytest.raises(TypeError, match="no option 'frction'; contact of links takes stiffness_per_area"):
+        ds.Robot.from_urdf(ARM, links=(), frction=0.3)
+
+
+def test_a_mirrored_mesh_stays_outside_in(tmp_path):
+    box = ds.TetrahedralMesh.create_box(2, 0.04)
+    rows = [("v", *x) for x in box.vertices] + [("f", *x) for x in box.surface_triangles + 1]
+    (tmp_path / "c.obj").write_text("\n".join(" ".join(map(str, row)) for row in rows))
+    for side in (1, -1):
+        shape = f'<mesh filename="c.obj" scale="1 {side} 1"/>'
+        (tmp_path / "m.urdf").write_text(
+            urdf(link("a"), link("b", 1.0, shape=shape), joint("j", "prismatic", "a", "b", "0 0 0"))
+        )
+        robot = ds.Robot.from_urdf(tmp_path / "m.urdf", width=1e-3, stiffness_per_area=1e7)
+        x = np.array([[0.02, side * 0.05, 0.02], [0.02, side * 0.02, 0.02]])
+        assert np.allclose(robot.companions[0].gap(x, np.eye(1, 7, 3)[0]), [0.01, -0.02])
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize(
+    ("kind", "force", "h", "inertia"), [("prismatic", 0.03, 1e-3, 0.05), ("revolute", 1e-3, 5e-3, 1e-6)]
+)
+def test_a_prescribed_joint_hides_no_light_one(precision, kind, force, h, inertia):
+    """Two branches of one base: rounding of a heavy one that is prescribed is more than all forces on the light one."""
+    heavy, light = (joint(name, kind, "a", name, "0 0 0") for name in "bc")
+    text = urdf(link("a"), link("b", 20.0, 0.0, 20.0), link("c", 0.05, 0.0, 1e-6), heavy, light)
+    targets = np.outer(0.5 + 1e-3 * np.arange(4), [1, 0])
+    given = dict(positions=targets[0], targets=targets, prescribed=["b"], torques=[0, force], links=())
+    scene = scene_of(ds.Robot.from_urdf(text, **given), fixed="ymin").replace(precision=precision)
+    rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=h), 3, outputs=[ds.JointVelocities()])
+    found = rollout.forward()["joint_velocities"][-1]
+    np.testing.assert_allclose(found, [1e-3 / h, 3 * h * force / inertia], rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def wheel():
+    """A link that turns far from the body."""
+    text = urdf(link("a"), link("b", 1.0, shape='<sphere radius="0.01"/>'), joint("j", "revolute", "a", "b", "0 5 0"))
+    robot = ds.Robot.from_urdf(text, width=1e-3, stiffness_per_area=1e7)
+    return ds.ImplicitEulerSolver(scene_of(robot, fixed="ymin"), dt=1e-2)
+
+
+def test_a_run_that_stops_keeps_its_joints_and_has_no_gradient(wheel):
+    rollout = ds.Rollout(wheel, 2, save_every=1, outputs=[ds.JointPositions()], raise_errors=False)
+    frames = rollout.forward(**{"robot.velocities": [400.0]})
+    assert "more than half a turn" in str(frames.error) and not frames["joint_positions"].any()
+    with pytest.warns(UserWarning, match="a run that was stopped is zero"):
+        assert rollout.vjp(frames, joint_positions=np.ones((3, 1)))["robot.velocities"] == 0
+    batch = ds.Batch(wheel, 2, 2, outputs=[ds.JointPositions()])
+    found = batch.forward(**{"robot.velocities": [[1.0], [400.0]]})
+    assert found.alive.tolist() == [True, False]
+    assert found["joint_positions"][0, -1, 0] == pytest.approx(0.02)
+
+
+def test_adjoints_of_joints_are_cut_clipped_and_reported(wheel):
+    run = dict(steps=2, save_every=1, outputs=[ds.JointPositions()])
+    seed = dict(joint_positions=[[0], [0], [3.0]])
+    for options in (dict(health=True), dict(clip=0.5), dict(truncate=1)):
+        rollout = ds.Rollout(wheel, **run, **options)
+        got = rollout.vjp(rollout.forward(), **seed)
+        clipped, cut = "clip" in options, "truncate" in options
+        start = 0.5 if clipped else 0.0 if cut else 3.0
+        assert got["robot.torques"] > 0 and got["robot.positions"] == pytest.approx(start, rel=1e-3)
+        norms, shares = ([row[key] for row in rollout.health] for key in ("norm_position", "scaled"))
+        assert cut or max(norms) > 1 and (min(shares) < 1) == clipped
+
+
+def test_links_stand_where_they_are_when_a_run_goes_on():
+    """A body falls to where a link, and a ball on a path, were when it began."""
+    from diffsim_ti.writers.adaptive_run import ForwardRun
+
+    text = urdf(
+        link("a"),
+        link("b", 1.0, shape='<sphere radius="0.02"/>'),
+        joint("j", "prismatic", "a", "b", "0.03 -0.04 0.03", "1 0 0"),
+    )
+    contact = dict(width=2e-3, stiffness_per_area=1e7)
+    ball = ds.Sphere((0.03, -0.04, 0.03), 0.02, path=lambda t: np.array([3 * t, 0, 0]), **contact)
+    scene = scene_of(
+        ds.Robot.from_urdf(text, velocities=[3.0], **contact), terms=[ball], initial_velocities=[0, -1.0, 0]
+    )
+    solver = ds.ImplicitEulerSolver(scene, dt=1e-2)
+    first, second = ds.Simulator(solver), ds.Simulator(solver)
+    first.run(5)
+    kept = first.state
+    second.resume(kept)
+    for one in (first, second):
+        one.step()
+    np.testing.assert_array_equal(first.positions, second.positions)
+    with pytest.raises(ValueError, match=r"joint_states: expected finite numbers, float64 of shape \(1, 2\)"):
+        second.resume(kept | dict(joint_states=np.zeros((3, 2))))
+    run = ForwardRun(scene, ds.ImplicitEulerSolver, 0.04, dt=1e-2)
+    run.advance()
+    assert run.seen.crossed == 0 and run.seen.gap > 0
 
 
 def test_other_solvers_refuse_and_say_which_takes_robots(monkeypatch):
@@ -115,6 +230,13 @@ def test_advice_works_when_it_is_followed(pressing):
     with pytest.raises(ValueError, match="take what='share'"):
         ds.ContactSlip("arm_tip").settled(pressing)
     assert ds.ContactSlip("arm_tip", what="share").settled(pressing).what == "share"
+    with pytest.raises(ValueError, match="leave it out"):
+        ds.ImplicitEulerSolver(pressing.replace(terms=[*pressing.terms_of(ds.Robot), ds.RotatingFrame([0, 0, 3.0])]))
+    with pytest.raises(ValueError, match="take no robots"):
+        ds.stable_dt(pressing)
+    with pytest.raises(ValueError, match="the solver substeps="):
+        ds.adaptive_steps(ds.ImplicitEulerSolver(pressing, dt=5e-3), 2, 1e-3)
+    ds.Rollout(ds.ImplicitEulerSolver(pressing, dt=5e-3, substeps=2), 2)
     with pytest.raises(ValueError, match="leave out reduced= and Tie"):
         ds.ImplicitEulerSolver(scene_of(ds.Robot.from_urdf(ARM, links=()), reduced={"all": "affine"}))
     far = dict(mesh=moved([1e5, 0, 0]), terms=[ds.Robot.from_urdf(ARM, links=())], fixed="ymin")
@@ -181,7 +303,7 @@ def pressing():
         width=4e-3,
         stiffness_per_area=3e7,
     )
-    tip = robot.poses(q)[0][1]
+    tip = robot.poses(q)["arm_tip"][:3]
     mesh = moved(tip - [0.02, 0.092, 0.03])
     return scene_of(robot, mesh, [ds.Gravity()], fixed="ymin")
 

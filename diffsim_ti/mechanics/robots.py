@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti.inputs.joints import JointRows
 from diffsim_ti.mechanics.interaction import Interaction
+from diffsim_ti.terms.body_forces import RotatingFrame
 from diffsim_ti.terms.robots.robot import Robot
 
 
@@ -32,8 +33,11 @@ class Robots(Interaction):
     def check_solver(self, solver) -> None:
         if not solver.moves_robots:
             raise ValueError(
-                f"{type(solver).__name__}: robots are unknowns of backward Euler steps alone: take ImplicitEulerSolver"
+                f"{type(solver).__name__}: robots are unknowns of backward Euler steps alone: take ImplicitEulerSolver; "
+                "recommend and stable_dt take no robots"
             )
+        if self.scene.term(RotatingFrame):
+            raise ValueError("robots do not feel a RotatingFrame: leave it out")
         if self.scene.reduced:
             raise ValueError("robots do not support reduced sets and ties beside them: leave out reduced= and Tie")
         if self.scene.origin.any():

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from diffsim_ti.common.checked import number
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.output import NOTED, Change, Frames, Output
 from diffsim_ti.scene import Scene
 
 
@@ -56,8 +56,7 @@ class SmoothMaximum(Output):
             raise ValueError(
                 f"SmoothMaximum: sharpness must be at least 1 and scale above zero, got {sharpness}, {scale}"
             )
-        reads = "contact_forces", "chamber_pressures", "law_state", "joint_states"
-        for flag in ("unit", "cumulative", *(f"reads_{what}" for what in reads)):
+        for flag in ("unit", "cumulative", *(f"reads_{what}" for what in NOTED)):
             setattr(self, flag, getattr(of, flag))
 
     def settled(self, scene: Scene) -> "SmoothMaximum":

@@ -13,6 +13,7 @@ from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
+from diffsim_ti.terms import Robot
 
 GROWTH = 2.0  # of substeps from one step to the next, at most
 SHARE = 0.7  # of the stable step, at most: beyond it the fastest waves are slowed to a half
@@ -49,13 +50,15 @@ def adaptive_steps(
     values: of the scenes of a `Batch`, inputs with their axis in front, {"youngs_modulus": [1e4, 2e4]}. Each is run, one
     after the other, and a step has the substeps of the scene that needs most.
 
-    Raises ValueError for a solver without time, for another `of`, and for a tolerance that is not > 0 or that 4096 substeps
-    of a step do not meet.
+    Raises ValueError for robots, whose joints are not in that measure, for a solver without time, for another `of`, and for
+    a tolerance that is not > 0 or that 4096 substeps of a step do not meet.
     Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, II.4, doi:10.1007/978-3-540-78862-1.
     """
     instance("adaptive_steps", "solver", solver, Solver, "a solver such as VelocityVerletSolver(scene)")
     if not solver.order:
         raise ValueError(f"{type(solver).__name__} finds equilibria, whose error no shorter step makes smaller")
+    if solver.scene.terms_of(Robot):
+        raise ValueError("adaptive_steps: errors of robots' joints are not in its measure: give the solver substeps=")
     tolerance, steps = number("tolerance", tolerance, unit="m"), whole("steps", steps, 1)
     if of not in ("vertices", "bodies"):
         raise ValueError(f'of must be "vertices" or "bodies", got {shown(of)}')

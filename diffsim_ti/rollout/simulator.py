@@ -269,6 +269,12 @@ class Simulator(metaclass=Public):
         return np.zeros(arrays.law_state_shape) if z is None else arrays.law_state_of(runtime.fetch(z)[0])
 
     @property
+    def joint_states(self) -> np.ndarray | None:
+        """Positions and velocities of the joints of all robots, shape (joints, 2); None without robots."""
+        joints = self.workspace.state.joints[0]
+        return None if joints is None else np.stack(joints, 1)
+
+    @property
     def _has_before(self) -> bool:
         return getattr(self.solver, "multistep", False)
 
@@ -282,8 +288,8 @@ class Simulator(metaclass=Public):
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:
             out["law_state"] = self.law_state
-        if state.joints[0] is not None:
-            out["joint_states"] = np.stack(state.joints[0], 1)
+        if self.joint_states is not None:
+            out["joint_states"] = self.joint_states
         if self._has_before and not state.fresh[0]:
             before = (runtime.fetch(x)[0] for x in (state.before.u, state.before.v))
             out["displacements_before"], out["velocities_before"] = before
@@ -317,11 +323,13 @@ class Simulator(metaclass=Public):
         shape, count = known["displacements"].shape, given["step_count"]
         if count.shape or count != int(count) or count < 0:
             raise ValueError(f"resume: step_count must be a whole number >= 0, got {count!r}")
-        for name in ("displacements", "velocities", *(two_step & given.keys())):
-            value, own = given[name], known["displacements"].dtype
-            if value.shape != shape or value.dtype != own or not np.all(np.isfinite(value)):
+        joints = {"joint_states"} & known.keys()
+        for name in ("displacements", "velocities", *(two_step & given.keys()), *joints):
+            value, usual = given[name], known.get(name, known["displacements"])
+            if value.shape != usual.shape or value.dtype != usual.dtype or not np.all(np.isfinite(value)):
                 raise ValueError(
-                    f"resume: {name}: expected finite numbers, {own} of shape {shape}, got {value.dtype} of {value.shape}"
+                    f"resume: {name}: expected finite numbers, {usual.dtype} of shape {usual.shape}, got {value.dtype} of "
+                    f"{value.shape}"
                 )
         law_state = self.workspace.checked_law_state(given["law_state"]) if "law_state" in given else None
         following = Following.of(given["preconditioner"], shape) if matrices & given.keys() else None
@@ -333,20 +341,28 @@ class Simulator(metaclass=Public):
         runtime.fill(now.v, given["velocities"][None])
         if law_state is not None:
             self.workspace.set_law_state(law_state)
+        if joints:
+            now.joints[0] = tuple(given["joint_states"].T.copy())
+        self.step_count = int(count)
+        self._place_obstacles()
         self.workspace.forget()
         if two_step & given.keys():
             runtime.fill(now.before.u, given["displacements_before"][None])
             runtime.fill(now.before.v, given["velocities_before"][None])
             now.fresh[0] = False
         now.beside[0] = following
-        if "joint_states" in given:
-            now.joints[0] = tuple(given["joint_states"].T.astype(np.float64))
-        self.step_count = int(count)
         if more_substeps & given.keys():
             self._take_solver(self.solver.with_substeps(whole("substeps", given["substeps"], 1)))
         if held & given.keys():
             self.workspace.go_on_from(given["constraint_pressures"].copy(), self.step_count)
-        self.workspace.place_obstacles(int(self.solver.schedule.first(1)) if count else 0)
+
+    def _place_obstacles(self) -> None:
+        """Put them where they are at the end of the last step, of rows that are loaded anew in the next."""
+        inputs, last = self.scene.inputs, max(self.step_count - 1, 0)
+        path = inputs.derive(inputs.at_step(last, self.solver.dt, self._set)).path
+        if path is not None:
+            self.workspace.arrays.load_rows(path=path)
+        self.workspace.place_obstacles(int(self.solver.schedule.first(1)) if self.step_count else 0)
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -377,7 +393,7 @@ class Simulator(metaclass=Public):
         frames = self._frames()
         frames.law_state = self.law_state[None]
         if output.reads_joint_states:
-            frames.joint_states = np.stack(self.workspace.state.joints[0], 1)[None]
+            frames.joint_states = self.joint_states[None]
         if self._notes:
             frames.contact_forces = self.workspace.contact_forces(self.solver.dt)[1:]
         if output.reads_chamber_pressures and self.scene.holds_volumes:

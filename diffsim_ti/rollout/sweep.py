@@ -140,8 +140,8 @@ class Sweep:
     def _noted(self, of, chamber_pressures: Callable) -> dict[str, np.ndarray]:
         """What a workspace or a tangent has of what frames hold besides states."""
         contact_forces, law_state = lambda: of.contact_forces(self.frame_time), lambda: of.law_frames.values()
-        joint_states = lambda: np.array(of.joint_frames)  # noqa: E731
-        make = dict(zip(NOTED, (contact_forces, chamber_pressures, law_state, joint_states)))
+        joints = lambda: np.array([of.joint_frames[0] if x is None else x for x in of.joint_frames])  # noqa: E731
+        make = dict(zip(NOTED, (contact_forces, chamber_pressures, law_state, joints)))
         return {name: make[name]() for name in self.noted}
 
     @property
@@ -372,7 +372,7 @@ class Sweep:
             if self.solver.last_frame_is_state:
                 self._adjoint.law_frames.add_to(self._adjoint.z, self.num_frames - 1)
         if self.joints:
-            self._adjoint.joints.seed_frames(seed.noted["joint_states"], self.solver.last_frame_is_state)
+            self._adjoint.joints.seed_frames(seed.noted["joint_states"])
         stop = 0 if self.truncate is None else self.solver.schedule.first(max(0, self.steps - self.truncate))
         kept, end = self._kept, checkpoints.num_segments
         self._kept = kept[:1]  # the sweep overwrites the others, also if it does not get to its end
@@ -397,6 +397,8 @@ class Sweep:
                 kept.pop()
         if self.num_passes > stop:
             self._adjoint.finish()
+        if self.joints and self.truncates:
+            self._adjoint.joints.clear()
         return norms
 
     def _reverse_segment(self, first: int, last: int, stop: int, end: int, careful: bool) -> None:

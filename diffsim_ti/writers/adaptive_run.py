@@ -15,13 +15,14 @@ from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.monitor.quantities import Energy
 from diffsim_ti.monitor.stability import lanczos_limit
+from diffsim_ti.obstacles import link_rows
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
 from diffsim_ti.scene.strength import check_strength
 from diffsim_ti.solvers import ImplicitEulerSolver
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.terms import ExternalForce, Gravity, Obstacle
+from diffsim_ti.terms import ExternalForce, Gravity, Obstacle, Robot
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.writers import Writer, writer_for
 
@@ -100,7 +101,7 @@ class ForwardRun:
         check_strength(scene)
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
         given = any(x.is_load and not isinstance(x, DeadLoads) for x in scene.interactions)
-        self.driven = scene.motion is not None or bool(scene.moving) or given
+        self.driven = scene.motion is not None or bool(scene.moving or scene.terms_of(Robot)) or given
         self.before_part: Callable[[], object] | None = None
         self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
         gravity = scene.term(Gravity)
@@ -253,9 +254,10 @@ class ForwardRun:
 
     def _check_gaps(self) -> None:
         sim, seen, offsets = self.simulator, self.seen, self.scene.places(self.simulator.time)
+        links = link_rows(self.scene, sim.joint_states)
         positions, crossed = sim.positions[self.scene.mesh.surface_vertices], 0
         for term in self.obstacles:
-            gap = term.gap(positions, offsets.get(term, np.zeros(3)))
+            gap = term.gap(positions, links.get(term.name, offsets.get(term, np.zeros(3))))
             seen.gap, crossed = min(seen.gap, float(gap.min())), crossed + int((gap < 0).sum())
         seen.crossed = max(seen.crossed, crossed)
         seen.gap = min(seen.gap, sim.contact_resolution.smallest_gap)  # of all substeps

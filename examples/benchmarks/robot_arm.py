@@ -47,7 +47,7 @@ def rollout_of(steps: int, dt: float) -> ds.Rollout:
         width=4e-3,
         stiffness_per_area=3e7,
     )
-    tip = robot.poses(START)[0][1]
+    tip = robot.poses(START)["arm_fore"][:3]
     mesh = ds.TetrahedralMesh.create_box((4, 3, 3), (0.12, 0.06, 0.06), origin=tip - [0.06, 0.095, 0.03])
     terms = [ds.Gravity(), robot]
     scene = ds.Scene(mesh, ds.StableNeoHookean(3e4, 0.35), 500.0, terms, fixed="ymin", precision="f64")

@@ -38,11 +38,14 @@ def moved(S: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 class Pushed(NamedTuple):
-    """What a link does to the vertices that it touches, by its barrier and by friction, shape (k, 3) [N]."""
+    """What a link does to the vertices that it touches, by its barrier and by friction, shape (k, 3) [N], and how the
+    joints move its points there, where the pass ends and where it begins, shape (k, joints, 3)."""
 
     at: np.ndarray
     f: np.ndarray
     drag: np.ndarray
+    J: np.ndarray
+    J_n: np.ndarray
 
 
 class Joints:
@@ -85,6 +88,10 @@ class Joints:
                 poses += robot.poses_of(frames)
             self._known = q.copy(), poses, twists
         return self._known[1:]
+
+    def turns(self, S: np.ndarray) -> np.ndarray:
+        """How twist S_a changes as joint b turns, [b, a]."""
+        return bracket(S[:, None], S[None]) * self.above[..., None]
 
     def put(self, rows: np.ndarray, q: np.ndarray, moments=(AT_STAGE,)) -> None:
         """Write the poses of links at q to rows of obstacles."""
@@ -142,6 +149,13 @@ class Joints:
                 f"the joints of robots are out of balance by {self.left:.2g} of their forces: take smaller steps",
                 [self.left],
             )
+        met = self.ws.collisions.detection.nearest(self.p.held_at, self.rows[::3]) if self.links else None
+        if met and met.obstacle in dict(self.links):
+            link = self.a.contacts[met.obstacle].name
+            raise NotConverged(f"{link} has got {-met.value:.2g} m into {met}: take smaller steps", [self.left])
+        turned = np.abs(self.q - self.q_n) * np.linalg.norm(self.S_n[:, 3:], axis=1)
+        if any(turned @ carried >= np.pi for _, carried in self.links):
+            raise NotConverged("a link of a robot turns by more than half a turn: take smaller steps", [self.left])
         self.now = self.q.copy(), (self.q - self.q_n) / self.h
 
     def forget(self) -> None:
@@ -155,14 +169,14 @@ class Joints:
 
     def _own_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(-dPhi/dq but for contact, sizes of what it adds up)"""
-        parts = -self.M @ self.acceleration, -self.bias, self.torques
-        parts += -self.k * (self.q - self.targets), -self.c * (self.q - self.q_n) / self.h
-        return sum(parts), sum(np.abs(part) for part in parts)
+        parts = -self.bias, self.torques, -self.k * (self.q - self.targets), -self.c * (self.q - self.q_n) / self.h
+        size = np.abs(self.M) @ np.abs(self.acceleration) + sum(np.abs(part) for part in parts)
+        return sum(parts) - self.M @ self.acceleration, size
 
-    def _rounding(self) -> float:
-        """Of the joints' own forces, by the digits of their positions."""
+    def _rounding(self) -> np.ndarray:
+        """Of each joint's own forces, by the digits of their positions."""
         reach = np.abs(self.q) + np.abs(self.q_n) + self.h * np.abs(self.v_n)
-        return 1e-15 * float(np.linalg.norm(np.abs(self.M) @ reach / self.h**2 + self.k * reach)) + 1e-300
+        return 1e-15 * (np.abs(self.M) @ reach / self.h**2 + self.k * reach) + 1e-300
 
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
@@ -188,11 +202,11 @@ class Joints:
         for k, carried in self.links:
             f, drag = forces[k]
             at = np.flatnonzero(f.any(1) | drag.any(1))
-            self.pushed.append(Pushed(at, f[at], drag[at]))
-            if len(at):
-                J, J_n = (carried[:, None] * moved(S, y[at]) for S, y in ((self.S, x), (self.S_n, x_n)))
-                work = np.einsum("iad,id->ia", J, f[at]) + np.einsum("iad,id->ia", J_n, drag[at])
-                R, size = R - work.sum(0), size + np.abs(work).sum(0)
+            J, J_n = (carried[:, None] * moved(S, y[at]) for S, y in ((self.S, x), (self.S_n, x_n)))
+            self.pushed.append(Pushed(at, f[at], drag[at], J, J_n))
+            for arm, force in ((J, f[at]), (J_n, drag[at])):
+                R = R - np.einsum("iad,id->a", arm, force)
+                size = size + np.einsum("iad,id->a", np.abs(arm), np.abs(force))
         return R, size
 
     def places(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -210,17 +224,19 @@ class Joints:
             return
         R, size = self._stand(self._predicted(u), u)
         best, stalled = np.inf, 0
+        scale = np.sqrt(np.diag(self.M) / self.h**2 + self.k + self.c / self.h)  # of joints, some stiff, some light
         for _ in range(self.most):
-            left, scale = np.linalg.norm(R), np.linalg.norm(size)
+            noise = self._rounding()
+            left = float(np.max(np.abs(R) / (max(1e-13, 4 * self.eps) * size + noise)))
             stalled = 0 if left < 0.5 * best else stalled + 1
-            known = max(1e-13, 4 * self.eps) * scale + self._rounding()
-            if not left > known or (stalled > 3 and left <= self.loose * scale) or stalled > 20:
+            fair = np.all(np.abs(R) <= self.loose * size + noise)
+            if not left > 1 or (stalled > 3 and fair) or stalled > 20:
                 break
             best = min(best, left)
             _, K = self.linear
-            values, vectors = np.linalg.eigh(K)
+            values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
             values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max())
-            step = vectors @ ((vectors.T @ R) / values)
+            step = vectors @ ((vectors.T @ (R / scale)) / values) / scale
             slope, q = float(R @ step), self.q
             t = self._free_share(u, q, step)
             while True:
@@ -228,7 +244,7 @@ class Joints:
                 if float(R @ step) >= -self.falls * slope or t < 1e-12:
                     break
                 t *= 0.5
-        self.left = float(np.linalg.norm(R)) / (float(np.linalg.norm(size)) + 1e6 * self._rounding())
+        self.left = float(np.max(np.abs(R) / (size + 1e6 * self._rounding())))
 
     def _free_share(self, u, q: np.ndarray, step: np.ndarray) -> float:
         """How far links may go along a step of the joints."""
@@ -249,12 +265,9 @@ class Joints:
         K, columns = self.M / self.h**2 + np.diag(self.k + self.c / self.h), []
         if any(len(part.at) for part in self.pushed):
             blocks = self._blocks()
-            x, x_n = self.places(self.p.held_at)
-            turns = bracket(self.S[:, None], self.S[None]) * self.above[..., None]  # [b, a]
-            for (k, carried), part in zip(self.links, self.pushed):
-                at, f = part.at, part.f
+            turns, x = self.turns(self.S), self.places(self.p.held_at)[0]
+            for (k, carried), (at, f, _, J, J_n) in zip(self.links, self.pushed):
                 H, F = blocks[:, k, 0, at], blocks[:, k, 1, at]  # (3, k, 3)
-                J, J_n = (carried[:, None] * moved(S, y[at]) for S, y in ((self.S, x), (self.S_n, x_n)))
                 w = carried[:, None] * self.S[:, 3:]
                 turned = np.tensordot(f, rotations.skew(w), (1, 2))  # (k, joints, 3), of f as the link turns
                 HJ, FJ = np.einsum("jid,iaj->iad", H, J), np.einsum("jid,iaj->iad", F, J_n)

@@ -5,7 +5,6 @@ import numpy as np
 from diffsim_ti.mechanics.joints.joints import moved
 from diffsim_ti.mechanics.obstacles.contact_record import SharesAdjoint
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
-from diffsim_ti.terms.robots.model import bracket
 
 
 class JointSweep:
@@ -36,7 +35,7 @@ class JointSweep:
         """Change of velocity of a link's own point t, and of its spin, by q_n at a constant rate, shape (joints, joints, 3)
         each: [b, a] of joint a by q_b."""
         J = self.joints
-        turns = bracket(J.S_n[:, None], J.S_n[None]) * J.above[..., None]
+        turns = J.turns(J.S_n)
         here = moved(J.S_n, t)
         at = turns[..., :3] + np.cross(turns[..., 3:], t) + np.cross(J.S_n[None, :, 3:], here[:, None])
         return at, turns[..., 3:]
@@ -81,8 +80,7 @@ class JointSweep:
     def _of_friction(self) -> list:
         """(vertices, joints that move the link, f, f', sum over vertices of f' . change of J' by q_b, [b, a])"""
         J, out = self.joints, []
-        _, x_n = J.places(J.p.held_at)
-        turns = bracket(J.S_n[:, None], J.S_n[None]) * J.above[..., None]
+        turns, x_n = J.turns(J.S_n), J.places(J.p.held_at)[1]
         for (_, carried), part in zip(J.links, J.pushed):
             force, moment = part.drag.sum(0), np.cross(x_n[part.at], part.drag).sum(0)
             bent = (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
@@ -102,10 +100,6 @@ class JointTangent(JointSweep):
     def note(self) -> None:
         """A frame has the change of the present state."""
         self.frames.append(np.stack([self.dq, self.dv], 1))
-
-    def rows(self) -> np.ndarray:
-        """Change of the rows of links, the joints staying where the pass ends."""
-        return self.rows_jvp(np.zeros_like(self.dq), self.dq)
 
     def force(self, shares: np.ndarray, held: np.ndarray, du: np.ndarray) -> np.ndarray:
         """Change of -dPhi/dq, body and joints staying where the pass ends, but for its fixed vertices.
@@ -147,12 +141,16 @@ class JointAdjoint(JointSweep):
         super().__init__(workspace)
         self._shares = SharesAdjoint(workspace, features, numbers) if self.joints.links else None
 
-    def seed_frames(self, seeds: np.ndarray | None, last_is_state: bool) -> None:
+    def seed_frames(self, seeds: np.ndarray | None) -> None:
         """Begin with the adjoints of the frames, shape (frames, joints, 2)."""
         frames = len(self.ws.joint_frames)
         self.frames = np.zeros((frames, self.joints.count, 2)) if seeds is None else seeds
         self.by_q, self.by_v = self.frames[-1].T.copy()
         self.numbers = np.zeros((5, self.joints.count))
+
+    def clear(self) -> None:
+        """The joints where the sweep stands are no start of theirs."""
+        self.by_q, self.by_v = np.zeros((2, self.joints.count))
 
     def add_frame(self, frame: int) -> None:
         """Add the adjoints of a frame."""
@@ -170,7 +168,7 @@ class JointAdjoint(JointSweep):
         J, n = self.joints, len(w)
         self.w = J.follow(self._seed - J.of_body(w))
         by_places, by_lag = np.zeros((n, 3)), np.zeros((2, n, 3))
-        self._turned = np.zeros((n, 3))
+        self.by_rest = np.zeros((n, 3))  # by the arms of forces
         if not J.links:
             return by_places, by_lag, np.zeros((J.a.poses.size, 3))
         seed = np.zeros((len(J.a.contacts), 2, n, 3))
@@ -182,15 +180,10 @@ class JointAdjoint(JointSweep):
             by_places[vertices] += np.cross(own @ J.S[:, 3:], f)
             by_lag[0, vertices] += np.cross(own @ J.S_n[:, 3:], drag)
             self._to_q_n = self._to_q_n - bent @ self.w
-        self._turned = by_places + by_lag[0]
+        self.by_rest = by_places + by_lag[0]
         by_u, lag, rows = self._shares.pull_back(seed)
         by_lag[: len(lag)] += lag if self.ws.potential.has_friction else 0.0
         return by_places + by_u, by_lag, rows
-
-    @property
-    def by_rest(self) -> np.ndarray:
-        """What comes to rest positions by the arms of forces."""
-        return self._turned
 
     def end(self, rows: np.ndarray, adj) -> np.ndarray:
         """Go to where the pass begins. rows: adjoint of the obstacles' rows by the equations of body and joints; adj: takes

@@ -78,6 +78,8 @@ class ImplicitAdjoint(RecordedPasses):
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
         self.anchor = np.zeros((len(a.held), 3))
+        if self.joints:
+            self.joints.seed_frames(None)
 
     def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: np.ndarray) -> None:
         """Set the adjoints of the frames' contact forces (None: zero)."""
@@ -253,12 +255,14 @@ class ImplicitAdjoint(RecordedPasses):
         """The sweep leaves nothing undone."""
 
     def norm(self) -> tuple[float, float]:
-        """Euclidean norms of the adjoints of displacement and velocity where the sweep stands.
+        """Euclidean norms of the adjoints of displacement and velocity, joints included, where the sweep stands.
 
         Fixed vertices have no velocity, and sets that are `reduced` only admissible motions.
         """
         reduced = self.ws.scene.reduced
         p, q = reduced.of(self.p), reduced.of(self.ws.arrays.supports.free(self.q))
+        if self.joints:
+            p, q = np.append(p, self.joints.by_q), np.append(q, self.joints.by_v)
         return float(np.linalg.norm(p)), float(np.linalg.norm(q))
 
     def scale(self, factor: float) -> None:

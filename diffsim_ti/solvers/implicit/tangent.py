@@ -69,7 +69,7 @@ class ImplicitTangent(RecordedPasses):
             held = ws.rigid.held_jvp(held, self.du, tangent.rest)
         poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
         if self.joints:
-            poses = self.joints.rows() + (0.0 if poses is None else poses)
+            poses = self.joints.rows_jvp(0.0 * self.joints.dq, self.joints.dq) + (0.0 if poses is None else poses)
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
         of_obstacles = dict(poses_dot=poses) if ws.pairs and ws.pairs.obstacles else {}
         if surface_friction:

@@ -1,6 +1,6 @@
 """Articulated robots, whose joints are unknowns of implicit steps together with the body."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypedDict
 
@@ -19,6 +19,7 @@ from diffsim_ti.terms.robots.model import RobotModel
 from diffsim_ti.terms.robots.urdf import Urdf
 from diffsim_ti.terms.term import Term
 
+OfJoints = ArrayLike | Mapping[str, ArrayLike]
 AT_LEAST_0 = Range(">= 0", NOT_NEGATIVE.holds, in_runs=False)
 
 
@@ -40,22 +41,27 @@ class Robot(GivenOverTime, Term):
         Phi(x) + E_contact(x, links(q)) + 1/2 (q - p)^T M (q - p) / h^2 + b . q
           + 1/2 k (q - q_target)^2 + 1/2 c (q - q_n)^2 / h - tau . q,    p = q_n + h v_n,
 
-    with friction by the velocities of body and links in the same step, so that no wrench lags. The inertia M(q_n), the bias
-    b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and arms and normal forces of friction, as of every obstacle,
-    are those where the step begins: they change by O(h) within it, which keeps the first order of backward Euler. Action is
-    reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
+    with friction by the velocities of body and links in the same step. So no wrench of normal contact lags. The inertia
+    M(q_n), the bias b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and arms and normal forces of friction, as
+    of every obstacle, are those where the step begins: they change by O(h) within it, which keeps the first order of
+    backward Euler. Action is reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
+    Links touch the body alone: not one another, the ground, or other obstacles. No vertex can be fixed to a link; where the
+    joints' motion is given, `Pose` moves a clamp as a link moves. `Simulator.set_state` leaves the joints where they are.
+    `compute_energy` and the guard of the energy are those of the body.
 
     All inputs have a gradient, by names that begin with the robot's: "positions", "velocities", shape (joints,), where a
     run starts [rad or m, per s]; "torques", (joints,) or (steps, joints) [N m or N]; "targets", of shape (joints,),
     (steps, joints), or (steps + 1, joints) of a function or keyframes; "drive_stiffness" k, "drive_damping" c;
     "masses" [kg], of what each joint carries rigidly, whose inertia goes along. Links are obstacles <robot>_<link> of the
     scene. Results: `JointPositions`, `JointVelocities`, and `ContactForce("<robot>_<link>")`.
-    Limits of joints, of effort and of velocity in the file are not enforced.
+    Limits of joints, effort and velocity in the file are not enforced. A link turns by less than half a turn in a step.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425; Featherstone 2008, Rigid Body Dynamics
     Algorithms.
     """
 
-    def __init__(self, model: RobotModel, inputs: Sequence[Input], targets: OverTime, name: str):
+    def __init__(self, model: RobotModel, inputs: Sequence[Input] = (), targets: OverTime = 0.0, name: str = "robot"):
+        if not isinstance(model, RobotModel):
+            raise TypeError("Robot is made by Robot.from_urdf(path)")
         self.model, self.shape = model, (model.size,)
         self.prescribed, self.damping = np.zeros(model.size, bool), np.zeros(model.size)
         self.companions: tuple[Obstacle, ...] = ()
@@ -71,30 +77,36 @@ class Robot(GivenOverTime, Term):
         path: str | Path,
         name: str = "robot",
         base: ArrayLike = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
-        positions: ArrayLike | None = None,
-        velocities: ArrayLike | None = None,
-        torques: ArrayLike | None = None,
-        targets: OverTime | None = None,
-        drive_stiffness: ArrayLike = 0.0,
-        drive_damping: ArrayLike = 0.0,
+        positions: OfJoints = 0.0,
+        velocities: OfJoints = 0.0,
+        torques: OfJoints = 0.0,
+        targets: OverTime | Mapping[str, ArrayLike] | None = None,
+        drive_stiffness: OfJoints = 0.0,
+        drive_damping: OfJoints = 0.0,
         prescribed: Sequence[str] = (),
         links: Sequence[str] | None = None,
         **contact: Unpack[LinkContact],
     ) -> "Robot":
-        """The robot of a URDF file, or of its text; joints in the order of `robot.joints`.
+        """The robot of a URDF file, or of its text; joints in the order of `robot.joints`, which need not be the file's.
 
+        What is given of joints is a value for all, a list in that order, or a dictionary {joint: value} that names all.
         base: pose of its root, a displacement [m] and a rotation vector or quaternion (w, x, y, z). positions, velocities:
         of the joints at the start. torques: constant, or of each step. targets: what drives pull to, in the form of any
         amount over time, default `positions`. drive_stiffness [N m/rad or N/m], drive_damping: of each joint or of all; the
-        file's damping comes on top. prescribed: joints that follow their targets, within F h^2 / (10^6 M) where F pulls.
+        file's damping comes on top. prescribed: joints that follow their targets, within F h^2 / (10^6 M) where F pulls, M
+        being the inertia by the file's masses where the joints start.
         links: whose collision geometry acts on the body; None: all. contact: of all links, as of an `Obstacle`; they act on
         vertices by their distance. Meshes are taken from beside the file.
 
         Raises ValueError for joints of other kinds, mimic joints, closed loops, dry friction, joints that carry no mass, and
         files that cannot be read; ImportError without Pinocchio.
         """
-        urdf = Urdf(path)
-        model = RobotModel(urdf.text, np.asarray(base, np.float64))
+        urdf, pose, known = Urdf(path), np.asarray(base, np.float64), LinkContact.__annotations__
+        if pose.shape not in ((3,), (6,), (7,)) or not np.isfinite(pose).all():
+            raise ValueError(f"Robot.from_urdf: base must be 3, 6 or 7 finite numbers, got {base}")
+        if unknown := contact.keys() - known:
+            raise TypeError(f"Robot.from_urdf: no option {min(unknown)!r}; contact of links takes {', '.join(known)}")
+        model = RobotModel(urdf.text, pose)
         m = model.size
         for joint, mass in zip(model.joints, model.masses):
             if not mass > 0:
@@ -103,28 +115,24 @@ class Robot(GivenOverTime, Term):
                 )
         if m == 0:
             raise ValueError("Robot.from_urdf: the robot has no joint that moves; take obstacles such as MeshObstacle")
-        start = np.zeros(m) if positions is None else positions
-        every = lambda x: np.full(m, x, np.float64) if np.ndim(x) == 0 else x  # noqa: E731
-        own, zeros = (m,), np.zeros(m)
+        own, start = (m,), each(model.joints, "positions", positions)
+        if targets is None or isinstance(targets, Mapping):
+            targets = start if targets is None else each(model.joints, "targets", targets)
+        named = dict(
+            velocities=velocities, drive_stiffness=drive_stiffness, drive_damping=drive_damping, torques=torques
+        )
+        speed, stiffness, damping, torques = (each(model.joints, name, x) for name, x in named.items())
         inputs = [
             Input("positions", start, (own,), "rad, m", plain="joint_positions"),
-            Input(
-                "velocities",
-                zeros if velocities is None else velocities,
-                (own,),
-                "rad/s, m/s",
-                plain="joint_velocities",
-            ),
-            Input("drive_stiffness", every(drive_stiffness), (own,), "N m/rad, N/m", AT_LEAST_0),
-            Input("drive_damping", every(drive_damping), (own,), "N m s/rad, N s/m", AT_LEAST_0),
+            Input("velocities", speed, (own,), "rad/s, m/s", plain="joint_velocities"),
+            Input("drive_stiffness", stiffness, (own,), "N m/rad, N/m", AT_LEAST_0),
+            Input("drive_damping", damping, (own,), "N m s/rad, N s/m", AT_LEAST_0),
             Input("masses", model.masses, (own,), "kg", POSITIVE, plain="link_masses"),
-            Input(
-                "torques", zeros if torques is None else torques, (own, ("steps", m)), "N m, N", plain="joint_torques"
-            ),
+            Input("torques", torques, (own, ("steps", m)), "N m, N", plain="joint_torques"),
         ]
         for given in inputs:
             given.check_value("Robot")  # before the targets, which may be the positions
-        out = cls(model, inputs, start if targets is None else targets, name)
+        out = cls(model, inputs, targets, name)
         for joint in prescribed:
             if joint not in model.joints:
                 raise ValueError(
@@ -151,20 +159,21 @@ class Robot(GivenOverTime, Term):
             parts.append(obstacle)
             places.append((obstacle.name, joint, pose))
         self.companions, self.places = tuple(parts), tuple(places)
-        for obstacle, (q, t) in zip(parts, self.poses(self.values["joint_positions"])):
-            obstacle.led = np.concatenate([t, q])
+        for obstacle, pose in zip(parts, self.poses(self.values["joint_positions"]).values()):
+            obstacle.led = pose
 
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints."""
         return self.model.joints
 
-    def poses(self, q: ArrayLike) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(unit quaternion, position [m]) of each of `companions` at joint positions."""
-        return self.poses_of(self.model.kinematics(np.asarray(q, np.float64))[0])
+    def poses(self, q: ArrayLike) -> dict[str, np.ndarray]:
+        """{name of the obstacle: its pose, 7 numbers as of `base`} of links at joint positions."""
+        found = self.poses_of(self.model.kinematics(np.asarray(q, np.float64))[0])
+        return {part.name: np.concatenate([t, turn]) for part, (turn, t) in zip(self.companions, found)}
 
     def poses_of(self, frames: list) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The same of the joints' frames."""
+        """(unit quaternion, position [m]) of each of `companions` for the joints' frames."""
         base = np.array([1.0, 0, 0, 0]), np.zeros(3)
         return [joined(base if joint < 0 else frames[joint], pose) for _, joint, pose in self.places]
 
@@ -182,6 +191,15 @@ class Robot(GivenOverTime, Term):
 
     def __repr__(self) -> str:
         return f"Robot(name={self.name!r}, joints={', '.join(self.joints)})"
+
+
+def each(joints: tuple[str, ...], name: str, given: OfJoints) -> ArrayLike:
+    """What is given of joints, in their order."""
+    if isinstance(given, Mapping):
+        if given.keys() != set(joints):
+            raise ValueError(f"Robot.from_urdf: {name} must name {', '.join(joints)}, got {', '.join(given)}")
+        return np.stack(np.broadcast_arrays(*(given[joint] for joint in joints)), -1)
+    return np.full(len(joints), given, np.float64) if np.ndim(given) == 0 else given
 
 
 def joined(a: tuple, b: tuple) -> tuple[np.ndarray, np.ndarray]:

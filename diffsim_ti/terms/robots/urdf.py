@@ -13,6 +13,7 @@ from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 
 MOVING = "revolute", "continuous", "prismatic"
+SHAPES = dict(sphere=("radius",), box=("size",), cylinder=("radius", "length"), mesh=("filename",))
 
 
 def numbers_of(element, name: str, default: str) -> np.ndarray:
@@ -53,7 +54,10 @@ class Urdf:
     def _check(self) -> None:
         children: dict[str, str] = {}
         for joint in self.root.findall("joint"):
-            name, kind, child = joint.get("name"), joint.get("type"), joint.find("child").get("link")
+            name, kind = joint.get("name"), joint.get("type")
+            if joint.find("parent") is None or joint.find("child") is None:
+                raise ValueError(f"Robot.from_urdf: joint {name!r} needs a <parent> and a <child>")
+            child = joint.find("child").get("link")
             if kind not in (*MOVING, "fixed"):
                 raise ValueError(
                     f"Robot.from_urdf: joint {name!r} is {kind!r}; revolute, continuous, prismatic and fixed joints are "
@@ -103,6 +107,9 @@ class Urdf:
         """An obstacle in the frame of its geometry."""
         shape = None if geometry is None or not len(geometry) else geometry[0]
         kind = None if shape is None else shape.tag
+        if kind not in SHAPES or not all(shape.get(name) for name in SHAPES[kind]):
+            needs = ", ".join(f"{kind} with {' and '.join(names)}" for kind, names in SHAPES.items())
+            raise ValueError(f"Robot.from_urdf: link {link!r}: collision geometry must be one of {needs}")
         if kind == "sphere":
             return Sphere(np.zeros(3), float(shape.get("radius")), **options)
         if kind == "box":
@@ -110,18 +117,16 @@ class Urdf:
         if kind == "cylinder":
             half = np.array([0, 0, 0.5 * float(shape.get("length"))])
             return Cylinder(-half, half, float(shape.get("radius")), **options)
-        if kind == "mesh":
-            points, triangles, _ = read_surface(self._file(shape.get("filename"), link))
-            return MeshObstacle(points * numbers_of(shape, "scale", "1 1 1"), triangles, **options)
-        raise ValueError(f"Robot.from_urdf: link {link!r}: collision geometry must be sphere, box, cylinder or mesh")
+        points, triangles, _ = read_surface(self._file(shape.get("filename"), link))
+        scale = numbers_of(shape, "scale", "1 1 1")
+        return MeshObstacle(points * scale, triangles[:, ::-1] if np.prod(scale) < 0 else triangles, **options)
 
     def _file(self, name: str, link: str) -> Path:
         """Where a mesh lies: beside the file, and of package://name/path in the nearest folder above that has `path`."""
         folder = Path.cwd() if self.folder is None else self.folder.resolve()
-        inner = (
-            name.split("//", 1)[1].split("/", 1)[1] if name.startswith("package://") else name.removeprefix("file://")
-        )
-        tried = [above / inner for above in ([folder, *folder.parents] if name.startswith("package://") else [folder])]
+        inner, packaged = name.removeprefix("file://").removeprefix("package://"), name.startswith("package://")
+        inner = inner.split("/", 1)[-1] if packaged else inner
+        tried = [above / inner for above in ([folder, *folder.parents] if packaged else [folder])]
         for path in tried:
             if path.is_file():
                 return path
