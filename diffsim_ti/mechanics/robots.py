@@ -4,8 +4,8 @@ import numpy as np
 
 from diffsim_ti.inputs.joints import JointRows
 from diffsim_ti.mechanics.interaction import Interaction
-from diffsim_ti.terms.body_forces import RotatingFrame
 from diffsim_ti.terms.robots.robot import Robot
+from diffsim_ti.terms.whole_body import RotatingFrame
 
 
 class Robots(Interaction):

@@ -165,6 +165,7 @@ class OnSurface:
     """The part of a term that acts on a `surface` of the body; None: all of it."""
 
     def check(self, mesh: TetrahedralMesh) -> None:
+        """Raise ValueError for a surface without faces."""
         nonempty(self, self.faces(mesh))
 
     def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
