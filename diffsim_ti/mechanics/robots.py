@@ -37,7 +37,7 @@ class Robots(Interaction):
                 "recommend and stable_dt take no robots"
             )
         if self.scene.term(RotatingFrame):
-            raise ValueError("robots do not feel a RotatingFrame: leave it out")
+            raise ValueError("a RotatingFrame does not act on robots: leave it out")
         if self.scene.reduced:
             raise ValueError("robots do not support reduced sets and ties beside them: leave out reduced= and Tie")
         if self.scene.origin.any():

@@ -169,8 +169,7 @@ class PairContact(Stage):
         return (u, slot) if self.pairs is self.inner else (self.pairs.fine(u, slot), 0)
 
     def _look(self, u, slot: int) -> tuple[bool, bool, bool]:
-        """Whether the list does not hold where the pass led, whether pairs beyond it may have crossed, and whether pairs of
-        it may be near."""
+        """Whether the list does not hold where the pass led, pairs beyond it may have crossed, pairs of it may be near."""
         inner = self.inner
         inner.near = inner.list.buffers.take("near", ti.i32, inner.list.count)
         return inner.look_at(inner.motion.find, u, slot)
