@@ -229,7 +229,7 @@ def resident_megabytes():
 
 def specializations():
     """How many Taichi kernels exist, and how many versions of them are compiled."""
-    kernels = [k for k in gc.get_objects() if isinstance(k, ti.lang.kernel_impl.Kernel)]
+    kernels = [k for k in gc.get_objects() if issubclass(type(k), ti.lang.kernel_impl.Kernel)]  # proxies may be dead
     return len(kernels), sum(len(k.compiled_kernels) for k in kernels)
 
 

@@ -353,7 +353,7 @@ def test_friction_of_a_solve_has_derivatives(solver):
 
 
 def test_forces_that_cannot_be():
-    with pytest.raises(ValueError, match="part must be normal, friction or total"):
+    with pytest.raises(ValueError, match="part must be total, normal or friction"):
         ds.SelfContactForce("body_1", "all")
     with pytest.raises(ValueError, match="give on=.*or per_vertex=True"):
         ds.SelfContactForce()
