@@ -161,7 +161,7 @@ class DeviceNewton:
             if self.whole:
                 self._trial(self.many, **numbers)
             elif solving:
-                self._iterate(state, eps)
+                state = self._iterate(state, eps)
             elif phase not in (nk.JUDGE, nk.UPDATE):
                 self._try(state, numbers)
             if not self.whole and (phase == nk.JUDGE or ahead and phase != nk.UPDATE):
@@ -171,7 +171,7 @@ class DeviceNewton:
                 if on_cpu:
                     self.preconditioner.follow(self._here())
                 self._update(1, **numbers)
-            state = runtime.fetch(cg.state)
+            state = state if solving and not self.whole else runtime.fetch(cg.state)
             if state[STOPPED] == 1 and not self.whole:
                 cg.last = int(state[COUNT])
                 if solving:
@@ -243,13 +243,14 @@ class DeviceNewton:
         self.cg.put_system(mass, more)
         return more
 
-    def _iterate(self, state: np.ndarray, eps: float) -> None:
-        """Conjugate gradients, until they stop."""
+    def _iterate(self, state: np.ndarray, eps: float) -> np.ndarray:
+        """The state after conjugate gradients, which go on until they stop."""
         friction, more = self.potential.surface_friction, self._more is not None
         with friction.bounded(self.newton.turning) if friction else nullcontext():
             while not state[STOPPED] and self._is_going_well(state):
                 self.cg.iterate(int(state[COUNT]), int(state[LIMIT]), eps, more)
                 state = runtime.fetch(self.cg.state)
+        return state
 
     def _here(self) -> np.ndarray:
         """The displacement on the device, of which the host is told."""
