@@ -9,6 +9,10 @@ import pytest
 import taichi as ti
 
 from diffsim_ti import runtime
+
+if runtime.QUADRANTS:
+    pytest.skip("Quadrants has a tracer of its own", allow_module_level=True)
+
 from diffsim_ti.runtime import tracer
 
 CALLEES = """
