@@ -222,3 +222,4 @@ def test_a_linear_mesh_is_given_ten_nodes_first():
     cut = ds.refine(start, "end", 0.01, down, rounds=1, ten_nodes=False)
     assert cut.mesh.order == 1 and cut.mesh.num_tetrahedra > start.scene.mesh.num_tetrahedra
     assert found.accuracy.bar < 0.5 * cut.accuracy.bar
+    assert ds.refine(start, "end", 0.01, down, rounds=1, onto=np.array).mesh.order == 1  # middles would not lie there

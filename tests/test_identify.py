@@ -1,6 +1,7 @@
 """Numbers from measurements: estimates, intervals that hold as often as they say, what data do not tell, and its price."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ from scipy.optimize import least_squares
 
 import diffsim_ti as ds
 from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
-from diffsim_ti.identification.problem import Problem
+from diffsim_ti.identification.problem import Point, Problem
 from diffsim_ti.identification.result import save_picture
-from diffsim_ti.identification.unknowns import Priors
+from diffsim_ti.identification.search import Ended, Search, levenberg_marquardt
+from diffsim_ti.identification.unknowns import EDGE, Priors
 
 identify = partial(ds.identify, check_mesh=False)  # data are of the mesh that is fitted
 MESH = ds.TetrahedralMesh.create_box([4, 2, 2], [0.6, 0.2, 0.2], pattern="five")
@@ -323,6 +325,52 @@ def test_a_number_that_was_driven_to_its_bound_comes_back():
     assert ended.converged and ended.estimates["poissons_ratio"] == pytest.approx(0.31, abs=2e-3 * 0.14)
 
 
+class Linear:
+    """Numbers x between 0 and 1 from data A x, which lie partly beyond what any such x explains."""
+
+    def __init__(self, size: int, seed: int):
+        rng = np.random.default_rng(seed)
+        rows = size + 5
+        self.A = rng.normal(size=(rows, size)) * np.geomspace(1, 0.05, size) + 1.5 * rng.normal(size=(rows, 1))
+        self.data, self.size, self.simulations = self.A @ rng.uniform(-0.4, 1.4, size), size, 0
+        self.labels, self.offset = [f"x{k}" for k in range(size)], rng.normal(size=size)
+        self.reach = np.stack([-EDGE - self.offset, EDGE - self.offset])
+        self.unknowns = [SimpleNamespace(size=size, kind="bounded", label="x")]
+
+    def x(self, t):
+        return 1 / (1 + np.exp(-t - self.offset))
+
+    def run(self, t) -> Point:
+        self.simulations += 1
+        return Point(np.array(t), [], 100 * (self.A @ self.x(t) - self.data))
+
+    def jacobian(self, point):
+        return 100 * self.A * (self.x(point.t) * (1 - self.x(point.t)))
+
+    def product(self, point, d):
+        return self.jacobian(point) @ d
+
+    def transposed(self, point, w):
+        return self.jacobian(point).T @ w
+
+
+@pytest.mark.parametrize("size", [3, 30])  # by columns of J, by its products
+@pytest.mark.parametrize("seed", range(4))
+def test_searches_of_bounded_numbers_end_where_the_cost_is_least(size, seed):
+    problem, iterations = Linear(size, seed), []
+
+    def record(*row):
+        iterations.append(row)
+        if len(iterations) == 300:
+            raise Ended("too many")
+
+    search = Search(problem, Priors(None, problem.unknowns, None))
+    assert levenberg_marquardt(search, record, 0.03) == ("converged", True)
+    box = dict(bounds=problem.reach, x_scale=1.0, xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=500)
+    least = least_squares(lambda t: problem.run(t).residual, np.zeros(size).clip(*problem.reach), **box)
+    assert search.cost < 1.01 * 2 * least.cost + 0.1
+
+
 def test_expected_intervals_and_the_best_markers(swing):
     foreseen = ds.expected(swing, ds.Measurement("positions", np.zeros((11, 4, 3)), NOISE, MARKERS), TRUE)
     found = identify(swing, tracks(swing.forward(**TRUE), np.random.default_rng(8)), TRUE)
@@ -350,8 +398,21 @@ def test_refusals(swing):
     ):
         with pytest.raises(ValueError, match=expected):
             identify(swing, *arguments)
+    inside, priors = ds.Unknown(1e5, range=(1e4, 1e6)), (ds.Normal(2e6, 0.1), ds.Normal(1e6, 0.1), ds.Normal(1e5, 0.0))
+    for prior in priors:
+        with pytest.raises(ValueError, match="lies where the unknown cannot be, or its deviation is 0"):
+            identify(swing, data, {"youngs_modulus": inside}, 1.0, {"youngs_modulus": prior})
+    with pytest.raises(ValueError, match="scale must be finite and not 0"):
+        identify(swing, data, {"youngs_modulus": ds.Unknown(2e5, scale=0.0)}, 1.0)
+    for call in (identify, ds.expected):
+        with pytest.raises(ValueError, match="2 rollouts need as many data, got 3, and as many noises, got 2"):
+            call([swing, swing], [data] * 3, {"density": 1.0}, 1.0)
+        with pytest.raises(ValueError, match="got 2, and as many noises, got 3"):
+            call([swing, swing], [data] * 2, {"density": 1.0}, [1.0, 1.0, 1.0])
     with pytest.raises(ValueError, match="must lie inside range"):
         ds.Unknown(2.0, range=(0.0, 1.0))
+    with pytest.raises(ValueError, match="range must be finite"):
+        ds.Unknown(1e5, range=(1e4, np.inf))
 
 
 def test_the_command(tmp_path, capsys):

@@ -487,6 +487,8 @@ def test_coefficient_derivatives_are_exact(material, numbers, uniform):
     np.testing.assert_allclose(m.coefficients(values), chain.real, rtol=1e-15)
     jvp = m.coefficients_jvp(values, tangents)
     np.testing.assert_allclose(jvp, chain.imag / step, rtol=1e-12)  # complex step is exact: round-off
+    single = m.coefficients_jvp(values, {n: v.astype(np.float32) for n, v in tangents.items()})
+    np.testing.assert_allclose(single, jvp, rtol=1e-6)
     w = rng.normal(size=(4, jvp.shape[-1]))
     vjp = m.coefficients_vjp(values, w)
     assert {n: a.shape for n, a in vjp.items()} == {n: v.shape for n, v in values.items()}

@@ -122,7 +122,7 @@ def test_wrong_calls_are_named():
         ds.Robot.from_urdf(ARM, links=(), frction=0.3)
 
 
-def test_a_mirrored_mesh_stays_outside_in(tmp_path):
+def test_a_mirrored_mesh_keeps_its_outside(tmp_path):
     box = ds.TetrahedralMesh.create_box(2, 0.04)
     rows = [("v", *x) for x in box.vertices] + [("f", *x) for x in box.surface_triangles + 1]
     (tmp_path / "c.obj").write_text("\n".join(" ".join(map(str, row)) for row in rows))

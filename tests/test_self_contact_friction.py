@@ -225,6 +225,27 @@ def test_forces_on_a_body_are_what_its_momentum_gains():
     np.testing.assert_allclose(frames["normal"] + frames["friction"], force, atol=1e-12)
 
 
+def test_a_potential_that_is_interrupted_is_what_it_was():
+    solver = dragged(ds.ImplicitEulerSolver, 0.02)
+    workspace = solver.workspace(solver.start_values())
+    workspace.advance(0, 3, 4)  # the step ends with parts that slide
+    potential, u = workspace.potential, workspace.u_star
+
+    def seen():
+        potential.place(u)
+        return potential.energy()[0], potential.forces()[0], potential.product(np.ones_like(u))
+
+    before = seen()
+    friction = potential.surface_friction
+    ways = potential.at_rest, potential.without_friction, potential.without_viscosity, friction.without
+    for way in (*ways, lambda: friction.bounded(np.ones(len(friction.L), bool))):
+        with pytest.raises(KeyboardInterrupt):
+            with way():
+                raise KeyboardInterrupt
+        for a, b in zip(seen(), before):
+            np.testing.assert_array_equal(a, b)
+
+
 def test_forces_on_supports_are_counted_however_these_hold():
     """Fixed vertices take forces, beside others that are fixed in some directions too; a simulator notes what is read."""
     low = ds.TetrahedralMesh.create_box(2, size=0.1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,18 +61,19 @@ def refine(
     weights: ArrayLike | Callable | None = None,
     rounds: int = 20,
     most: int = 300_000,
-    ten_nodes: bool = True,
     onto: Callable[[np.ndarray], ArrayLike] | None = None,
     values: dict | None = None,
+    ten_nodes: bool = True,
 ) -> Refined:
     """Refine the mesh of a run where a number's error comes from, until its bar is below a tolerance.
 
     problem: a Rollout of equilibria or implicit steps. output, weights: the number, as in `Rollout.accuracy`.
     tolerance: of the bar over the number's change since the first frame. rounds: of refinement at most.
     most: unknowns of the finer mesh that says the error, beyond which no round begins.
-    ten_nodes: whether the first round of a linear mesh gives its tetrahedra ten nodes and cuts none, which brings most for
-        each unknown: the error falls by a higher power of the length of edges. False: all meshes are linear.
     onto: as in `TetrahedralMesh.refined`. values: of inputs, as in `Rollout.forward`.
+    ten_nodes: whether the first round of a linear mesh gives its tetrahedra ten nodes and cuts none, which brings most for
+        each unknown: the error falls by a higher power of the length of edges. With `onto` all meshes stay linear, for the
+        middles of edges would not lie there; so they do with False.
 
     In each other round the fewest tetrahedra that have half of the error by size are cut in two at their longest edges.
     States are carried to the new mesh, and Newton's method begins there. What the steps cost is not refined.
@@ -85,10 +87,9 @@ def refine(
         reached = found.relative <= tolerance
         if reached or len(history) > rounds or found.cost["finer unknowns"] > most:
             return Refined(problem, history, reached, values)
-        where = largest(found.shares)
-        finer = lambda mesh: mesh.refined(where, "longest", onto)  # noqa: E731
-        if ten_nodes and problem.scene.mesh.order == 1:
-            finer = TetrahedralMesh.quadratic
+        cuts = dict(where=largest(found.shares), edges="longest", onto=onto)
+        is_given_nodes = ten_nodes and onto is None and problem.scene.mesh.order == 1
+        finer = TetrahedralMesh.quadratic if is_given_nodes else partial(TetrahedralMesh.refined, **cuts)
         problem, values, P, _ = on_finer_mesh(problem, finer, values)
         given = [P @ u for u in run.each("places")]
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import public
 from diffsim_ti.identification.measurements import measurements
-from diffsim_ti.identification.problem import Experiment, Problem, is_experiment
+from diffsim_ti.identification.problem import Experiment, Problem, experiments
 from diffsim_ti.identification.result import Information, described
 from diffsim_ti.identification.unknowns import Priors
 from diffsim_ti.inputs.description import InputValue
@@ -54,10 +54,8 @@ def expected(
     data only shape, noise and NaN count; a name, or a list of names, of outputs stands for complete data.
     Atkinson, Donev, Tobias, Optimum Experimental Designs, 2007, ch. 17.
     """
-    several = not is_experiment(rollout)
-    rollouts = list(rollout) if several else [rollout]
-    given = list(data) if several else [data]
-    filled = [measurements(_complete(x, r), noise) for x, r in zip(given, rollouts)]
+    rollouts, given, noises = experiments(rollout, data, noise)
+    filled = [measurements(_complete(x, r), s) for x, r, s in zip(given, rollouts, noises)]
     problem = Problem(rollouts, filled, unknowns)
     priors = Priors(prior, problem.unknowns, rollouts[0].scene.mesh)
     t = np.zeros(problem.size)

@@ -15,7 +15,7 @@ from diffsim_ti.identification import search as searching
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.mesh_check import mesh_check
 from diffsim_ti.identification.modal_test import ModalTest
-from diffsim_ti.identification.problem import Problem, is_experiment
+from diffsim_ti.identification.problem import Problem, experiments
 from diffsim_ti.identification.result import Identification, Information, MeshCheck, described
 from diffsim_ti.identification.search import DENSE, FAILURES, METHODS, STOPPED, Ended, Search
 from diffsim_ti.identification.unknowns import TIME_OFFSET, Priors
@@ -84,10 +84,8 @@ def identify(
         known = f"{', '.join(METHODS)} or a function that makes a torch optimiser"
         raise ValueError(f"identify: method must be {known}, got {shown(method)}")
     go_on = partial(searching.torch_descent, method) if callable(method) else METHODS[method]
-    several = not is_experiment(rollout)
-    rollouts = list(rollout) if several else [rollout]
-    noises = noise if several and isinstance(noise, list | tuple) else [noise] * len(rollouts)
-    given = [measurements(x, s) for x, s in zip(data, noises)] if several else [measurements(data, noise)]
+    rollouts, data, noises = experiments(rollout, data, noise)
+    given = [measurements(x, s) for x, s in zip(data, noises)]
     problem = Problem(rollouts, given, unknowns)
     if method != "Levenberg-Marquardt" or problem.size > DENSE:
         problem.check_gradients()

@@ -28,12 +28,23 @@ class Point:
     residual: np.ndarray
 
 
+def experiments(rollout, data, noise) -> tuple[list, list, list]:
+    """Experiments, and the data and the noise of each."""
+    if is_experiment(rollout):
+        return [rollout], [data], [noise]
+    rollouts, data = list(rollout), list(data)
+    noises = list(noise) if isinstance(noise, list | tuple) else [noise] * len(rollouts)
+    if not len(rollouts) == len(data) == len(noises):
+        raise ValueError(
+            f"identify: {len(rollouts)} rollouts need as many data, got {len(data)}, and as many noises, got {len(noises)}"
+        )
+    return rollouts, data, noises
+
+
 class Problem:
     """r(t): what is measured less what is simulated, over the noise, of all experiments; counts its simulations."""
 
     def __init__(self, rollouts: list[Experiment], data: list[list[Measurement]], unknowns: dict):
-        if len(rollouts) != len(data):
-            raise ValueError(f"identify: {len(rollouts)} rollouts need as many data, got {len(data)}")
         if not unknowns:
             raise ValueError("identify: nothing is unknown; name an input, such as {'youngs_modulus': 1e5}")
         for rollout, given in zip(rollouts, data):

@@ -123,9 +123,11 @@ class LevenbergMarquardt:
             self.gradient = search.half_gradient(at)
         low, high = search.problem.reach  # numbers at an end that the cost pushes outwards stay there
         ended = (at.t <= low) & (self.gradient > 0) | (at.t >= high) & (self.gradient < 0)
-        self.gradient[ended] = 0.0
+        self.moves = ~ended
+        both = np.outer(self.moves, self.moves)
+        self.gradient, self.prior_hessian = self.gradient * self.moves, self.prior_hessian * both
         if self.dense:
-            self.hessian[ended], self.hessian[:, ended] = 0.0, 0.0
+            self.hessian = self.hessian * both
 
     def step(self) -> np.ndarray:
         """The damped Gauss-Newton step."""
@@ -136,7 +138,7 @@ class LevenbergMarquardt:
 
         def product(d):
             both = problem.transposed(self.search.point, problem.product(self.search.point, d))
-            return both + self.prior_hessian @ d + (damping + LEAST) * d
+            return self.moves * both + self.prior_hessian @ d + (damping + LEAST) * d
 
         solve = np.linalg.inv(self.prior_hessian + np.eye(problem.size))
         before, self.size = self.size, float(self.gradient @ solve @ self.gradient)
@@ -178,8 +180,7 @@ def levenberg_marquardt(search: Search, record: Callable, tolerance: float) -> t
         promised = float(-method.gradient @ step)
         if promised <= tolerance**2 * search.problem.size:
             return "converged", True
-        step = method.limited(step)
-        why = method.try_step(step)
+        why = method.try_step(method.limited(step))  # the step itself is what gets shorter
         rejected = rejected + 1 if why else 0
         record(promised, why)
         if rejected > 12:

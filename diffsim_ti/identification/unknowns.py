@@ -46,6 +46,10 @@ class Unknown(metaclass=Public):
         self.scale, self.experiments = scale, None if experiments is None else tuple(experiments)
         if range is not None and (shape_of("Unknown: range", range) != (2,) or isinstance(range, str | dict)):
             raise ValueError(f"Unknown: range must be two numbers (low, high), got {shown(range)}")
+        if range is not None and not np.all(np.isfinite(range)):
+            raise ValueError(
+                f"Unknown: range must be finite, got {shown(range)}; a start > 0 alone is searched by its logarithm"
+            )
         if range is not None and not (range[0] < self.start.min() and self.start.max() < range[1]):
             raise ValueError(f"Unknown: start = {self.start} must lie inside range = {range}")
         if range is not None and scale is not None:
@@ -76,6 +80,8 @@ class Free:
             if np.size(scale) not in (1, self.size):
                 raise ValueError(f"{label}: scale has shape {np.shape(scale)}, expected one number or {self.size}")
             self.scale = np.broadcast_to(np.ravel(np.asarray(scale, float)), (self.size,))
+            if not (np.all(np.isfinite(self.scale)) and np.all(self.scale != 0)):
+                raise ValueError(f"{label}: scale must be finite and not 0, got {shown(scale)}")
         self.kind = "bounded" if unknown.range is not None else "log" if is_log else "linear"
         if self.kind == "linear" and scale is None:
             raise ValueError(
@@ -215,7 +221,12 @@ class Priors:
             k = labels.index(label)
             start = sum(free.size for free in unknowns[:k])
             for one in given if isinstance(given, list | tuple) else [given]:
-                rows, r = one.rows(unknowns[k], mesh)
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    rows, r = one.rows(unknowns[k], mesh)
+                if not (np.isfinite(rows).all() and np.isfinite(r).all()):
+                    raise ValueError(
+                        f"prior of {label}: {one!r} lies where the unknown cannot be, or its deviation is 0"
+                    )
                 wide = np.zeros((len(rows), size))
                 wide[:, start : start + unknowns[k].size] = rows
                 parts.append(wide), right.append(r), edges.append(np.full(len(r), getattr(one, "edges", False)))

@@ -172,7 +172,8 @@ class Material(metaclass=Public):
             dp = self.coefficients_jvp(values, tangents) @ self.to_lame.T
             return dp[..., 0], dp[..., 1]
         self._check_known_moduli()
-        moved = [stepped(values, tangents)[name] for name in self._of_lame]
+        values = stepped(values, tangents)
+        moved = [values[name] for name in self._of_lame]
         parts = moduli.lame(*moved) if self._begins_with_E_and_nu() else np.broadcast_arrays(*moved)
         return tuple(part.imag / TINY for part in parts)
 
@@ -302,7 +303,7 @@ def summed(adjoint: np.ndarray, value, shape: tuple = ()) -> np.ndarray:
 
 def stepped(values: dict, tangents: dict) -> dict:
     """The values with their change as an imaginary part, which analytic formulas carry through."""
-    return {name: x + 1j * TINY * np.asarray(tangents.get(name, 0.0)) for name, x in values.items()}
+    return {name: x + 1j * TINY * np.asarray(tangents.get(name, 0.0), np.float64) for name, x in values.items()}
 
 
 def check_range(name: str, value, low: float, high: float, low_included: bool, remedy: str) -> None:

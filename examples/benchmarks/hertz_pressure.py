@@ -7,8 +7,8 @@ ch. 4, doi:10.1017/CBO9781139171731),
     a^3 = 3 F R / (4 E*),    p = 3 F / (2 pi a^2) (1 - r^2 / a^2)^(1/2),    E* = E / (1 - nu^2)
 
 `TactilePad` reads pressure on a grid, vertices give `ContactTraction`; both are compared where r < 0.8 a, as shares of the
-pressure there. Both are means over the faces around a vertex, and so fall short where the pressure is curved, by about
-2 (h / a)^2 at 0.8 a for a face of size h: 3 % takes twelve cells in a radius.
+pressure there. Both are means over the faces around a vertex, and so fall short where the pressure is curved, by 3
+to 4 (h / a)^2 at 0.8 a for a face of size h: 3 % takes twelve cells in a radius.
 
     python examples/benchmarks/hertz_pressure.py [cells in a radius ...]
 """

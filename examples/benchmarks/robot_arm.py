@@ -61,7 +61,7 @@ def main(steps: int = 200, dt: float = 5e-3) -> dict:
     frames = rollout.forward()
     seeds = {name: rng.normal(size=frames[name].shape) for name in ("positions", "velocities", *SEEN)}
     gradients, out = rollout.vjp(frames, **seeds), dict(force=frames["contact_force"][-1])
-    names = [name for name in frames.inputs if name.startswith("arm") and not name.endswith("velocities")]
+    names = [name for name in frames.inputs if name.startswith("arm")]
     size = {name: max(float(np.abs(frames.inputs[name]).max()), 0.1) for name in names}
     change = {name: size[name] * rng.normal(size=frames.inputs[name].shape) for name in names}
     pulled = sum(float((gradients[name] * change[name]).sum()) for name in names)

@@ -6,7 +6,7 @@ Every iteration of either takes one episode of all scenes. Returns are those of 
 
     python examples/control/against_ppo.py [--iterations 30] [--more 4] [--folder output]
 
-PPO is that of Stable-Baselines3 (pip install diffsim_ti[learning]). Schulman et al. 2017, Proximal Policy Optimization,
+PPO is that of Stable-Baselines3 (pip install "diffsim-ti[learning]"). Schulman et al. 2017, Proximal Policy Optimization,
 arXiv:1707.06347; Raffin et al. 2021, Stable-Baselines3, jmlr.org/papers/v22/20-1364.html.
 """
 
@@ -99,7 +99,7 @@ def ppo_of(envs, scaled: Callable, seed: int):
         from stable_baselines3 import PPO
         from stable_baselines3.common.vec_env import VecEnv
     except ImportError:
-        raise ImportError("PPO of Stable-Baselines3 is missing: pip install diffsim_ti[learning]") from None
+        raise ImportError('PPO of Stable-Baselines3 is missing: pip install "diffsim-ti[learning]"') from None
 
     class Scenes(VecEnv):
         """Which show scaled observations and rewards, and start anew in the step in which they end, as `SoftBodies` do."""

@@ -119,16 +119,18 @@ class Potential:
     def at_rest(self):
         """At rest, and then back to where it was."""
         u, kept = self.held_at, [(x, runtime.fetch(x)) for x in (self.z, self.held) if x is not None]
-        with self.joints.still() if self.joints else nullcontext():
-            self.place(np.zeros_like(u))
-            if self.z is not None:
-                runtime.fill(self.z, self.arrays.initial_state_blocks())
-            if self.held is not None:
-                runtime.fill(self.held, 0)
-            yield
-        self.place(u)
-        for array, numbers in kept:
-            runtime.fill(array, numbers)
+        try:
+            with self.joints.still() if self.joints else nullcontext():
+                self.place(np.zeros_like(u))
+                if self.z is not None:
+                    runtime.fill(self.z, self.arrays.initial_state_blocks())
+                if self.held is not None:
+                    runtime.fill(self.held, 0)
+                yield
+        finally:
+            self.place(u)
+            for array, numbers in kept:
+                runtime.fill(array, numbers)
 
     @contextmanager
     def without_viscosity(self):
@@ -136,9 +138,11 @@ class Potential:
         rate = None if self.rate is None else runtime.fetch(self.rate)
         if rate is not None:
             runtime.fill(self.rate, 0)
-        yield
-        if rate is not None:
-            runtime.fill(self.rate, rate)
+        try:
+            yield
+        finally:
+            if rate is not None:
+                runtime.fill(self.rate, rate)
 
     @contextmanager
     def without_friction(self):
@@ -152,9 +156,11 @@ class Potential:
         smooth = kept.copy()
         smooth[rough] = 0
         runtime.fill(a.parameters, smooth)
-        with self.surface_friction.without() if self.surface_friction else nullcontext():
-            yield
-        runtime.fill(a.parameters, kept)
+        try:
+            with self.surface_friction.without() if self.surface_friction else nullcontext():
+                yield
+        finally:
+            runtime.fill(a.parameters, kept)
 
     def energy(self) -> tuple[float, float, np.ndarray]:
         """(energy [J], the sum of its absolute parts, J at each point)."""

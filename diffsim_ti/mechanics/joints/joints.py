@@ -139,8 +139,10 @@ class Joints:
         """Stand where they are while the body is placed elsewhere."""
         kept = self._held
         self.hold(self.q)
-        yield
-        self._held, self._placed = kept, None
+        try:
+            yield
+        finally:
+            self._held, self._placed = kept, None
 
     def end(self) -> None:
         """The pass is over. Raises NotConverged where the joints are not in balance."""

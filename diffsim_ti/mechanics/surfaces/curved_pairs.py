@@ -144,10 +144,8 @@ class CurvedPairs:
         self._u, self._w, self._blocks = (runtime.array(vector, k, surface.num_vertices) for k in (1, 1, 3))
         self._row, self._rest_dot = runtime.array(vector, 1, n), runtime.array(vector, surface.num_vertices)
         self.step, self.next = runtime.array(vector, 1, n), runtime.array(vector, 1, n)
-        self._launch, self.launch = (
-            self.inner.list.launch,
-            self.inner.launch,
-        )  # cleared where arrays of the list are others
+        # cleared where arrays of the list are others
+        self._launch, self.launch = self.inner.list.launch, self.inner.launch
         self.friction = CurvedLaggedFriction(self) if self.inner.friction else None
 
     # ---- between nodes and points ------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.buffers import put
 from diffsim_ti.mechanics.surfaces.listed_pair import three
 from diffsim_ti.runtime import Kernel, kernels_of, vector_type
 
@@ -76,9 +77,7 @@ class FrictionProduct:
     def _put(self, name: str, dtype, data: np.ndarray) -> None:
         array = self.pairs.list.buffers.take(f"{name} of lagged friction", dtype, len(data))
         setattr(self.of, name, array)
-        whole = np.zeros((array.shape[0], *data.shape[1:]))
-        whole[: len(data)] = data
-        runtime.fill(array, whole)
+        put(array, data)
 
     def part(self, w, out) -> tuple:
         """What adds the change of the forces for changes w[0] to the last corners of `out`: kernel, records, numbers."""

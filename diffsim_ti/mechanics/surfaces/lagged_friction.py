@@ -85,15 +85,19 @@ class LaggedFriction:
         Directions then go too far less often. Lange, Hunter, Yang 2000, Optimization Transfer Using Surrogate Objective
         Functions, doi:10.1080/10618600.2000.10474858."""
         self._bounded, self._is_put = which, False
-        yield
-        self._bounded, self._is_put = False, False
+        try:
+            yield
+        finally:
+            self._bounded, self._is_put = False, False
 
     @contextmanager
     def without(self):
         """As if nothing pressed."""
         self.L, pressing, self._is_put = np.zeros_like(self.L), self.L, False
-        yield
-        self.L, self._is_put = pressing, False
+        try:
+            yield
+        finally:
+            self.L, self._is_put = pressing, False
 
     def _measure_here(self) -> None:
         pairs = self.pairs

@@ -8,17 +8,11 @@ import sys
 
 import numpy as np
 import torch
+from static_torch_fem import psi
 from torchfem import Solid
 from torchfem.materials import Hyperelastic3D
 
 torch.set_default_dtype(torch.float64)
-
-
-def psi(F, numbers):
-    mu, lam = numbers
-    C = F.transpose(-1, -2) @ F
-    log_J = 0.5 * torch.logdet(C)
-    return 0.5 * mu * (torch.trace(C) - 3) - mu * log_J + 0.5 * lam * (torch.exp(log_J) - 1) ** 2
 
 
 def loss(job, theta):

@@ -8,7 +8,6 @@ import torch
 from torchfem import Solid
 from torchfem.materials import Hyperelastic3D
 
-job = np.load(sys.argv[1])
 torch.set_default_dtype(torch.float64)
 
 
@@ -19,7 +18,7 @@ def psi(F, numbers):
     return 0.5 * mu * (torch.trace(C) - 3) - mu * log_J + 0.5 * lam * (torch.exp(log_J) - 1) ** 2
 
 
-def solved():
+def solved(job):
     body = Solid(
         torch.tensor(job["vertices"]),
         torch.tensor(job["tetrahedra"]),
@@ -30,9 +29,14 @@ def solved():
     return body.solve(increments=torch.tensor([0.0, 1.0]), max_iter=30, rtol=float(job["tolerance"]))[0]
 
 
-best = np.inf
-for _ in range(int(job["repeats"])):
-    begin = time.perf_counter()
-    u = solved()
-    best = min(best, time.perf_counter() - begin)
-np.savez(sys.argv[2], seconds=best, displacements=u.detach().numpy().reshape(-1, 3))
+def main(job) -> dict:
+    best = np.inf
+    for _ in range(int(job["repeats"])):
+        begin = time.perf_counter()
+        u = solved(job)
+        best = min(best, time.perf_counter() - begin)
+    return dict(seconds=best, displacements=u.detach().numpy().reshape(-1, 3))
+
+
+if __name__ == "__main__":
+    np.savez(sys.argv[2], **main(np.load(sys.argv[1])))

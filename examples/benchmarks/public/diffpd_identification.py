@@ -55,7 +55,7 @@ def cantilever(quick: bool) -> tuple:
 
 
 def thrown_ball(quick: bool) -> tuple:
-    """(rollout, truth, bounds of E, of nu): thrown at 1.5, 0.5 and -1 m/s from 7 cm above a rough floor."""
+    """(rollout, truth, bounds of E, of nu): thrown at 1.5, -1 and 0.5 m/s along x, y and z from 7 cm above a rough floor."""
     mesh = ball(2, 0.1).translated((0, 0.17, 0))
     scene = ds.Scene(
         mesh,
