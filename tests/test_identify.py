@@ -323,6 +323,7 @@ def test_a_number_that_was_driven_to_its_bound_comes_back():
     assert inside.converged and inside.simulations < 80
     assert inside.estimates == pytest.approx(TRUE, rel=1e-6)
     assert ended.converged and ended.estimates["poissons_ratio"] == pytest.approx(0.31, abs=2e-3 * 0.14)
+    assert "with poissons_ratio at the end of what its range" in str(ended) and "range" not in inside.stopped
 
 
 class Linear:

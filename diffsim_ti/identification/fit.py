@@ -136,6 +136,8 @@ def _is_far(search: Search, times: float) -> bool:
 def _result(searches: list[tuple[Search, str, bool]], best: int, with_covariance: bool, check_mesh) -> Identification:
     search, stopped, converged = searches[best]
     problem, t, residual = search.problem, search.point.t, search.point.residual
+    if ended := [label for label, x, ends in zip(problem.labels, t, problem.reach.T) if x in ends]:
+        stopped = f"{stopped}, with {', '.join(ended)} at the end of what its range lets it reach"
     starts = []
     for one, why, _ in searches:
         ends = dict(start=problem.all_numbers(one.start), numbers=problem.all_numbers(one.point.t))

@@ -146,16 +146,15 @@ class LevenbergMarquardt:
         return _conjugate_gradients(product, -self.gradient, solve, share)
 
     def limited(self, step: np.ndarray) -> np.ndarray:
-        """A step that changes no logarithm and no bounded number by more than LONGEST, and ends within their reach."""
+        """A step that changes no logarithm and no bounded number by more than LONGEST."""
         free = np.concatenate([np.full(f.size, f.kind != "linear") for f in self.search.problem.unknowns])
-        step, t = np.where(free, np.clip(step, -LONGEST, LONGEST), step), self.search.point.t
-        return np.clip(t + step, *self.search.problem.reach) - t
+        return np.where(free, np.clip(step, -LONGEST, LONGEST), step)
 
     def try_step(self, step: np.ndarray) -> str | None:
-        """Take the step if the cost falls; else damp more, and say why."""
+        """Take the step, to where the unknowns reach, if the cost falls; else damp more, and say why."""
         search = self.search
         try:
-            new = search.problem.run(search.point.t + step)
+            new = search.problem.run(np.clip(search.point.t + step, *search.problem.reach))
             cost, why = search.cost_of(new), "the cost rose"
         except FAILURES as error:
             new, cost, why = None, np.inf, f"{type(error).__name__}: {error}"
