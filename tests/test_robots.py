@@ -113,6 +113,13 @@ def test_values_by_names_come_in_the_order_of_the_joints():
     assert robot.values["joint_torques"].tolist() == [[0.5, 3], [0.5, 4]] and not robot.values["joint_velocities"].any()
     with pytest.raises(ValueError, match="velocities must name shoulder, elbow, got elbow"):
         ds.Robot.from_urdf(ARM, velocities={"elbow": 1.0})
+    with pytest.raises(ValueError, match=r"torques must have as many steps .* shoulder \(3,\), elbow \(2,\)"):
+        ds.Robot.from_urdf(ARM, torques={"elbow": [1.0, 2.0], "shoulder": [1.0, 2.0, 3.0]})
+    for wrong in (dict(links="tip"), dict(prescribed="elbow")):
+        with pytest.raises(ValueError, match="must be one or several (links|joints) by name"):
+            ds.Robot.from_urdf(ARM, **wrong)
+    with pytest.raises(ValueError, match="there is no file 'xxx"):
+        ds.Robot.from_urdf(300 * "x")
 
 
 def test_wrong_calls_are_named():
@@ -376,3 +383,61 @@ def test_steps_that_are_given_torques_are_those_of_a_run(pressing):
     simulator.resume(kept)
     simulator.step()
     np.testing.assert_array_equal(simulator.output(ds.JointVelocities("arm")), there)
+
+
+def test_two_robots_and_a_ball_in_any_order_have_the_same_run_and_exact_gradients():
+    """Robots of other sizes, one on a turned base, whose base and link with two shapes press, too; steps of unequal length,
+    two in a frame. No vertex is where two parts of an obstacle are equally near."""
+    contact = dict(friction=0.4, friction_speed=0.05, width=4e-3, stiffness_per_area=3e7)
+    ball = '<sphere radius="0.02"/>'
+    both = "".join(f'<collision><origin xyz="{x} 0 0"/><geometry>{ball}</geometry></collision>' for x in (0.0, 0.2))
+    text = urdf(
+        link("foot", shape=ball),
+        link("b", 0.3, 0.0).replace("</link>", both + "</link>"),
+        joint("j", "prismatic", "foot", "b", "-0.0034 0.0513 -0.0222", "0 1 0"),
+    )
+    slide = ds.Robot.from_urdf(
+        text,
+        "slide",
+        [0.0807, 0.0313, 0.0283, 0, np.pi / 2, 0],
+        targets=lambda t: [-0.3 * t],
+        prescribed=["j"],
+        **contact,
+    )
+    tip = ds.Robot.from_urdf(ARM, positions=[0.3, -1.0]).poses([0.3, -1.0])["robot_tip"][:3]
+    moves = dict(velocities=[-1.0, 0.5], drive_stiffness=50.0, drive_damping=1.0)
+    arm = ds.Robot.from_urdf(ARM, "arm", [0.0153, 0.0925, 0.0311] - tip, positions=[0.3, -1.0], **moves, **contact)
+    led = dict(name="ball", path=lambda t: [0.05 * t, 0.2 * t, 0], by_pairs=False)
+    away = ds.Sphere((-0.0215, 0.0374, 0.0341), 0.02, **led, **contact)
+    outputs = [ds.JointPositions("arm", "arm_at"), ds.JointVelocities("slide", "slide_speed")]
+    pressed = ["arm_tip", "slide_foot", "slide_b_1", "ball"]
+    outputs += [ds.ContactForce(name, name=f"on_{name}") for name in pressed]
+    runs = []
+    for terms, asked in (
+        ([arm, away, ds.Gravity(), slide], outputs),
+        ([slide, ds.Gravity(), arm, away], outputs[::-1]),
+    ):
+        scene = ds.Scene(MESH, SOFT, 500.0, terms, fixed="ymin", precision="f64")
+        solver, checkpoint_every = ds.ImplicitEulerSolver(scene, dt=5e-3, tolerance=1e-12), 2 if runs else None
+        options = dict(save_every=2, gradients="all", outputs=asked, checkpoint_every=checkpoint_every)
+        rollout = ds.Rollout(solver, [5e-3, 3e-3, 6e-3, 4e-3], **options)
+        frames, rng = rollout.forward(), np.random.default_rng(0)
+        seeds = {x: rng.normal(size=frames[x].shape) for x in ("positions", "velocities", *(y.name for y in outputs))}
+        runs.append((frames, rollout.vjp(frames, **seeds)))
+    assert all(np.abs(frames[f"on_{name}"][-1]).max() > 0.1 for name in pressed)
+    for name in seeds:
+        np.testing.assert_allclose(runs[1][0][name], runs[0][0][name], rtol=1e-9, atol=1e-12)
+    gradients = runs[0][1]
+    for name in gradients:
+        np.testing.assert_allclose(
+            runs[1][1][name], gradients[name], rtol=1e-7, atol=1e-9 * np.abs(gradients[name]).max()
+        )
+    share = lambda name, x: 1e-3 if name.endswith("positions") else max(0.1 * np.abs(x).max(), 1e-3)  # noqa: E731
+    sizes = {name: share(name, x) for name, x in frames.inputs.items()}
+    change = {name: sizes[name] * rng.normal(size=x.shape) for name, x in frames.inputs.items()}
+    sides = []
+    for e in (1e-5, -1e-5):
+        there = rollout.forward(**{name: x + e * change[name] for name, x in frames.inputs.items()})
+        sides.append(sum(float((seeds[k] * there[k]).sum()) for k in seeds))
+    whole = sum(float((gradients[name] * change[name]).sum()) for name in change)
+    assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(whole, rel=1e-5)

@@ -182,8 +182,8 @@ class Workspace:
         raise NotImplementedError
 
     def contact_forces(self, frame_time: np.ndarray):
-        """Mean forces [N] of frames, shape (frames, obstacles, 2: by push and by friction, num_vertices, 3); frame_time: how
-        long each takes [s], or all."""
+        """Mean forces [N] of frames, shape (frames, obstacles and surfaces on each other, 2: by push and by friction,
+        num_vertices, 3); frame_time: how long each takes [s], or all."""
         raise NotImplementedError
 
     def chamber_pressures(self, num_frames: int, save_every: int):

@@ -74,7 +74,7 @@ class ContactForce(Output):
         out.sides = {"total": slice(0, 2), "normal": slice(0, 1), "friction": slice(1, 2)}[self.part]
         return out
 
-    def _place(self, scene: "Scene") -> int:
+    def _place(self, scene: Scene) -> int:
         """Among the rows of frames.contact_forces."""
         return scene.place_of(self.obstacle)
 

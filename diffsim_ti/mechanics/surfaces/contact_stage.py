@@ -226,11 +226,11 @@ class PairContact(Stage):
         one, parts, b, led_to = None, [], None, u
         for tries in range(MOST_TRIES):
             flagged = np.flatnonzero(whole(self.inner.near)[: self.inner.list.count])
-            if not near.holds(flagged):
+            if extended := not near.holds(flagged):
                 self._extend(flagged, now)
             mass = self.a.values.mass
             near.begin(self.whole.vectors(start), anew=tries == 0)
-            if any(self.sets[x.set].follows_places for x in self.whole.near.sets):
+            if (tries == 0 or extended) and any(self.sets[x.set].follows_places for x in self.whole.near.sets):
                 near.put_sets(self._factors(self.whole, self._places(self.whole, start, u, mass)))
             if not near.choose(self.whole.vectors(led_to - start)):
                 break

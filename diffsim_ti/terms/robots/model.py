@@ -83,9 +83,8 @@ class RobotModel:
 
     def carries(self, joint: int) -> np.ndarray:
         """Which joints move what a joint carries; -1: the base, which none moves."""
-        out = np.zeros(self.size, bool) if joint < 0 else self.above[:, joint].copy()
-        out[joint if joint >= 0 else slice(0, 0)] = True
-        return out
+        own = np.arange(self.size) == joint
+        return own | self.above[:, joint] if joint >= 0 else own
 
     def kinematics(self, q: np.ndarray) -> tuple[list, np.ndarray]:
         """(pose of each joint's frame, twists of the joints about the world's origin, (v, w) each, shape (joints, 6))"""

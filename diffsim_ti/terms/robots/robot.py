@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
 from diffsim_ti.common import rotations
+from diffsim_ti.common.checked import listed
 from diffsim_ti.inputs import NOT_NEGATIVE, POSITIVE, Input
 from diffsim_ti.inputs.description import Range
 from diffsim_ti.inputs.links import Joined
@@ -53,7 +54,8 @@ class Robot(GivenOverTime, Term):
     run starts [rad or m, per s]; "torques", (joints,) or (steps, joints) [N m or N]; "targets", of shape (joints,),
     (steps, joints), or (steps + 1, joints) of a function or keyframes; "drive_stiffness" k, "drive_damping" c;
     "masses" [kg], of what each joint carries rigidly, whose inertia goes along. Links are obstacles <robot>_<link> of the
-    scene. Results: `JointPositions`, `JointVelocities`, and `ContactForce("<robot>_<link>")`.
+    scene, with _1, _2 behind it where a link has several shapes, and _ for what is no letter or digit.
+    Results: `JointPositions`, `JointVelocities`, and `ContactForce("<robot>_<link>")`.
     Limits of joints, effort and velocity in the file are not enforced. A link turns by less than half a turn in a step.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425; Featherstone 2008, Rigid Body Dynamics
     Algorithms.
@@ -101,6 +103,8 @@ class Robot(GivenOverTime, Term):
         Raises ValueError for joints of other kinds, mimic joints, closed loops, dry friction, joints that carry no mass, and
         files that cannot be read; ImportError without Pinocchio.
         """
+        prescribed = tuple(listed("Robot.from_urdf: prescribed", prescribed, "joints by name"))
+        links = None if links is None else tuple(listed("Robot.from_urdf: links", links, "links by name"))
         urdf, pose, known = Urdf(path), np.asarray(base, np.float64), LinkContact.__annotations__
         if pose.shape not in ((3,), (6,), (7,)) or not np.isfinite(pose).all():
             raise ValueError(f"Robot.from_urdf: base must be 3, 6 or 7 finite numbers, got {base}")
@@ -146,7 +150,7 @@ class Robot(GivenOverTime, Term):
                 "Robot.from_urdf: the robot has no positive definite inertia where it starts: check the <inertial> elements"
             )
         out.typical = np.diag(M).copy()
-        out._take_links(urdf.obstacles(name, None if links is None else tuple(links), dict(contact)))
+        out._take_links(urdf.obstacles(name, links, dict(contact)))
         return out
 
     def _take_links(self, found: list) -> None:
@@ -198,7 +202,13 @@ def each(joints: tuple[str, ...], name: str, given: OfJoints) -> ArrayLike:
     if isinstance(given, Mapping):
         if given.keys() != set(joints):
             raise ValueError(f"Robot.from_urdf: {name} must name {', '.join(joints)}, got {', '.join(given)}")
-        return np.stack(np.broadcast_arrays(*(given[joint] for joint in joints)), -1)
+        try:
+            return np.stack(np.broadcast_arrays(*(given[joint] for joint in joints)), -1)
+        except ValueError:
+            shapes = ", ".join(f"{joint} {np.shape(given[joint])}" for joint in joints)
+            raise ValueError(
+                f"Robot.from_urdf: {name} must have as many steps for each joint, got shapes {shapes}"
+            ) from None
     return np.full(len(joints), given, np.float64) if np.ndim(given) == 0 else given
 
 

@@ -1,5 +1,6 @@
 """URDF files: what of them is not supported is refused, and collision geometry becomes obstacles."""
 
+import os
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -40,7 +41,7 @@ class Urdf:
     def __init__(self, path: str | Path):
         text = str(path)
         self.folder = None if text.lstrip().startswith("<") else Path(text).parent
-        if self.folder is not None and not Path(text).is_file():
+        if self.folder is not None and not os.path.isfile(text):
             raise ValueError(f"Robot.from_urdf: there is no file {text!r}")
         self.text = text if self.folder is None else Path(text).read_text(encoding="utf-8")
         try:
