@@ -159,6 +159,22 @@ def test_a_pad_reads_the_same_however_it_is_turned():
     np.testing.assert_allclose(np.abs(signs), 1)
 
 
+@pytest.mark.parametrize("half", [False, True])
+def test_a_pad_says_where_its_points_are(half):
+    """In the middle of cells over the sole, also where a set of half the sole's triangles leaves points beside it."""
+    mesh = ds.TetrahedralMesh.create_box((4, 2, 3), (0.12, 0.03, 0.08))
+    sole = mesh.surface_where(lambda X, n: X[:, 1] < 1e-9)
+    floor = ds.Ground(-0.004, 1e4, 0.005, name="floor")
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.0), terms=[floor], precision="f64")
+    on = sole[::2] if half else sole
+    pad = ds.TactilePad("floor", on, size=(4, 6)).settled(scene)
+    assert pad.inside.all() != half and pad.inside.any()
+    x, z = (np.unique(pad.places[..., k].round(12)) for k in (0, 2))
+    np.testing.assert_allclose(x, 0.12 * (np.arange(6) + 0.5) / 6, atol=1e-12)
+    np.testing.assert_allclose(z, 0.08 * (np.arange(4) + 0.5) / 4, atol=1e-12)
+    np.testing.assert_allclose(pad.places[..., 1], 0, atol=1e-12)
+
+
 def on_a_turntable(dt=1e-3, **options) -> ds.Scene:
     """A cube on a disc that turns about a point beside it, and goes up and sideways."""
     turn = lambda t: [0.3 * t, 0.05 * t, 0.1 * t, 0.2 * t, 5 * t, 0.1 * t]  # noqa: E731
