@@ -122,6 +122,40 @@ def test_a_local_minimum_is_left_or_said_to_explain_nothing(tmp_path):
             identify(rollout, data, dict(youngs_modulus=3e5), starts=starts)
 
 
+def test_a_long_motion_is_found_by_its_early_data_from_far_starts():
+    """A search that is near a wrong minimum is set aside; what the first sixteenth of the motion says leads to the truth."""
+    rollout = body(240, 4)
+    data = tracks(rollout.forward(**TRUE), np.random.default_rng(0))
+    for start in (3e5, 1e6):
+        rows, stuck = [], identify(rollout, data, dict(youngs_modulus=start), starts=1)
+        assert not stuck.residuals_fit and abs(stuck.estimates["youngs_modulus"] / 8e4 - 1) > 0.3
+        found = identify(rollout, data, dict(youngs_modulus=start), callback=lambda row, frames: rows.append(row))
+        assert found.residuals_fit and found.converged and found.simulations < stuck.simulations
+        assert abs(found.estimates["youngs_modulus"] - 8e4) < 3 * found.standard_errors["youngs_modulus"]
+        assert [row["start"] for row in rows] == sorted(row["start"] for row in rows) and rows[-1]["start"] == 1
+        assert "set aside" in found.starts[0]["stopped"] and len(found.starts) == 2
+    model = Problem([rollout], [[data]], dict(youngs_modulus=5e4))
+    whole = model.run(np.zeros(1)).residual
+    with model.until(0.25) as count:
+        early = model.run(np.zeros(1))
+        assert count == 16 * 3 * len(MARKERS) and np.array_equal(
+            early.residual, whole * (np.arange(len(whole)) < count)
+        )
+        J, w = model.jacobian(early)[:, 0], np.linspace(-1, 1, len(whole))
+        assert not np.any(J[count:]) and abs(J @ w - model.transposed(early, w)[0]) < 1e-9 * np.abs(J).sum()
+    assert np.array_equal(model.run(np.zeros(1)).residual, whole)
+
+
+def test_a_search_that_was_set_aside_goes_on_where_nothing_explains_the_data():
+    """Data of two motions added up."""
+    rollout = body(240, 4)
+    one, other = (rollout.forward(youngs_modulus=E).positions[:, MARKERS] for E in (8e4, 4e5))
+    data = ds.Measurement("positions", 0.5 * (one + other), 1e-4, MARKERS)
+    found = identify(rollout, data, dict(youngs_modulus=1e6), max_iterations=20)
+    assert not found.residuals_fit and len(found.starts) > 2
+    assert found.starts[0]["stopped"] in ("converged", "stopped after 20 iterations")
+
+
 def test_intervals_of_one_number_and_of_several_have_the_same_form(swing):
     x = swing.forward(**TRUE).positions
     regions = np.repeat(np.arange(3), len(MESH.tetrahedra) // 3)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from diffsim_ti.identification.unknowns import TIME_OFFSET, Priors
 from diffsim_ti.rollout import Rollout
 
 FAR, AT_MOST = 3.0, 4  # residuals over the noise beyond which further starts are tried, and how many
+SLIGHT = 1e-3  # share of a cost which the noise does not explain; where a step promises less, a minimum is near
+SET_ASIDE = "set aside near a minimum that does not explain the data"
 
 
 @public
@@ -59,10 +62,11 @@ def identify(
     method: "Levenberg-Marquardt", which takes the fewest simulations; "L-BFGS-B" (SciPy's) needs gradients alone, so serves
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as
     `lambda t: torch.optim.Adam(t, lr=0.05)`, for costs that are rough. Both begin again when resumed.
-    starts: how many searches, the first from the unknowns' own start, the others from those of sixteen times as many
-    points around it whose cost is least (`around`); or further starts, a list of {unknown: numbers}. The best search is
-    returned, `Identification.starts` has all. Default: one, and up to four more, until one explains the data, where the
-    residuals of the first are more than three times the noise. max_iterations are of each.
+    starts: how many searches, the first from the unknowns' own start, the second from what early data alone lead to from
+    there (`grown`), the others from those of sixteen times as many points around whose cost is least (`around`); or further
+    starts, a list of {unknown: numbers}. The best search is returned, `Identification.starts` has all. Default: one, and up
+    to five more, until one explains the data, where the residuals of the first are more than three times the noise; it is
+    set aside for them near such a minimum. max_iterations are of each.
     check_mesh: fit the data again with ten-node tetrahedra of the same mesh, by a few forward runs, and widen the intervals
     by what estimates move (`MeshCheck`). Default: where it costs no more than three times the fit, or takes some seconds.
     False for data that this very mesh computed, which do not contain its error.
@@ -94,27 +98,45 @@ def identify(
     most, with_covariance = max_iterations, problem.size <= DENSE if covariance is None else covariance
     searches = []
 
-    def search(how, show) -> bool:
-        """Run a search to its end; whether there may be more."""
-        one = how()
+    def search(one: Search, show, hesitates: bool = False) -> bool:
+        """Run a search to its end, or until it `hesitates`; whether there may be more."""
+        record = partial(one.record, most, show, callback)
+
+        def recorded(promised=None, why=None):
+            record(promised, why)
+            if hesitates and promised is not None and promised < SLIGHT * one.cost and _is_far(one, FAR):
+                raise Ended(SET_ASIDE)
+
         try:
             if callback is not None and not one.is_resumed and callback(one.row(0), one.point.frames) is True:
                 raise Ended(STOPPED)
             if len(one.report) >= most:
                 raise Ended(f"stopped after {most} iterations")
-            stopped, converged = go_on(one, partial(one.record, most, show, callback), tolerance)
+            stopped, converged = go_on(one, recorded, tolerance)
         except Ended as end:
             stopped, converged = str(end), False
         searches.append((one, stopped, converged))
         return stopped != STOPPED
 
     with progress_bar("identify", most, progress) as show:
-        more = search(lambda: Search(problem, priors, resume), show)
+        more = search(Search(problem, priors, resume), show, starts is None)
         first, why, _ = searches[0]
+        ways = further
+        if not isinstance(further, list):
+            early, late = searching.grown(problem, priors, go_on, most), searching.around(problem, priors, further)
+            ways = (
+                chain(early, [first] * (why == SET_ASIDE), late)
+                if starts is None
+                else islice(chain(early, late), further)
+            )
         if more and (starts is not None or (not why.startswith("stopped") and _is_far(first, FAR))):
-            for start in further if isinstance(further, list) else searching.around(problem, priors, further):
-                with suppress(*FAILURES):  # numbers that end its first run
-                    more = search(lambda start=start: Search(problem, priors, None, start, len(searches)), show)
+            for start in ways:
+                if start is first:  # nothing explains the data: it goes on to its end
+                    more = search(first, show)
+                    searches[0] = searches.pop()
+                else:
+                    with suppress(*FAILURES):  # numbers that end its first run
+                        more = search(Search(problem, priors, None, start, len(searches)), show)
                 if not more or (starts is None and not _is_far(searches[-1][0], 1.0)):
                     break
     best = min(range(len(searches)), key=lambda k: searches[k][0].cost)

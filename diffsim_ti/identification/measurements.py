@@ -69,6 +69,13 @@ class Measurement(metaclass=Public):
         if self.values.shape != tuple(shape):
             raise ValueError(f"{self.output}: expected values of shape {tuple(shape)}, got {self.values.shape}")
 
+    def when(self, rollout: Rollout) -> np.ndarray:
+        """The share of the run that had passed at each of the values that are not missing."""
+        first, last = rollout.times[0], rollout.times[-1]
+        share = (np.asarray(rollout.times if self.times is None else self.times) - first) / ((last - first) or 1.0)
+        rows = np.nonzero(self.seen)[0]
+        return share[rows] if len(share) > 1 else np.zeros(len(rows))
+
     def _rows(self, times: np.ndarray, offset: float, order: int = 0) -> np.ndarray:
         """Weights of the frames in each row of values, shape (rows, frames)."""
         from scipy.interpolate import CubicSpline  # half a second to import

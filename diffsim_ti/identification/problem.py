@@ -1,6 +1,7 @@
 """Residuals of several experiments as one function of the free variables, with products by its Jacobian both ways."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,8 @@ class Problem:
         self.labels = [f"{f.label}[{i}]" if f.size > 1 else f.label for f in self.unknowns for i in range(f.size)]
         self.reach = np.concatenate([free.reach() for free in self.unknowns], 1)
         self.num_data = sum(int(m.seen.sum()) for given in data for m in given)
+        when = [m.when(rollout) for rollout, given in zip(rollouts, data) for m in given]
+        self.when, self.counts = np.concatenate([np.zeros(0), *when]), np.ones(())  # whether a datum does
 
     def _of(self, k: int) -> Iterable[tuple[Free, slice]]:
         return [(free, part) for free, part in zip(self.unknowns, self.parts) if k in free.experiments]
@@ -79,6 +82,15 @@ class Problem:
             out[free.input] = free.spread(k, free.numbers(t[part]), base)
         return out
 
+    @contextmanager
+    def until(self, share: float) -> Iterator[int]:
+        """For a while only data of the first share of each run count; how many there are."""
+        self.counts = self.when <= share
+        try:
+            yield int(self.counts.sum())
+        finally:
+            self.counts = np.ones(())
+
     def run(self, t: np.ndarray) -> Point:
         """A run of each experiment."""
         frames, residual = [], []
@@ -88,7 +100,7 @@ class Problem:
             frames.append(rollout.forward(**values))
             self.simulations += 1
             residual += [m.residual(frames[-1], offset) for m in self.data[k]]
-        return Point(np.array(t), frames, np.concatenate(residual))
+        return Point(np.array(t), frames, self.counts * np.concatenate(residual))
 
     def product(self, point: Point, d: np.ndarray) -> np.ndarray:
         """J d: a tangent run of each experiment whose inputs change."""
@@ -106,11 +118,11 @@ class Problem:
                 changes = rollout.tangents(point.frames[k], **tangents)
                 self.simulations += 1
             out += [m.change(point.frames[k], changes.get(m.output), offset, d_offset) for m in self.data[k]]
-        return np.concatenate(out)
+        return self.counts * np.concatenate(out)
 
     def transposed(self, point: Point, w: np.ndarray) -> np.ndarray:
         """J^T w: a reverse sweep of each experiment."""
-        out, begin = np.zeros(self.size), 0
+        out, begin, w = np.zeros(self.size), 0, self.counts * w
         for k, rollout in enumerate(self.rollouts):
             values, seeds, by_offset = self.inputs(k, point.t), {}, 0.0
             offset = float(values.get(TIME_OFFSET, 0.0))

@@ -8,6 +8,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -285,6 +286,31 @@ def torch_descent(make: Callable, search: Search, record: Callable, tolerance: f
             return "converged", True
 
 
+EARLY = 1 / 16, 1 / 8, 1 / 4, 1 / 2  # of a run
+
+
+def grown(problem: Problem, priors: Priors, go_on: Callable, most: int) -> Iterator[np.ndarray]:
+    """The start that is found from the unknowns' own by the data of the first part of each run, then of longer ones: late
+    data of a motion fit many periods, early ones fit one. None where all data are of one instant.
+
+    Pisarenko, Sornette 2004, doi:10.1103/PhysRevE.69.036122, on why a long motion has many minima.
+    """
+    t = np.zeros(problem.size)
+    for share in EARLY if np.any(problem.when > EARLY[-1]) else ():
+        with problem.until(share) as count, suppress(*FAILURES):
+            if count > problem.size:
+                one = Search(problem, priors, start=t)
+                with suppress(Ended):
+                    go_on(one, partial(one.record, most, _silent, None), 1.0)
+                t = one.point.t
+    if np.any(t):
+        yield t
+
+
+def _silent(*_) -> None:
+    """Show nothing."""
+
+
 EACH = 16  # points whose cost is asked for, for each start: a run each, where a search takes dozens
 WIDTH = dict(log=np.log(10.0), bounded=2.0, linear=3.0)  # of the free variables: a factor of ten, three scales
 
@@ -311,8 +337,8 @@ def further_starts(problem: Problem, starts: int | Iterable[dict]) -> int | list
 
 
 def around(problem: Problem, priors: Priors, count: int) -> Iterator[np.ndarray]:
-    """So many starts: of a Latin hypercube around the unknowns' own (a factor of ten to both sides, three scales, most of
-    the range), with one draw for all numbers of an unknown where there are many, those whose cost is least.
+    """Yields so many starts: of a Latin hypercube around the unknowns' own (a factor of ten to both sides, three scales,
+    most of the range), with one draw for all numbers of an unknown where there are many, those whose cost is least.
 
     McKay, Beckman, Conover 1979, doi:10.1080/00401706.1979.10489755.
     """
@@ -329,4 +355,4 @@ def around(problem: Problem, priors: Priors, count: int) -> Iterator[np.ndarray]
         with suppress(*FAILURES):  # numbers that end a run
             r = problem.run(t).residual
             points.append((float(r @ r) + priors.cost(t), k, t))
-    return (t for _, _, t in sorted(points, key=lambda point: point[:2])[:count])
+    yield from (t for _, _, t in sorted(points, key=lambda point: point[:2])[:count])

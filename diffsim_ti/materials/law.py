@@ -48,6 +48,7 @@ class Law(metaclass=Public):
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
     plastic = False  # whether its state is a flow that keeps the volume, and moves on with the strain alone
     viscous = False  # whether it has a `viscous_differential`
+    linear = False  # whether its stress is linear in H, so that its stiffness is that at rest
     # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
     frozen_names: ClassVar[tuple[str, ...]] = ()
     short = False  # whether its kernels are so short that Taichi's own passes over them pay (runtime/launch.py)

@@ -13,6 +13,7 @@ class LinearElasticLaw(StrainLaw):
     """psi = mu q + lam/2 t^2"""
 
     coefficient_names = ("mu", "lam")
+    linear = True
 
     @ti.func
     def psi(self, t, q, p):

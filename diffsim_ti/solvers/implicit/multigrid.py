@@ -84,7 +84,7 @@ class Multigrid(Preconditioner):
         a = potential.arrays
         self._follows = (
             potential.z is None and potential.held is None and not potential.hosts and a.values.growths is None
-        ) and a.num_scenes == 1
+        ) and (a.num_scenes == 1 and not a.law.linear)
         self.frames = Frames(potential, parallel)
         self.frames.allowed = upload_rows(projectors_of(free))
         self._aggregates = None

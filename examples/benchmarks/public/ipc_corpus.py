@@ -4,8 +4,8 @@
 
 FOLDERs hold the meshes of the paper's repository, as tests/contact_corpus.py says; of a clone named IPC they are
 IPC/input/tetMeshes/erleben IPC/input/tetMeshes IPC/input/triMeshes/erleben IPC/input/triMeshes. Without them coarser
-meshes of our own take their place. The tests' dependencies are needed: pip install ".[test]". Scenes share the minutes:
-each stops at its share of what is left, and its verdict is "stopped". Scenes are those of the paper by Li et al.
+meshes of our own take their place. The tests' dependencies are needed: pip install ".[test]". Scenes share the minutes
+of processor time: each stops at its share of what is left, and its verdict is "stopped". Scenes are those of the paper by Li et al.
 (doi:10.1145/3386569.3392425) and of Erleben (doi:10.1145/3096239); the paper's repository,
 https://github.com/ipc-sim/IPC, has the MIT licence. Equal: shapes, materials, steps and motions as published, as far as
 the paper says them. Not equal: without FOLDERs the meshes, and the paper's columns are microseconds of a step and
@@ -34,12 +34,12 @@ class TimeIsUp(Exception):
 
 
 def result(name: str, meshes: corpus.Meshes, steps: int | None, seconds: float) -> corpus.Run | str:
-    """What became of a scene within so many seconds, or why it was not posed."""
-    last, end = [], time.monotonic() + seconds
+    """What became of a scene within so many seconds of processor time, or why it was not posed."""
+    last, end = [], time.process_time() + seconds
 
     def say(run: corpus.Run) -> None:
         last[:] = [run]
-        if time.monotonic() > end:
+        if time.process_time() > end:
             raise TimeIsUp
 
     try:
@@ -59,9 +59,9 @@ def main(quick: bool, folders=(), names=None, minutes: float = 9.0) -> tuple[lis
     meshes, rows, runs = corpus.Meshes(*folders), [], []
     chosen = [n for n in corpus.SCENES if names is None or any(n.startswith(s) for s in names)]
     chosen = list(QUICK) if quick else chosen
-    end = time.monotonic() + 60 * minutes
+    end = time.process_time() + 60 * minutes
     for k, name in enumerate(chosen):
-        share = (end - time.monotonic()) / (len(chosen) - k)
+        share = (end - time.process_time()) / (len(chosen) - k)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = result(name, meshes, QUICK.get(name) if quick else None, share)
@@ -70,7 +70,7 @@ def main(quick: bool, folders=(), names=None, minutes: float = 9.0) -> tuple[lis
         rows.append(["" if cell == "nan" else cell for cell in shown])
         print(f"{name}: {rows[-1][-1]}", file=sys.stderr, flush=True)
     where = "the meshes of the paper's repository" if folders else "coarser meshes of our own"
-    notes = f"On {where}, all scenes within {minutes:g} minutes."
+    notes = f"On {where}, all scenes within {minutes:g} minutes of processor time."
     report("ipc_corpus", corpus.HEAD, rows, quick or names is not None, notes)
     return rows, runs
 
@@ -79,7 +79,7 @@ if __name__ == "__main__":
     arguments = parser(__doc__, peers=False)
     arguments.add_argument("--meshes", nargs="+", default=(), help="folders of meshes, searched in this order")
     arguments.add_argument("--scene", nargs="+", help="names, or what they begin with; the page stays as it is")
-    arguments.add_argument("--minutes", type=float, default=9.0, help="for all scenes")
+    arguments.add_argument("--minutes", type=float, default=9.0, help="of processor time, for all scenes")
     options = arguments.parse_args()
     ds.init("cpu", precision="f64")
     with threadpool_limits(1):
