@@ -5,8 +5,8 @@
 FOLDERs hold the meshes of the paper's repository, as tests/contact_corpus.py says; of a clone named IPC they are
 IPC/input/tetMeshes/erleben IPC/input/tetMeshes IPC/input/triMeshes/erleben IPC/input/triMeshes. Without them coarser
 meshes of our own take their place. The tests' dependencies are needed: pip install ".[test]". Scenes share the minutes
-of processor time: each stops at its share of what is left, and its verdict is "stopped". Scenes are those of the paper by Li et al.
-(doi:10.1145/3386569.3392425) and of Erleben (doi:10.1145/3096239); the paper's repository,
+of processor time: each stops at its share of what is left, and its verdict is "stopped". Scenes are those of the paper by
+Li et al. (doi:10.1145/3386569.3392425) and of Erleben (doi:10.1145/3096239); the paper's repository,
 https://github.com/ipc-sim/IPC, has the MIT licence. Equal: shapes, materials, steps and motions as published, as far as
 the paper says them. Not equal: without FOLDERs the meshes, and the paper's columns are microseconds of a step and
 tetrahedron of its own meshes on its authors' machine, of which we found no name. Seconds are those of the processor,
