@@ -11,7 +11,8 @@ friction 0.4 is our own choice. DiffPD publishes a search from one start each, s
 starts that arrive. It is C++ that is built from source, so it does not run here.
 
 A start arrives when E is within 1 % and nu within 0.01 of the truth. A search ends when it arrives, or after 100
-simulations. `identify` may begin up to four further searches from elsewhere; the other methods have one start. A
+simulations. `identify` may begin up to five further searches, the first from what the first part of the motion says; the
+other methods have one start. A
 forward, a tangent and a reverse run count as a simulation each. Times leave out compiling; the two tasks run at the
 same time, a process each.
 """
