@@ -88,14 +88,26 @@ class JoinedNewton(Newton):
         self.preconditioner.update(u)
         return self._direction_all(probe * self.free, np.full(len(solved), 1e-3), solved)[1]
 
+    def _rigidity(self) -> np.ndarray:
+        """How much force a small displacement makes at each vertex [N/m], contact and friction included."""
+        contact = self.potential.contact_blocks()
+        return self.stiffness if contact is None else self.stiffness + np.abs(contact).sum((1, 2))[:, None]
+
+    def _forcing(self, norm, before, solved, size, floor) -> float:
+        """Relative residual of a round's linear solve: rough while rounds gain little, but not of the last one, whose error
+        slow motions of stiff bodies would show. Eisenstat, Walker 1996, Choosing the Forcing Terms in an Inexact Newton
+        Method, choice 2, doi:10.1137/0917003."""
+        if not np.isfinite(norm):
+            return self.inexact
+        last = 0.3 * self.tolerance * size / norm  # what makes this round the last one, if that is within reach
+        exact = min(self.inexact, np.sqrt(norm / size), last if last > 0.03 * self.inexact else 1.0)
+        exact = max(exact, 0.3 * floor / norm)  # rounding would hide more
+        gained = min(norm / before, 1.0) if np.isfinite(before) else 1.0
+        return exact if solved else max(exact, min(self.rough, 0.9 * gained**2))
+
     def _residual_all(self, u):
-        f, sizes = self.potential.forces()
-        inertia = self.mass * (u - self.inertial)
-        if self.others:
-            f, sizes = f + self.others.forces(u), sizes + self.others.sizes(u)
-        felt = inertia * self.moves
-        size = np.sqrt(self._dot(sizes, sizes) + self._dot(self.loads, self.loads) + self._dot(inertia, felt))
-        return (f + self.loads - inertia) * self.free, size
+        R, sizes = self.residual(u)
+        return R, np.sqrt(self._dot(sizes, sizes))
 
     def _search_all(self, u, d, R, before, left) -> tuple:
         """(where scenes get, what was evaluated there, whether each moved, whether an obstacle cut it short)."""

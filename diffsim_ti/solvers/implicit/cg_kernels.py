@@ -10,7 +10,7 @@ from diffsim_ti.runtime import PRECISIONS, Kernel
 A = ti.template()
 # places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature, 3 r . z <= 0
 RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST, LIMIT = range(8)
-NUMBERS, ROOM = 8, 48  # of these; of those behind them, which are Newton's method's (newton_kernels.py), too
+NUMBERS, ROOM = 8, 56  # of these; of those behind them, which are Newton's method's (newton_kernels.py), too
 
 
 @dataclass(frozen=True)

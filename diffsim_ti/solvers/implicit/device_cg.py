@@ -16,7 +16,7 @@ class DeviceCG:
     """Solves A x = b for A = c M + d2E/du2 of a potential as `linear.conjugate_gradients` does. Vectors have float64 where
     the device has it.
 
-    free: what vertices may do (free.py), not of sets that move by few numbers.
+    free: what vertices may do (free.py); of sets that move by few numbers it keeps arrays alone, for rounds.py.
     cycle: the preconditioner, z = cycle(r) (cycle.py); None: `put_inverse` sets its blocks, one for each vertex.
     An iteration is one kernel, but on Vulkan, and a launch makes many.
     """
@@ -44,10 +44,8 @@ class DeviceCG:
         if cycle is None:
             self.inverse = runtime.array(self._vector, 3, n)
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
-        self._is_one_kernel = Repeated.is_possible(parallel)
-        whole = runs_on_cpu() and not parallel and self._is_one_kernel
-        # whether rounds of Newton's method are on the device, too
-        self.takes_rounds = self._is_one_kernel and self.precision == "f64"
+        self.is_one_kernel = Repeated.is_possible(parallel)
+        whole = runs_on_cpu() and not parallel and self.is_one_kernel
         # iterations between looks at the state; on a card so many as the solve before took
         self._look, self.last = self.many if whole else 1 if runs_on_cpu() else 0, 10
         # (with a matrix, convex) -> iterate(times, rounding), numbers of its products, what tells whether arrays are others
@@ -98,7 +96,7 @@ class DeviceCG:
     def _iteration(self, more: bool, convex: bool, products: list):
         """(times, rounding) -> so many iterations."""
         parts, potential, lanes = self.parts(more, products), self.potential, runs_on_cpu()
-        if self._is_one_kernel:
+        if self.is_one_kernel:
             repeated = Repeated("cg", [parts], self.parallel, lanes)
             return lambda times, rounding: repeated(times, **potential.sizes(), **self._sizes, rounding=rounding)
         launches = [

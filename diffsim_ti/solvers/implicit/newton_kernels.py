@@ -15,19 +15,26 @@ A = ti.template()
 (E, PARTS, E_TRIED, PARTS_TRIED, UPRIGHT, ROUND, PRODUCTS, TRIALS, HALVINGS, CUTS) = range(RISE + 1, RISE + 11)
 # what a solve is told: tolerances, limits, and numbers of `Newton`
 (TOLERANCE, EPS, MOST, INSIST, INEXACT, ROUGHEST, SHORTEST, ROUGHLY) = range(CUTS + 1, CUTS + 9)
-# what the host adds to energies, to their sizes and to the change along a step
-(BESIDE, BESIDE_PARTS, BESIDE_CHANGE) = range(ROUGHLY + 1, ROUGHLY + 4)
+# what the host adds to energies, to their sizes and to the change along a step; whether volumes that are held are not met,
+# and whether multipliers of theirs are counted anew once a step is taken
+(BESIDE, BESIDE_PARTS, BESIDE_CHANGE, UNMET, RECOUNTS) = range(ROUGHLY + 1, ROUGHLY + 6)
+# whether R is small; what brings the linear solve's x to the direction, whether that is of negative curvature, the longest
+# free step along it, the least change of the potential along it so far (1: go back to that); what makes a step good, and
+# the |R| that it is to lower
+(SOLVED, SCALE, INDEFINITE, LONGEST, BEST, MEASURE, TO_LOWER) = range(RECOUNTS + 1, RECOUNTS + 8)
 COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
-# phases: it is done, or the host has to go on; energies where rises are measured from, and of one; where a solve starts, a
-# trial of the line search, its residual, the preconditioner, conjugate gradients
-DONE, TROUBLE, BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE = range(9)
+# phases: it is done, no step is found, rounds are used up; energies where rises are measured from, and of one; where a solve
+# starts, a trial of the line search, its residual, the preconditioner, conjugate gradients
+DONE, TROUBLE, MANY, BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE = range(10)
 WAITS = 4  # of STOPPED: conjugate gradients have not begun
+BY_WORK, BY_RESIDUAL = 1, 2  # of MEASURE where there is no potential: work or |R| is lower, |R| is
+LONGEST_STEP = 64.0  # along an indefinite direction, which is doubled while Phi falls, for its length says little
 
 
 @dataclass(frozen=True)
 class NewtonKernels:
     """scene: precision of displacements and energies; vectors: of all else; guided: whether vertices are fixed in some
-    directions only; contact: whether there is contact; beside: whether the host has forces, too."""
+    directions only; contact: whether there is contact; beside: whether the host says the residual."""
 
     scene: str
     vectors: str
@@ -86,7 +93,7 @@ class NewtonKernels:
         for c in range(plan.chunks):
             slope = ti.cast(0, self.fp)
             for i in range(c * plan.length, self.end(c, plan.length, plan.nodes)):
-                d = cg.x[0, i] * cg.state[NORM]
+                d = cg.x[0, i] * cg.state[SCALE]
                 if ti.static(self.guided):
                     d = self.cg.allowed(i, cg, d)
                 newton.d[i] = d
@@ -101,7 +108,9 @@ class NewtonKernels:
                 cg.state[PHASE], cg.state[FRESH] = ti.cast(TRY, self.fp), ti.cast(1, self.fp)
                 self.cg.add_up(cg.part, 1, plan.chunks)
                 cg.state[SLOPE] = cg.part[0, 0]
-                cg.state[FRACTION] = ti.cast(1, self.fp)
+                cg.state[FRACTION], cg.state[LONGEST] = ti.cast(1, self.fp), ti.cast(1, self.fp)
+                if cg.state[INDEFINITE] == 1:
+                    cg.state[LONGEST] = ti.cast(LONGEST_STEP, self.fp)
                 cg.state[PRODUCTS] = cg.state[PRODUCTS] + cg.state[COUNT]
 
     @cached_property
@@ -117,7 +126,8 @@ class NewtonKernels:
         for _ in range(1):
             if cg.state[FRESH] == 1:
                 for j in range(plan.count):
-                    cg.state[FRACTION] = ti.min(cg.state[FRACTION], ti.cast(out.found[j], self.fp))
+                    cg.state[LONGEST] = ti.min(cg.state[LONGEST], ti.cast(out.found[j], self.fp))
+                cg.state[FRACTION] = ti.min(cg.state[FRACTION], cg.state[LONGEST])
                 if cg.state[FRACTION] < 1:
                     cg.state[CUTS] = cg.state[CUTS] + ti.cast(1, self.fp)
 
@@ -187,19 +197,41 @@ class NewtonKernels:
             if flat:
                 cg.state[RISE] = ti.cast(ti.math.inf, self.fp)
         elif cg.state[PHASE] == START:
-            cg.state[UPRIGHT] = ti.cast(cg.part[3, 0] == 0, self.fp)
-            cg.state[PHASE], cg.state[TRIALS] = ti.cast(JUDGE, self.fp), ti.cast(1, self.fp)
+            if cg.state[UPRIGHT] < 0:
+                cg.state[UPRIGHT] = ti.cast(cg.part[3, 0] == 0, self.fp)
+            cg.state[PHASE], cg.state[TRIALS] = ti.cast(JUDGE, self.fp), cg.state[TRIALS] + ti.cast(1, self.fp)
         else:
             cg.state[TRIALS] = cg.state[TRIALS] + ti.cast(1, self.fp)
             noise = cg.state[EPS] * 10 * (cg.state[PARTS] + size + cg.part[5, 0])
-            upright = cg.state[UPRIGHT] == 1 and cg.state[FRACTION] > cg.state[INSIST]
-            admissible = not (upright and flat)
-            if admissible and change <= cg.state[FRACTION] * cg.state[SLOPE] * ti.cast(-1e-4, self.fp):
-                cg.state[PHASE] = ti.cast(JUDGE, self.fp)
+            admissible = not (cg.state[UPRIGHT] == 1 and cg.state[FRACTION] > cg.state[INSIST] and flat)
+            lower = admissible and change <= cg.state[FRACTION] * cg.state[SLOPE] * ti.cast(-1e-4, self.fp)
+            if cg.state[BEST] != 0:
+                self.lengthen(cg, change, admissible)
+            elif cg.state[MEASURE] > 0:
+                if lower and cg.state[MEASURE] == BY_WORK and cg.state[SLOPE] > 0:
+                    cg.state[PHASE] = ti.cast(JUDGE, self.fp)
+                elif admissible and change - change == 0:
+                    cg.state[PHASE], cg.state[DOUBTED] = ti.cast(JUDGE, self.fp), ti.cast(1, self.fp)
+                else:
+                    self.halve(cg)
+            elif lower:
+                self.lengthen(cg, change, True)
             elif admissible and ti.abs(cg.state[SLOPE]) * cg.state[FRACTION] <= noise and change <= noise:
                 cg.state[PHASE], cg.state[DOUBTED] = ti.cast(JUDGE, self.fp), ti.cast(1, self.fp)
             else:
                 self.halve(cg)
+
+    @ti.func
+    def lengthen(self, cg: A, change, admissible):
+        """Take what is tried, or try twice as much of an indefinite direction while that is lower still."""
+        if cg.state[BEST] > 0:  # it is where the last step was lower
+            cg.state[PHASE], cg.state[BEST] = ti.cast(JUDGE, self.fp), ti.cast(0, self.fp)
+        elif not (admissible and (cg.state[BEST] == 0 or change < cg.state[BEST])):
+            cg.state[FRACTION], cg.state[BEST] = cg.state[FRACTION] * ti.cast(0.5, self.fp), ti.cast(1, self.fp)
+        elif cg.state[INDEFINITE] == 1 and cg.state[FRACTION] >= 1 and cg.state[FRACTION] * 2 <= cg.state[LONGEST]:
+            cg.state[FRACTION], cg.state[BEST] = cg.state[FRACTION] * 2, change
+        else:
+            cg.state[PHASE], cg.state[BEST] = ti.cast(JUDGE, self.fp), ti.cast(0, self.fp)
 
     @ti.func
     def halve(self, cg: A):
@@ -238,20 +270,18 @@ class NewtonKernels:
         zero = ti.cast(0, self.fp)
         square, size, floor, slope = zero, zero, zero, zero
         for i in range(c * plan.length, self.end(c, plan.length, plan.nodes)):
-            u, rigidity = self.cg.to(self.fp, at.u[0, i]), newton.stiffness[i]
-            inertia = (u + newton.inertial[i] * ti.cast(-1, self.fp)) * cg.mass[i]
-            R, forces = self.cg.to(self.fp, at.y[0, i]) + newton.loads[i], ti.cast(at.size[i], self.fp)
+            u, rigidity, R = self.cg.to(self.fp, at.u[0, i]), newton.stiffness[i], newton.R[i]
             if ti.static(self.beside):
-                inertia += newton.carried[i]
-                R += self.cg.to(self.fp, newton.pushes[i])
-                forces += newton.pushes[i][3]
-            R += inertia * ti.cast(-1, self.fp)
-            R = self.cg.allowed(i, cg, R)
-            newton.R[i] = R
+                size += R[3] * R[3]
+            else:
+                inertia = (u + newton.inertial[i] * ti.cast(-1, self.fp)) * cg.mass[i]
+                R = self.cg.to(self.fp, at.y[0, i]) + newton.loads[i] + inertia * ti.cast(-1, self.fp)
+                R, forces = self.cg.allowed(i, cg, R), ti.cast(at.size[i], self.fp)
+                newton.R[i] = R
+                size += forces * forces + self.cg.dot(newton.loads[i], newton.loads[i])
+                size += self.cg.dot(inertia, inertia) * cg.free[i]
             square += self.cg.dot(R, R)
             slope += self.cg.dot(R, newton.d[i])
-            size += forces * forces + self.cg.dot(newton.loads[i], newton.loads[i])
-            size += self.cg.dot(inertia, inertia) * cg.free[i]
             far = newton.far[i]
             for k in ti.static(range(3)):
                 far = ti.max(far, ti.abs(u[k]))
@@ -264,8 +294,7 @@ class NewtonKernels:
 
     @ti.func
     def take(self, cg: A, newton: A, plan: A):
-        """What is tried, and its residual is known: whether it is the last round, or how the next is solved
-        (`Newton.solve`, `Newton._forcing`)."""
+        """What is tried, and its residual is known: whether it is the last round, or how the next is solved."""
         one = ti.cast(1, self.fp)
         if cg.state[FRACTION] <= cg.state[INSIST]:
             cg.state[UPRIGHT] = ti.cast(0, self.fp)
@@ -279,30 +308,53 @@ class NewtonKernels:
             relative = norm / size
         newton.history[ti.cast(cg.state[ROUND], ti.i32)] = relative
         cg.state[ROUND] = cg.state[ROUND] + one
-        solved = norm <= cg.state[TOLERANCE] * size + floor
+        solved = norm <= cg.state[TOLERANCE] * size + floor and cg.state[UNMET] == 0
+        cg.state[SOLVED], cg.state[SCALE], cg.state[INDEFINITE] = ti.cast(solved, self.fp), norm, ti.cast(0, self.fp)
         if (solved and (cg.state[ROUGH] == 0 or norm <= floor)) or norm <= cg.state[ROUGHLY] * size:
             cg.state[PHASE] = ti.cast(DONE, self.fp)
-        elif cg.state[ROUND] > cg.state[MOST] or not norm - norm == 0:
+        elif not norm - norm == 0:
             cg.state[PHASE] = ti.cast(TROUBLE, self.fp)
         else:
-            last = cg.state[TOLERANCE] * size / norm * ti.cast(0.3, self.fp)
-            hidden = floor / norm * ti.cast(0.3, self.fp)
-            exact = ti.min(cg.state[INEXACT], ti.sqrt(norm / size))
-            if last > cg.state[INEXACT] * ti.cast(0.03, self.fp):
+            self.force(cg, size, solved)
+            cg.state[PHASE] = ti.cast(UPDATE, self.fp)
+            if cg.state[ROUND] > cg.state[MOST]:
+                cg.state[PHASE] = ti.cast(MANY, self.fp)
+            cg.state[STOPPED], cg.state[COUNT], cg.state[SQUARE] = ti.cast(WAITS, self.fp), ti.cast(0, self.fp), one
+
+    @ti.func
+    def force(self, cg: A, size, solved):
+        """How exact a round's linear solve is: rough while rounds gain little, but not of the last one, whose error slow
+        motions of stiff bodies would show. Eisenstat, Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method,
+        choice 2, doi:10.1137/0917003."""
+        norm, exact, hidden = cg.state[NORM], cg.state[INEXACT], ti.cast(0, self.fp)
+        forcing = exact
+        if norm > 0:  # else only a volume is not as it is to be
+            last = cg.state[TOLERANCE] * size / norm * ti.cast(0.3, self.fp)  # what makes this round the last one
+            hidden = cg.state[FLOOR] / norm * ti.cast(0.3, self.fp)  # by rounding
+            exact = ti.min(exact, ti.sqrt(norm / size))
+            if last > cg.state[INEXACT] * ti.cast(0.03, self.fp):  # which is within reach
                 exact = ti.min(exact, last)
             exact = ti.max(exact, hidden)
             forcing = exact
             if not solved:
-                gained = one
+                gained = ti.cast(1, self.fp)
                 if cg.state[BEFORE] > 0:
-                    gained = ti.min(norm / cg.state[BEFORE], one)
+                    gained = ti.min(norm / cg.state[BEFORE], gained)
                 forcing = ti.max(exact, ti.min(cg.state[ROUGHEST], gained * gained * ti.cast(0.9, self.fp)))
-            cg.state[ROUGH] = ti.cast(0, self.fp)
-            if forcing > ti.max(cg.state[INEXACT], hidden):
-                cg.state[ROUGH] = one
-            forcing = ti.max(forcing, cg.state[EPS] * 10)
-            cg.state[LEAST], cg.state[PHASE] = forcing * forcing, ti.cast(UPDATE, self.fp)
-            cg.state[STOPPED], cg.state[COUNT], cg.state[SQUARE] = ti.cast(WAITS, self.fp), ti.cast(0, self.fp), one
+        cg.state[ROUGH] = ti.cast(forcing > ti.max(cg.state[INEXACT], hidden), self.fp)
+        forcing = ti.max(forcing, cg.state[EPS] * 10)
+        cg.state[LEAST] = forcing * forcing
+
+    @ti.func
+    def is_good(self, cg: A):
+        """Whether R says that a step is: that the potential does not rise again as steeply as it fell before, which is left
+        to ask where its change drowns in rounding; where there is none, that |R| is less. Hager, Zhang 2005, A New Conjugate
+        Gradient Method with Guaranteed Descent, doi:10.1137/030601880."""
+        good = cg.part[3, 0] >= cg.state[SLOPE] * ti.cast(-0.8, self.fp)
+        if cg.state[MEASURE] > 0:
+            lower = cg.state[TO_LOWER] * (1 - cg.state[FRACTION] * ti.cast(1e-4, self.fp))
+            good = ti.sqrt(cg.part[0, 0]) <= lower
+        return good
 
     @ti.func
     def weigh(self, cg: A, newton: A, at: A, barriers: A, plan: A):
@@ -314,9 +366,10 @@ class NewtonKernels:
             cg.state[ACCEPTED] = ti.cast(0, self.fp)
             if cg.state[PHASE] == JUDGE:
                 self.cg.add_up(cg.part, 4, plan.chunks)
-                falls = cg.part[3, 0] >= cg.state[SLOPE] * ti.cast(-0.8, self.fp)
-                if cg.state[DOUBTED] == 1 and not falls:
+                if cg.state[DOUBTED] == 1 and not self.is_good(cg):
                     self.halve(cg)
+                elif cg.state[DOUBTED] == 1 and cg.state[RECOUNTS] == 1:  # R is another then
+                    cg.state[DOUBTED] = ti.cast(0, self.fp)
                 else:
                     self.take(cg, newton, plan)
         ti.loop_config(serialize=not self.parallel)
@@ -331,13 +384,13 @@ class NewtonKernels:
     @cached_property
     def judge(self) -> Kernel:
         """R where something is tried, its forces being there; if that is taken, what the round solves: r = R / |R|."""
-        cg = dict(mass="scalars", free="scalars", r="vectors2")
-        cg |= dict(guide="ints", held="vectors2") if self.guided else {}
-        values = "singles" if self.scene == "f32" else "doubles"
-        own = dict.fromkeys(("far", "stiffness", "history"), "scalars")
-        own |= dict.fromkeys(("u", "d", "R", "inertial", "loads"), "vectors") | dict(J=values)
-        own |= dict.fromkeys(("pushes", "carried"), "vectors") if self.beside else {}
-        at = dict(u=f"vectors2_{self.scene}", y=f"vectors2_{self.scene}", size=values, J=values)
+        cg, values = dict(free="scalars", r="vectors2"), "singles" if self.scene == "f32" else "doubles"
+        own = dict.fromkeys(("far", "stiffness", "history"), "scalars") | dict.fromkeys(("u", "d", "R"), "vectors")
+        own, at = own | dict(J=values), dict(u=f"vectors2_{self.scene}", J=values)
+        if not self.beside:
+            cg |= dict(mass="scalars") | (dict(guide="ints", held="vectors2") if self.guided else {})
+            own |= dict(inertial="vectors", loads="vectors")
+            at |= dict(y=f"vectors2_{self.scene}", size=values)
         barriers = dict(blocks=f"vectors2_{self.scene}") if self.contact else {}
         return self._kernel("judge", self.weigh, cg=cg, newton=own, at=at, barriers=barriers)
 
