@@ -89,14 +89,16 @@ def traced_alone(found: dict):
         for part in (self._trial, self._residual, self._update, *(self._steps or ())):
             if part:
                 part(1, **numbers)
-        self.state[PHASE] = DONE
+        self.potential.launch("energy", lanes=False)
+        self.potential.launch("forces")
+        self.state[:, PHASE] = DONE
 
-    kept = Launch._launch, Launch._compile, DeviceCG.__call__, Rounds._advance
-    Launch._launch, Launch._compile, DeviceCG.__call__, Rounds._advance = launch, _stop, solve, run
+    kept = Launch._launch, Launch._compile, DeviceCG.__call__, Rounds.advance
+    Launch._launch, Launch._compile, DeviceCG.__call__, Rounds.advance = launch, _stop, solve, run
     try:
         yield
     finally:
-        Launch._launch, Launch._compile, DeviceCG.__call__, Rounds._advance = kept
+        Launch._launch, Launch._compile, DeviceCG.__call__, Rounds.advance = kept
 
 
 class _Traced(Exception):

@@ -110,6 +110,9 @@ class Potential:
             self.joints.settle(self.held_at)
         return self.held_at
 
+    def only(self, bodies: np.ndarray) -> None:
+        """Of a batch, let what follows be of some bodies (batch/joined_potential.py)."""
+
     def hold(self, history, slot: int) -> None:
         """Hold the state that the law has in a slot."""
         if self.z is not None:

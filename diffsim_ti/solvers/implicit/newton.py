@@ -69,6 +69,7 @@ class Newton:
     by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
     indefinite = False  # whether the last direction that the host found is one of negative curvature
+    going = True  # which bodies are looked at
 
     def __init__(
         self,
@@ -122,7 +123,7 @@ class Newton:
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
         most, done, here = self.max_iterations if rounds is None else rounds, report.residuals, self.loop
-        here.start(self, 0.0 if rounds is None else self.roughly)
+        here.start(self, 0.0 if rounds is None else self.roughly, most)
         while True:
             phase, norm, floor, solved = here.run(most)
             if phase == DONE:
@@ -206,6 +207,12 @@ class Newton:
         """The Hessian of Phi where the potential stands."""
         return Operator(self.potential, self.mass, self.free, self.others)
 
+    def system(self) -> tuple | None:
+        """(diagonal mass, SciPy matrix of blocks or None) that join the potential's Hessian; None where a product needs the
+        host."""
+        found = self.operator().on_device()
+        return found and found[:2]
+
     def residual(self, u) -> tuple[np.ndarray, np.ndarray]:
         """(R, shape (num_vertices, 3); the root of the squares of the forces at each vertex that it is measured by)"""
         f, sizes = self.potential.forces()
@@ -284,9 +291,9 @@ class Newton:
         pairs = self.potential.pairs
         return self.collisions(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
-    def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[np.ndarray], float]:
-        """there -> how much higher Phi is at another place than at u. Forces without an energy do no more work on the way
-        than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+    def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[np.ndarray], np.ndarray]:
+        """there -> how much higher Phi of each body is at another place than at u. Forces without an energy do no more work
+        on the way than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
         self.pose(problem)
         here = self.loop
         here.stand(self, u)

@@ -25,6 +25,9 @@ class Rounds:
     The host solves where something is unusual in a linear system (`Newton.step`), and takes part between the launches where
     there is something `beside` the kernels: pairs of surfaces, of which it keeps the list, forces of its own, masses that
     are no diagonal, volumes, joints of robots, sets that move by few numbers. It adds energies and work, and says R.
+
+    `state` has a row of numbers for each body of a batch (batch/joined_newton.py), else one. Bodies are in the same phases
+    but where one halves its step more often than another.
     """
 
     small, many = 300, 200  # vertices up to which a solve on one thread is one kernel; phases in a launch of it
@@ -38,20 +41,18 @@ class Rounds:
         self.cg, a, n = preconditioner.solver, potential.arrays, potential.arrays.num_vertices
         cg, points, free = self.cg, potential.J.shape[0], preconditioner.free
         reduced, consistent = isinstance(free, FreeBodies), isinstance(newton.mass, ConsistentMass)
-        by_host = newton.others or potential.joints or reduced
+        by_host, self.several = newton.others or potential.joints or reduced, cg.systems > 1
         self.beside = beside = bool(by_host or potential.pairs or potential.hosts or consistent)
-        known = len(potential.hosts.matrices(potential.held_at)) == len(potential.hosts)
-        self.solves_on_host = bool(by_host) or not known
+        self.solves_on_host = newton.system() is None
         self.contact = contact = bool(a.contacts or potential.pairs or potential.hosts)
-        kernels = kernels_of(
-            NewtonKernels, a.precision, cg.precision, cg.parallel, isinstance(free, FreeDirections), contact, beside
-        )
+        how = a.precision, cg.precision, cg.parallel, isinstance(free, FreeDirections)
+        kernels = kernels_of(NewtonKernels, *how, contact, beside, self.several)
         fp, vector = runtime.PRECISIONS[cg.precision], runtime.array_types(cg.precision)["vectors"].dtype
         self.u, self.d, self.R, self.inertial, self.loads = (runtime.array(vector, n) for _ in range(5))
         self.far, self.stiffness, self.history = (runtime.array(fp, k) for k in (n, n, self.most_rounds + 1))
         self.J, self._filled = runtime.array(a.fp, points), {}
-        self.sizes = dict(chunks=cg.chunks, length=cg.length, nodes=n, count=detection.count)
-        self.sizes |= dict(points=points, points_length=-(-points // cg.chunks))
+        self.sizes = dict(chunks=cg.chunks, length=cg.length, nodes=n, count=detection.count, systems=cg.systems)
+        self.sizes |= dict(points=points, points_length=-(-(points // cg.systems) // (cg.chunks // cg.systems)))
         way, barriers = (detection.way, potential.barriers) if contact else (None, None)
         own = dict(cg=cg, at=potential, newton=(self, way), out=detection.found, barriers=barriers)
         of_potential = dict(scene=a, pass_=potential, at=potential, out=potential)
@@ -64,14 +65,16 @@ class Rounds:
             residual.append((potential.kernels.forces, of_potential))
             if contact:
                 residual.append((potential.kernels.contact_blocks, of_potential | dict(out=barriers)))
-        compare = [(potential.kernels.energy, of_potential), (kernels.choose, own)]
-        steps = direction, [(kernels.move, own)], compare, residual, [(kernels.judge, own)]
-        steps = [[(*part, None) for part in group] for group in steps]
-        groups = [[(tries, own, None), *sum(steps[:3], [])], [(judges, own, None), *sum(steps[3:], [])]]
-        update, hard = ([], None) if beside else preconditioner.updating()
+        energy, move = (potential.kernels.energy, of_potential), [(kernels.move, own)]
+        compare, judge = [(kernels.choose, own)], [(kernels.judge, own)]
+        groups = [[(tries, own), *direction, *move, energy, *compare], [(judges, own), *residual, *judge]]
+        direction, move, compare, judge, *groups = (
+            [(*part, None) for part in group] for group in (direction, move, compare, judge, *groups)
+        )
+        update, hard = ([], None) if beside or self.several else preconditioner.updating()
         update = [*update, (kernels.ready, dict(cg=cg, body=hard), None)] if update else []
-        self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small and not beside
-        self.whole &= potential.kernels.blocks.variables <= self.short
+        self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small
+        self.whole &= potential.kernels.blocks.variables <= self.short and not (beside or self.several)
         self._always, self._update = self.sizes | dict(kept=detection.kept), self._in_turn(update)
         if self.whole:
             groups += [[(updates, own, None), *update]] if update else []
@@ -79,8 +82,8 @@ class Rounds:
         self._trial = self._residual = self._steps = self._more = None
         if self.whole:
             self._trial = Repeated("newton", groups, cg.parallel, vectorized=True)
-        elif beside or runs_on_cpu() or not cg.is_one_kernel:
-            self._steps = [self._in_turn(group) for group in steps]
+        elif beside or self.several or runs_on_cpu() or not cg.is_one_kernel:
+            self._steps = [self._in_turn(group) for group in (direction, move, compare, judge)]
         else:
             self._trial, self._residual = (Repeated(f"newton{k}", [own], True) for k, own in enumerate(groups))
         if self.whole:
@@ -111,7 +114,6 @@ class Rounds:
 
     def _begin(self, newton, phase: int) -> None:
         """Tell the device the problem of a solve, and that it begins where the potential stands."""
-        self.state = state = np.zeros(ROOM)
         self.newton, self._base, self._direction = weakref.proxy(newton), self.potential.held_at, None
         self.cg.put_mass(newton.mass if isinstance(newton.mass, np.ndarray) else np.zeros((self.cg.nodes, 1)))
         self._put("inertial", newton.inertial)
@@ -119,10 +121,14 @@ class Rounds:
         runtime.fill(self.stiffness, newton.stiffness.ravel())
         if self.potential.arrays.contacts:
             self.detection.put(runtime.fetch(self.potential.poses)[::3])
-        state[nk.TOLERANCE], state[nk.EPS], state[nk.INSIST] = newton.tolerance, newton.eps, newton.insist
-        state[nk.SHORTEST], state[nk.UPRIGHT] = newton.shortest, -1
-        state[nk.INEXACT], state[nk.ROUGHEST], state[nk.FRACTION] = newton.inexact, newton.rough, 1.0
-        state[STOPPED], state[nk.PHASE], state[nk.RECOUNTS] = nk.WAITS, phase, bool(newton.volumes)
+        told = {nk.TOLERANCE: newton.tolerance, nk.EPS: newton.eps, nk.INSIST: newton.insist, nk.FRACTION: 1.0}
+        told |= {nk.SHORTEST: newton.shortest, nk.INEXACT: newton.inexact, nk.ROUGHEST: newton.rough, nk.UPRIGHT: -1}
+        self.state = np.zeros((self.cg.systems, ROOM))
+        self.state[:, list(told)] = list(told.values())
+        self.state[:, STOPPED], self.state[:, nk.RECOUNTS] = nk.WAITS, bool(newton.volumes)
+        self.state[:, nk.PHASE] = np.where(newton.going, phase, nk.DONE)
+        if self.several:
+            runtime.fill(self.u, self._base)
 
     # ---- rises of the potential --------------------------------------------------------------------------------------
 
@@ -130,35 +136,34 @@ class Rounds:
         """Measure `rise` from u."""
         self.potential.place(u)
         self._begin(newton, nk.BASE)
-        self._advance()
+        self.advance()
         self._based = self.state
 
-    def rise(self, there: np.ndarray) -> float:
-        """How much higher Phi is there; infinite where a tetrahedron changes its volume more than tenfold."""
+    def rise(self, there: np.ndarray) -> np.ndarray:
+        """How much higher Phi of each body is there; infinite where a tetrahedron changes its volume more than tenfold."""
         self.potential.place(there)
         self.state = self._based.copy()
-        self.state[nk.PHASE] = nk.PROBE
-        self._advance()
-        return float(self.state[nk.RISE])
+        self.state[:, nk.PHASE] = np.where(self.newton.going, nk.PROBE, nk.DONE)
+        self.advance()
+        return self.state[:, nk.RISE]
 
     # ---- a solve -----------------------------------------------------------------------------------------------------
 
-    def start(self, newton, roughly: float) -> None:
-        """Begin a solve where the potential stands; it also ends where R is `roughly` small."""
+    def start(self, newton, roughly: float, most: int) -> None:
+        """Begin a solve where the potential stands, which also ends where R is `roughly` small, or after so many rounds."""
         self._begin(newton, nk.START)
-        self.state[nk.ROUGHLY] = roughly
+        self.state[:, nk.ROUGHLY], self.state[:, nk.MOST], self.state[:, LIMIT] = roughly, most, self._limit()
 
     def run(self, most: int) -> tuple[float, float, float, bool]:
         """(why they end: DONE, TROUBLE or MANY; |R|, what of it is rounding, whether R is small) after rounds until the
         report of Newton has so many residuals, and one more."""
-        done, state = self.newton.report.residuals, self.state
-        state[nk.ROUND], state[nk.MOST] = 0, min(max(most - len(done), 0), self.most_rounds)
+        report, state = self.newton.report, self.state[0]
+        state[nk.ROUND], state[nk.MOST] = 0, min(max(most - len(report.residuals), 0), self.most_rounds)
         state[list(nk.COUNTED.values())] = 0
-        state[LIMIT] = self._limit()
-        self._advance()
-        state, report = self.state, self.newton.report
+        self.advance()
+        state = self.state[0]
         self.preconditioner.spent += int(state[nk.PRODUCTS])
-        done += runtime.fetch(self.history)[: int(state[nk.ROUND])].tolist()
+        report.residuals += runtime.fetch(self.history)[: int(state[nk.ROUND])].tolist()
         for name, place in nk.COUNTED.items():
             setattr(report, name, getattr(report, name) + int(state[place]))
         self.newton.upright = state[nk.UPRIGHT] == 1
@@ -166,7 +171,7 @@ class Rounds:
 
     def go_on(self) -> None:
         """With a round more than asked for."""
-        self.state[nk.PHASE] = nk.UPDATE
+        self.state[0, nk.PHASE], self.state[0, LIMIT] = nk.UPDATE, self._limit()
 
     def go(self, direction: np.ndarray, R: np.ndarray) -> None:
         """Along a direction in which Phi falls though R is zero; R: of which it is as if it were Newton's."""
@@ -181,12 +186,12 @@ class Rounds:
         if not self.newton.volumes.can_stiffen():
             return False
         self.potential.place(self._base)
-        self.state[nk.PHASE], self.state[STOPPED] = nk.START, nk.WAITS
+        self.state[0, nk.PHASE], self.state[0, STOPPED] = nk.START, nk.WAITS
         return True
 
     def end(self) -> np.ndarray:
         """Where the last step that was taken has led, where the potential then stands."""
-        if self.state[nk.PHASE] == nk.DONE:
+        if np.all(self.state[:, nk.PHASE] == nk.DONE):
             return self._here()
         return self.potential.place(runtime.fetch(self.u).astype(np.float64))
 
@@ -196,57 +201,83 @@ class Rounds:
         """Products of a linear solve on the device; none where the host solves."""
         own, static = self.preconditioner, not diagonal_of(self.newton.mass).any()
         slow = own.given_up or static and own.spent > 2 * own.patience
-        return 0 if self.solves_on_host or slow else min(10 * self.cg.nodes, own.patience)
+        return 0 if self.solves_on_host or slow else min(10 * self.cg.nodes // self.cg.systems, own.patience)
 
-    def _advance(self) -> None:
+    def _send(self) -> None:
+        runtime.fill(self.cg.state, self.state)
+
+    def _receive(self) -> None:
+        self.state = runtime.fetch(self.cg.state).astype(np.float64, copy=False)
+
+    def advance(self) -> None:
         """From one phase to the next until it is over."""
-        cg, served, state = self.cg, False, self.state
+        cg, served = self.cg, False
         numbers = self._always | self.potential.sizes() | dict(rounding=10 * self.newton.eps)
-        if state[nk.PHASE] == nk.START:
+        if nk.START in self.state[:, nk.PHASE]:
             self.preconditioner.follow(self.potential.held_at)
-        runtime.fill(cg.state, state)
-        while state[nk.PHASE] > nk.MANY:
-            phase, solving = state[nk.PHASE], state[nk.PHASE] == nk.SOLVE and not state[STOPPED]
-            if phase == nk.UPDATE and (served or not self._update):
-                self.preconditioner.update(self._here())
-                self._more = self._matrix() if self.beside and state[LIMIT] else None
-                state[nk.PHASE], state[STOPPED], served = nk.SOLVE, 0, False
-                runtime.fill(cg.state, state)
+        self._send()
+        while max(phases := self.state[:, nk.PHASE].tolist()) > nk.MANY:
+            solves = nk.SOLVE in phases
+            if solves and (odd := self._odd()).any():
+                self._solve(odd)
+                self._send()
                 continue
-            if not self._is_going_well(state):
-                self._solve()
-                runtime.fill(cg.state, self.state)
+            found = solves and not (self.state[:, STOPPED] == 0).any()
+            tries = found or any(nk.BASE <= phase <= nk.TRY for phase in phases)
+            judges, updates = not tries and nk.JUDGE in phases, nk.UPDATE in phases
+            updates = updates and not (tries or judges)
+            solves = not (tries or judges or updates)
+            if updates and (served or not self._update):
+                self._follow()
+                served = False
                 continue
-            numbers["most"] = nk.LONGEST_STEP if state[nk.INDEFINITE] else 1.0
+            numbers["most"] = nk.LONGEST_STEP if self.state[:, nk.INDEFINITE].any() else 1.0
             # a card goes on before the host has looked, but not to conjugate gradients
-            ahead = not (self.whole or self._steps) and nk.START <= phase and not solving
+            ahead = not (self.whole or self._steps or solves) and phases[0] >= nk.START
             if self.whole:
                 self._trial(self.many, **numbers)
-            elif solving:
-                self._iterate()
-            elif phase not in (nk.JUDGE, nk.UPDATE):
+            elif tries:
                 self._try(numbers)
-            if not self.whole and (phase == nk.JUDGE or ahead and phase != nk.UPDATE):
+            elif solves:
+                self._iterate()
+            if not self.whole and (judges or ahead and tries):
                 self._judge(numbers)
-            served = bool(self._update) and (self.whole or phase == nk.UPDATE or ahead)
+            served = bool(self._update) and (self.whole or updates or ahead)
             if served and not self.whole:
                 if self._steps:
                     self.preconditioner.follow(self._here())
                 self._update(1, **numbers)
-            if self.whole or not solving:
-                state = self.state = runtime.fetch(cg.state).astype(np.float64)
-            elif state[STOPPED] == 1:
-                cg.last = int(state[COUNT])
-                self.preconditioner.learn(float(np.sqrt(state[SQUARE])), cg.last)
-            if phase == nk.JUDGE and state[nk.ACCEPTED]:
-                self._base = self.potential.held_at
+            if self.whole or not solves:
+                self._receive()
+            elif (self.state[:, STOPPED] == 1).any():
+                cg.last = int(self.state[:, COUNT].max())
+                if not self.several:
+                    self.preconditioner.learn(float(np.sqrt(self.state[0, SQUARE])), cg.last)
+            if judges and self.beside:
+                taken = self.state[:, nk.ACCEPTED] == 1
+                self._base = self.potential.held_at if taken.all() else self._where(taken, self._base)
 
-    @staticmethod
-    def _is_going_well(state: np.ndarray) -> bool:
-        """Whether a linear solve is not at its limit, and has met no negative curvature and nothing that is not finite."""
-        fails = state[STOPPED] in (2, 3) or not np.isfinite(state[SQUARE])
-        fails = fails or (not state[STOPPED] and state[COUNT] >= state[LIMIT])
-        return not (state[nk.PHASE] == nk.SOLVE and fails)
+    def _follow(self) -> None:
+        """The preconditioner goes to where steps that were taken led, and conjugate gradients begin."""
+        here = self.potential.place(runtime.fetch(self.u).astype(np.float64)) if self.several else self._here()
+        self.preconditioner.update(here)
+        if self.beside and self.state[:, LIMIT].any():
+            mass, self._more = self.newton.system()
+            self.cg.put_system(mass, self._more)
+        on = self.state[:, nk.PHASE] == nk.UPDATE
+        self.state[on, nk.PHASE], self.state[on, STOPPED] = nk.SOLVE, 0
+        self._send()
+
+    def _where(self, which: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Where the potential stands of some bodies, else an other displacement."""
+        return np.where(np.repeat(which, len(other) // len(which))[:, None], self.potential.held_at, other)
+
+    def _odd(self) -> np.ndarray:
+        """Which linear solves are at their limits, or have met negative curvature or something that is not finite."""
+        state = self.state
+        fails = (state[:, STOPPED] == 2) | (state[:, STOPPED] == 3) | ~np.isfinite(state[:, SQUARE])
+        fails |= (state[:, STOPPED] == 0) & (state[:, COUNT] >= state[:, LIMIT])
+        return (state[:, nk.PHASE] == nk.SOLVE) & fails
 
     def _here(self) -> np.ndarray:
         """The displacement on the device, of which the host is told."""
@@ -255,23 +286,20 @@ class Rounds:
 
     # ---- linear solves -----------------------------------------------------------------------------------------------
 
-    def _matrix(self):
-        """What joins the Hessian of a round, for conjugate gradients."""
-        mass, more, _ = self.newton.operator().on_device()
-        self.cg.put_system(mass, more)
-        return more
-
     def _iterate(self) -> None:
         """Conjugate gradients until they stop."""
-        friction, more, state = self.potential.surface_friction, self._more is not None, self.state
+        friction, more = self.potential.surface_friction, self._more is not None
         with friction.bounded(self.newton.turning) if friction else nullcontext():
-            while not state[STOPPED] and self._is_going_well(state):
-                self.cg.iterate(int(state[COUNT]), int(state[LIMIT]), self.newton.eps, more)
-                state[:] = runtime.fetch(self.cg.state)
+            while np.any(on := (self.state[:, STOPPED] == 0) & ~self._odd()):
+                done, most = (int(self.state[on, k].max()) for k in (COUNT, LIMIT))
+                self.cg.iterate(done, most, self.newton.eps, more)
+                self._receive()
 
-    def _solve(self) -> None:
-        """The host's direction."""
-        state, newton = self.state, self.newton
+    def _solve(self, odd: np.ndarray) -> None:
+        """The host's direction; of several bodies what is left to those that are odd."""
+        if self.several:
+            return self.newton.leave(self, odd)
+        newton, state = self.newton, self.state[0]
         R, forcing = runtime.fetch(self.R).astype(np.float64), float(np.sqrt(state[LEAST]))
         direction, R = newton.step(self._here(), R, forcing)
         early = len(newton.report.residuals) + state[nk.ROUND] <= newton.by_work
@@ -279,7 +307,7 @@ class Rounds:
 
     def _take(self, direction: np.ndarray, R: np.ndarray, measure: int) -> None:
         """A direction that goes down by R is what a linear solve has found; measure: of what makes a step good."""
-        state, self._direction = self.state, direction
+        state, self._direction = self.state[0], direction
         runtime.fill(self.cg.x, direction[None])
         runtime.fill(self.R, R)
         state[nk.PHASE], state[STOPPED], state[COUNT], state[SQUARE] = nk.SOLVE, 1, 0, 0
@@ -290,36 +318,45 @@ class Rounds:
 
     def _set(self, numbers: dict) -> None:
         """Numbers of the state, by their places."""
-        state = runtime.fetch(self.cg.state)
-        state[list(numbers)] = list(numbers.values())
-        runtime.fill(self.cg.state, state)
+        self._receive()
+        for place, number in numbers.items():
+            self.state[:, place] = number
+        self._send()
 
     def _try(self, numbers: dict) -> None:
         """Energies of a trial, of a new direction or along the same."""
         if self._steps is None:
             return self._trial(1, **numbers)
-        (direct, move, compare, *_), phase = self._steps, self.state[nk.PHASE]
+        (direct, move, compare, _), phases = self._steps, self.state[:, nk.PHASE]
+        tried = (nk.BASE <= phases) & (phases <= nk.TRY) | (phases == nk.SOLVE)
+        phase = phases[tried].max()
         if phase == nk.SOLVE:
             direct(1, **numbers)
             if self.potential.pairs or (self.potential.joints and self.contact):
                 self._shorten()
         move(1, **numbers)
+        self.potential.only(tried)
         if self.beside:
             self._set(self._beside(phase))
+        self.potential.launch("energy", lanes=False)
         compare(1, **numbers)
 
     def _shorten(self) -> None:
         """Not farther along a new direction than to where surfaces meet, or links that give way."""
         potential, newton, u = self.potential, self.newton, self._base
-        state, step = runtime.fetch(self.cg.state), runtime.fetch_row(self.detection.way.step, 0)
-        share = longest = float(state[nk.LONGEST])
+        self._receive()
+        step, longest, cuts = (
+            runtime.fetch_row(self.detection.way.step, 0),
+            *self.state[0, [nk.LONGEST, nk.CUTS]].tolist(),
+        )
+        share = longest
         if potential.joints:
             share = newton.collisions(u, step, longest)[0]
         if potential.pairs:
             share = min(share, potential.pairs.safe_share(u, step, share, placed=True))
         if potential.surface_friction:
             newton.turning = potential.surface_friction.turns(u, u + step)
-        numbers = {nk.CUTS: state[nk.CUTS] + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share)}
+        numbers = {nk.CUTS: cuts + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share)}
         self._set(numbers | ({} if share > newton.shortest else {nk.PHASE: nk.TROUBLE}))
 
     def _beside(self, phase: int) -> dict:
@@ -334,33 +371,33 @@ class Rounds:
             u = potential.arrive(on_way=True) if moved else potential.held_at
         if newton.rigid and phase == nk.START:
             runtime.fill(self.far, runtime.fetch(self.far) + newton.rigid.rounding.ravel() / newton.eps)
-        energies, change, step, mass = potential.energies_beside(), 0.0, u - base, newton.mass
+        rows = lambda x: x.reshape(self.cg.systems, -1)  # noqa: E731
+        energies, change, step, mass = rows(potential.energies_beside()), 0.0, u - base, newton.mass
         if isinstance(mass, ConsistentMass):
-            change += float((step * (mass * (base + 0.5 * step - newton.inertial))).sum())
+            change = rows(step * (mass * (base + 0.5 * step - newton.inertial))).sum(1)
         if newton.others and step.any():
             work = newton.others.work(base, step)
-            change -= min(float((newton.others.forces(base) * step).sum()), work) if phase == nk.PROBE else work
-        return {
-            nk.BESIDE: energies.sum(),
-            nk.BESIDE_PARTS: np.abs(energies).sum(),
-            nk.BESIDE_CHANGE: np.inf if met else change,
-        }
+            if phase == nk.PROBE:
+                work = np.minimum(rows(newton.others.forces(base) * step).sum(1), work)
+            change = change - work
+        whole = {nk.BESIDE: energies.sum(1), nk.BESIDE_PARTS: np.abs(energies).sum(1)}
+        return whole | {nk.BESIDE_CHANGE: np.inf if met else change}
 
     def _judge(self, numbers: dict) -> None:
         """The residual of what is tried."""
         if self._steps is None:
             return self._residual(1, **numbers)
-        potential, newton, (*_, residual, judge) = self.potential, self.newton, self._steps
+        potential, newton, u = self.potential, self.newton, self.potential.held_at
+        potential.only(self.state[:, nk.PHASE] == nk.JUDGE)
+        if newton.volumes and not self.state[0, nk.DOUBTED]:
+            if self._direction is not None:
+                newton.recount(self._base, u - self._base, self._direction)
+                self._direction = None
+            self._set({nk.UNMET: not newton.volumes.met(u)})
         if self.beside:
-            u = potential.held_at
-            if newton.volumes and not self.state[nk.DOUBTED]:
-                if self._direction is not None:
-                    newton.recount(self._base, u - self._base, self._direction)
-                    self._direction = None
-                self._set({nk.UNMET: not newton.volumes.met(u)})
             runtime.fill(self.R, np.column_stack(newton.residual(u)))
-            if self.contact:
-                potential.put_contact_blocks()
         else:
-            residual(1, **numbers)
-        judge(1, **numbers)
+            potential.launch("forces")
+        if self.contact:
+            potential.put_contact_blocks()
+        self._steps[3](1, **numbers)
