@@ -69,11 +69,16 @@ class CGKernels:
 
     @ti.func
     def is_wanted(self, cg: A, plan: A):
-        return cg.state[0, STOPPED] == 0
+        wanted = cg.state[0, STOPPED] == 0
+        if ti.static(self.several):
+            for b in range(1, cg.state.shape[0]):
+                if cg.state[b, STOPPED] == 0:
+                    wanted = True
+        return wanted
 
     @cached_property
     def wanted(self) -> Kernel:
-        """Whether the solve goes on, for `Repeated`."""
+        """Whether a solve goes on, for `Repeated`."""
         return Kernel("wanted", self.is_wanted, self.vectors, dict(cg=dict(state="scalars2")), {})
 
     @ti.func

@@ -320,7 +320,7 @@ class NewtonKernels:
         solved = norm <= cg.state[b, TOLERANCE] * size + floor and cg.state[b, UNMET] == 0
         cg.state[b, SOLVED], cg.state[b, SCALE] = ti.cast(solved, self.fp), norm
         cg.state[b, INDEFINITE] = ti.cast(0, self.fp)
-        if (solved and (cg.state[b, ROUGH] == 0 or norm <= floor)) or norm <= cg.state[b, ROUGHLY] * size:
+        if (solved and (cg.state[b, ROUGH] == 0 or norm <= floor)) or norm < cg.state[b, ROUGHLY] * size:
             cg.state[b, PHASE] = ti.cast(DONE, self.fp)
         elif not norm - norm == 0:
             cg.state[b, PHASE] = ti.cast(TROUBLE, self.fp)
