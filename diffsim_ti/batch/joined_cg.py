@@ -5,9 +5,7 @@ from diffsim_ti.runtime import Piecewise, kernels_of
 from diffsim_ti.solvers.implicit.cg_kernels import STOPPED, CGKernels
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 
-DONE, NEGATIVE = 1, 2  # values of STOPPED
 COUNTS = "nodes", "below", "chunks", "systems", "num_items", "num_tetrahedra", "num_vertices"  # of all scenes
-
 
 # what scenes share, or is found by what `start` says, in kernels of one scene
 WHOLE = {(m, a) for m in ("level", "down", "up", "inverse") for a in ("column", "values")}
@@ -21,6 +19,8 @@ COUNTING |= {("scene", "corner_of"): ("scene", "corner")}
 class JoinedCG(DeviceCG):
     """Solves A x = b of all scenes; a scene that is not `going` keeps x = 0. On the processor a thread takes a scene to its
     end, while its arrays lie in the caches: from 64 scenes of 750 tetrahedra on twice as fast as all scenes in turns."""
+
+    several = True
 
     def __init__(self, potential, cycle, free, parallel: bool):
         self.systems, self.by_scene = potential.arrays.num_scenes, potential.arrays.by_scene

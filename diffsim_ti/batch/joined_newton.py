@@ -1,7 +1,7 @@
 """Newton's method for all scenes of a batch at once, each with its own steps, tolerances and end.
 
-What is done here is the usual course of Newton (solvers/implicit/newton.py) of one scene. A scene that leaves it (a line
-search that finds nothing, rounds that are used up, of statics an indefinite Hessian) is given up here, and run alone
+They go through the rounds of one scene (solvers/implicit/rounds.py) together. A scene that leaves their usual course (a line
+search that finds nothing, rounds that are used up, of statics an indefinite Hessian) is given up, and run alone
 (batch/batch.py).
 """
 

@@ -22,7 +22,7 @@ class DeviceCG:
     """
 
     most_chunks, shortest = 256, 32
-    systems = 1
+    systems, several = 1, False  # how many; whether there may be more than one
     many = 50  # iterations in a launch on one thread, which stops by itself
 
     def __init__(self, potential, cycle, free: Free, parallel: bool):
@@ -84,7 +84,7 @@ class DeviceCG:
         """An iteration, as [(kernel, records, numbers)] of `Repeated`; products: those of the potential."""
         potential, own = self.potential, dict(cg=self, at=self.potential)
         how = potential.arrays.precision, self.precision, self.parallel, self.guided, more
-        kernels = kernels_of(CGKernels, *how, self.systems > 1)
+        kernels = kernels_of(CGKernels, *how, self.several)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
         before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
         return [*before, *products, (kernels.step, own, None)]

@@ -41,7 +41,7 @@ class Rounds:
         self.cg, a, n = preconditioner.solver, potential.arrays, potential.arrays.num_vertices
         cg, points, free = self.cg, potential.J.shape[0], preconditioner.free
         reduced, consistent = isinstance(free, FreeBodies), isinstance(newton.mass, ConsistentMass)
-        by_host, self.several = newton.others or potential.joints or reduced, cg.systems > 1
+        by_host, self.several = newton.others or potential.joints or reduced, cg.several
         self.beside = beside = bool(by_host or potential.pairs or potential.hosts or consistent)
         self.solves_on_host = newton.system() is None
         self.contact = contact = bool(a.contacts or potential.pairs or potential.hosts)
@@ -191,7 +191,7 @@ class Rounds:
 
     def end(self) -> np.ndarray:
         """Where the last step that was taken has led, where the potential then stands."""
-        if np.all(self.state[:, nk.PHASE] == nk.DONE):
+        if self.state[0, nk.PHASE] == nk.DONE:
             return self._here()
         return self.potential.place(runtime.fetch(self.u).astype(np.float64))
 
@@ -345,11 +345,8 @@ class Rounds:
         """Not farther along a new direction than to where surfaces meet, or links that give way."""
         potential, newton, u = self.potential, self.newton, self._base
         self._receive()
-        step, longest, cuts = (
-            runtime.fetch_row(self.detection.way.step, 0),
-            *self.state[0, [nk.LONGEST, nk.CUTS]].tolist(),
-        )
-        share = longest
+        step, cuts = runtime.fetch_row(self.detection.way.step, 0), self.state[0, nk.CUTS]
+        share = longest = float(self.state[0, nk.LONGEST])
         if potential.joints:
             share = newton.collisions(u, step, longest)[0]
         if potential.pairs:
