@@ -13,11 +13,10 @@ from scipy.sparse import diags, eye
 from scipy.sparse.linalg import spsolve
 
 import diffsim_ti as ds
-from diffsim_ti import runtime
 from diffsim_ti.runtime.launch import Launch
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
-from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
-from diffsim_ti.solvers.implicit.newton_kernels import PHASE, TROUBLE
+from diffsim_ti.solvers.implicit.newton_kernels import DONE, PHASE
+from diffsim_ti.solvers.implicit.rounds import Rounds
 
 FIBRE = dict(k1=1e4, k2=1.0)
 
@@ -84,22 +83,22 @@ def traced_alone(found: dict):
         x[free] = spsolve(A.tocsc()[free][:, free], b.ravel()[free])
         return x.reshape(b.shape), 0.0, 1, None
 
-    def run(self, state, eps=0.0):
-        """Once, and then the host has to go on."""
-        numbers = self._always | self.potential.sizes() | dict(rounding=0.0)
+    def run(self):
+        """Once, and where it began is the solution."""
+        numbers = self._always | self.potential.sizes() | dict(rounding=0.0, most=1.0)
         for part in (self._trial, self._residual, self._update, *(self._steps or ())):
             if part:
                 part(1, **numbers)
-        runtime.fill(self.u, self.potential.held_at)
-        state[PHASE] = TROUBLE
-        return state
+        self.potential.launch("energy", lanes=False)
+        self.potential.launch("forces")
+        self.state[:, PHASE] = DONE
 
-    kept = Launch._launch, Launch._compile, DeviceCG.__call__, DeviceNewton._run
-    Launch._launch, Launch._compile, DeviceCG.__call__, DeviceNewton._run = launch, _stop, solve, run
+    kept = Launch._launch, Launch._compile, DeviceCG.__call__, Rounds.advance
+    Launch._launch, Launch._compile, DeviceCG.__call__, Rounds.advance = launch, _stop, solve, run
     try:
         yield
     finally:
-        Launch._launch, Launch._compile, DeviceCG.__call__, DeviceNewton._run = kept
+        Launch._launch, Launch._compile, DeviceCG.__call__, Rounds.advance = kept
 
 
 class _Traced(Exception):

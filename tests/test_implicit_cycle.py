@@ -12,10 +12,9 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.stress.projection import Projection
 from diffsim_ti.solvers.implicit.contact_kernels import ContactKernels
 from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
-from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
-from diffsim_ti.solvers.implicit.newton import Newton
+from diffsim_ti.solvers.implicit.rounds import Rounds
 
 
 def beam(precision="f64", **more) -> ds.Scene:
@@ -360,34 +359,50 @@ def moving(name: str) -> ds.Rollout:
     return ds.Rollout(ds.StaticSolver(scene) if name == "balance" else ds.ImplicitEulerSolver(scene, dt=0.01), 1)
 
 
-@pytest.mark.parametrize("name, small", [("blocks", 300), ("multigrid", 0), ("slides", 0), ("balance", 300)])
-def test_rounds_on_the_device_are_those_of_the_host(name, small, monkeypatch):
-    """small: vertices up to which a solve is one kernel."""
-    monkeypatch.setattr(DeviceNewton, "small", small)
-    found, taken, here = [], [], Newton._on_device
-    for choose in (lambda self: taken.append(here(self)) or taken[-1], lambda self: None):
-        monkeypatch.setattr(Newton, "_on_device", choose)
-        rollout = moving(name)
-        frames = rollout.forward()
-        found.append((frames.positions, rollout.vjp(frames, frames.positions)["youngs_modulus"]))
-    assert taken and all(taken)
-    (x, by_E), (other, by_other_E) = found
-    assert np.abs(x - other).max() <= 1e-9 * np.ptp(x, 0).max() and abs(by_E - by_other_E) <= 1e-6 * abs(by_other_E)
+def as_one_kernel(monkeypatch) -> None:
+    """Rounds of small bodies."""
 
 
-def test_rounds_that_the_device_leaves_go_on_on_the_host(monkeypatch):
-    """A column that is pressed beyond its buckling load meets indefinite Hessians: the same minimum."""
+def in_turn(monkeypatch) -> None:
+    monkeypatch.setattr(Rounds, "small", 0)
+
+
+def solved_on_the_host(monkeypatch) -> None:
+    monkeypatch.setattr(Rounds, "_limit", lambda self: 0)
+
+
+FORMS = as_one_kernel, in_turn, solved_on_the_host
+
+
+@pytest.mark.parametrize("name", ["blocks", "multigrid", "slides", "balance"])
+def test_rounds_lead_to_the_same_in_each_form(name, monkeypatch):
+    found = []
+    for form in FORMS:
+        with monkeypatch.context() as changed:
+            form(changed)
+            rollout = moving(name)
+            frames = rollout.forward()
+            found.append((frames.positions, rollout.vjp(frames, frames.positions)["youngs_modulus"]))
+    x, by_E = found[0]
+    for other, by_other_E in found[1:]:
+        assert np.abs(x - other).max() <= 1e-9 * np.ptp(x, 0).max() and abs(by_E - by_other_E) <= 1e-6 * abs(by_other_E)
+
+
+def test_rounds_go_on_where_the_hessian_is_indefinite(monkeypatch):
+    """A column that is pressed beyond its buckling load: the same minimum in each form."""
     mesh, runs = ds.TetrahedralMesh.create_box((9, 2, 2), (0.8, 0.1, 0.1)), []
     pressed = [ds.Traction([-6e3, 0.0, 1.0], "xmax")]
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, pressed, "xmin", precision="f64")
     solver = ds.ImplicitEulerSolver(scene, dt=0.5)
-    for choose in (Newton._on_device, lambda self: None):
-        monkeypatch.setattr(Newton, "_on_device", choose)
-        workspace = solver.workspace(solver.start_values())
-        workspace.advance(0, 1, 1)
-        runs.append((workspace.u_star, workspace.newton.report.indefinite))
-    assert runs[0][1] > 0 and runs[1][1] > 0
-    assert np.abs(runs[0][0] - runs[1][0]).max() < 1e-4 * np.abs(runs[0][0]).max()
+    for form in FORMS:
+        with monkeypatch.context() as changed:
+            form(changed)
+            workspace = solver.workspace(solver.start_values())
+            workspace.advance(0, 1, 1)
+            runs.append((workspace.u_star, workspace.newton.report.indefinite))
+    assert all(indefinite > 0 for _, indefinite in runs)
+    for u, _ in runs[1:]:
+        assert np.abs(runs[0][0] - u).max() < 1e-4 * np.abs(u).max()
 
 
 def stretched() -> ds.StaticSolver:

@@ -1,24 +1,23 @@
 """Newton's method for all scenes of a batch at once, each with its own steps, tolerances and end.
 
-What is done here is the usual course of Newton (solvers/implicit/newton.py) of one scene. A scene that leaves it (a line
-search that finds nothing, rounds that are used up, of statics an indefinite Hessian) is given up here, and run alone
+They go through the rounds of one scene (solvers/implicit/rounds.py) together. A scene that leaves their usual course (a line
+search that finds nothing, rounds that are used up, of statics an indefinite Hessian) is given up, and run alone
 (batch/batch.py).
 """
 
 import numpy as np
 
+from diffsim_ti import runtime
 from diffsim_ti.inputs import ConsistentMass
+from diffsim_ti.solvers.implicit import newton_kernels as nk
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, STOPPED
 from diffsim_ti.solvers.implicit.newton import Newton
 
 
 class JoinedNewton(Newton):
     """`going`: (scenes,), those that are not given up."""
 
-    def _rows(self, x: np.ndarray) -> np.ndarray:
-        return x.reshape(len(self.going), -1)
-
-    def _dot(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.einsum("bi,bi->b", self._rows(a), self._rows(b))
+    saddles = False  # whether negative curvature is left to runs alone
 
     def spread(self, x: np.ndarray) -> np.ndarray:
         """A number of each scene for each vertex, shape (num_vertices, 1)."""
@@ -29,50 +28,41 @@ class JoinedNewton(Newton):
     ) -> tuple:
         """(minimisers, whether each scene came to its own), as `Newton.solve` of each scene that is `going`; `rounds`: those
         that each took."""
-        self.mass, self.inertial, self.loads = problem
-        self.going = going = going.copy()
+        self.pose(problem)
+        self.going, self.saddles = going.copy(), leave_saddles
         self.potential.only(np.ones(len(going), bool))
-        u = self.potential.place(start)
-        self.preconditioner, self.stiffness = self.preconditioners(self.mass)
-        B, far = len(going), np.abs(u).max(1, keepdims=True)
-        E, norm, rough = self.potential.energies(), np.full(B, np.inf), np.zeros(B, bool)
-        self.upright = (E[2] > 0).all(1)
-        solved, left, cuts, self.rounds = np.zeros(B, bool), going.copy(), *np.zeros((2, B), int)
+        self.potential.place(start)
+        here, most = self.loop, self.max_iterations if rounds is None else rounds
+        here.start(self, 0.0 if rounds is None else self.roughly, most)
         while True:
-            (R, size), before = self._residual_all(u), norm
-            rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far)
-            stiff = self._rigidity() * rounding * self.moves
-            floor, norm = 4 * np.sqrt(self._dot(stiff, stiff)), np.sqrt(self._dot(R, R))
-            small = norm <= self.tolerance * size + floor
-            solved |= left & small & (~rough | (norm <= floor))
-            if rounds is not None:
-                solved |= left & np.isfinite(norm) & ((norm <= self.roughly * size) | (self.rounds >= rounds))
-            most = np.minimum(self.max_iterations + cuts, self.patience * self.max_iterations)
-            left &= ~solved & np.isfinite(norm) & (self.rounds < most)
-            if not left.any():
+            here.advance()
+            state, many = here.state, here.state[:, nk.PHASE] == nk.MANY
+            state[:, nk.MOST] = np.minimum(most + state[:, nk.CUTS], self.patience * most)
+            more = many & (state[:, nk.ROUND] <= state[:, nk.MOST]) & (rounds is None)
+            if not more.any():
                 break
-            self.rounds += left
-            self.potential.only(left)
-            self.preconditioner.update(u)
-            forcing = np.array(
-                [self._forcing(*x) if on else 1.0 for *x, on in zip(norm, before, small, size, floor, left)]
-            )
-            with np.errstate(divide="ignore", invalid="ignore"):
-                rough = forcing > np.maximum(self.inexact, 0.3 * floor / norm)
-            d, found, down, _ = self._direction_all(R * self.spread(left), np.maximum(forcing, 10 * self.eps), left)
-            left &= found | (down & (not leave_saddles))
-            u, E, moved, cut = self._search_all(u, d * self.spread(left), R, E, left)
-            cuts += cut
-            resting = left & ~moved & (small | (norm <= 100 * floor))  # rounding has the last word
-            solved, left = solved | resting, left & moved
+            state[more, nk.PHASE] = nk.UPDATE
+        phase, small = state[:, nk.PHASE], (state[:, nk.SOLVED] == 1) | (state[:, nk.NORM] <= 100 * state[:, nk.FLOOR])
+        solved = (phase == nk.DONE) | ((phase == nk.TROUBLE) & small)  # rounding has the last word
+        solved = going & (solved | many & (rounds is not None))
+        self.upright, self.rounds = state[:, nk.UPRIGHT] == 1, state[:, nk.ROUND] - 1
         self.potential.only(going)
+        u = self.potential.place(runtime.fetch(here.u).astype(np.float64))
         if leave_saddles and solved.any() and not self.by_residual:
             solved &= self._stable(u, solved)
         return u, solved
 
-    def _direction_all(self, R, forcing, left) -> tuple:
-        most = min(10 * len(R) // len(left), self.preconditioner.patience)
-        return self.preconditioner.solver(*self.system(), R, forcing, left, most, self.eps)
+    def leave(self, rounds, odd: np.ndarray) -> None:
+        """Scenes whose linear solve did not succeed go on as far as it led to negative curvature, or are left."""
+        state, cg = rounds.state, rounds.cg
+        goes_on = odd & (state[:, STOPPED] == 2) & (not self.saddles)
+        first = goes_on & (state[:, COUNT] <= 1)
+        if first.any():
+            x, p = (runtime.fetch_row(own, 0) for own in (cg.x, cg.p))
+            runtime.fill(cg.x, np.where(self.spread(first), p, x)[None])
+        state[goes_on, STOPPED] = 1
+        lost = odd & ~goes_on
+        state[lost, nk.PHASE], state[lost, nk.NORM], state[lost, nk.SOLVED] = nk.TROUBLE, np.inf, 0
 
     def system(self) -> tuple:
         """(diagonal mass, matrix of blocks or None) that join the potential's Hessian."""
@@ -84,73 +74,8 @@ class JoinedNewton(Newton):
 
     def _stable(self, u, solved) -> np.ndarray:
         """Whether Phi falls in no direction at u, as `Newton._downhill` asks."""
-        probe = np.tile(np.random.default_rng(0).standard_normal((len(u) // len(solved), 3)), (len(solved), 1))
+        count = len(solved)
+        probe = np.tile(np.random.default_rng(0).standard_normal((len(u) // count, 3)), (count, 1)) * self.free
         self.preconditioner.update(u)
-        return self._direction_all(probe * self.free, np.full(len(solved), 1e-3), solved)[1]
-
-    def _residual_all(self, u):
-        f, sizes = self.potential.forces()
-        inertia = self.mass * (u - self.inertial)
-        if self.others:
-            f, sizes = f + self.others.forces(u), sizes + self.others.sizes(u)
-        felt = inertia * self.moves
-        size = np.sqrt(self._dot(sizes, sizes) + self._dot(self.loads, self.loads) + self._dot(inertia, felt))
-        return (f + self.loads - inertia) * self.free, size
-
-    def _search_all(self, u, d, R, before, left) -> tuple:
-        """(where scenes get, what was evaluated there, whether each moved, whether an obstacle cut it short)."""
-        slope, share = self._dot(R, d), self.collisions(u, d)
-        open_, moved, share = left.copy(), np.zeros(len(left), bool), np.where(left, np.minimum(1.0, share), 0.0)
-        cut, E0 = left & (share < 1), before
-        after = E0
-        while open_.any():
-            self.potential.only(open_)
-            trial = self.potential.place(u + self.spread(share) * d)
-            after = self.potential.energies()
-            step = trial - u
-            change = after[0] - E0[0] + self._against_loads_all(u, step)
-            if self.others:
-                change = change - self._work(u, step)
-            kept = (after[2] > 0.1 * E0[2]).all(1)
-            change = np.where(self.upright & (share > self.insist) & ~kept, np.inf, change)
-            size = E0[1] + after[1] + self._rows(self.stiffness * trial**2).sum(1)
-            noise = 10 * self.eps * size
-            with np.errstate(invalid="ignore"):
-                lower = change <= -1e-4 * share * slope
-                drowned = (np.abs(slope) * share <= noise) & (noise >= change)
-            ask = open_ & ~lower & drowned
-            if ask.any():
-                lower |= ask & (self._dot(self._residual_all(trial)[0], d) >= -0.8 * slope)
-            found = open_ & lower
-            self.upright &= ~found | (share > self.insist)
-            moved |= found
-            open_ &= ~lower
-            share = np.where(open_, 0.5 * share, share)
-            given_up = open_ & ~(share > self.shortest)  # also a share that is no number
-            open_ &= ~given_up
-            share = np.where(given_up, 0.0, share)
-        if (left & ~moved).any():  # these stay
-            self.potential.only(left & ~moved)
-            self.potential.place(u + self.spread(np.where(moved, share, 0.0)) * d)
-            after = self.potential.energies()
-        self.potential.only(moved)
-        return self.potential.held_at, after, moved, cut
-
-    def _work(self, u, step) -> np.ndarray:
-        return sum(part.work(u, step) for part in self.others)
-
-    def _against_loads_all(self, u, step) -> np.ndarray:
-        return self._dot(step, self.mass * (u + 0.5 * step - self.inertial) - self.loads)
-
-    def rises(self, u, before: tuple, there, problem: tuple) -> np.ndarray:
-        """`rise` of each scene."""
-        self.mass, self.inertial, self.loads = problem
-        self.potential.only(self.going)
-        step = self.potential.place(there) - u
-        (after, _, J), (E, _, J0) = self.potential.energies(), before
-        with np.errstate(invalid="ignore"):
-            sound = ((J0 <= 0) | ((J > 0.1 * J0) & (J < 10 * J0))).all(1)
-        change = after - E + self._against_loads_all(u, step)
-        if self.others:
-            change = change - np.minimum(self._dot(self.others.forces(u), step), self._work(u, step))
-        return np.where(sound, change, np.inf)
+        most = min(10 * len(u) // count, self.preconditioner.patience)
+        return self.preconditioner.solver(*self.system(), probe, np.full(count, 1e-3), solved, most, self.eps)[1]

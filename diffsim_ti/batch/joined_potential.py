@@ -159,14 +159,9 @@ class JoinedPotential(Potential):
         """Let what follows be of some scenes, a mask; of others what was found before stays."""
         runtime.fill(self.skip, ~scenes)
 
-    def energies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(energy [J], the sum of its absolute parts) of each scene, J at each point, shape (scenes, points)."""
-        self.launch("energy", lanes=False)
-        count = self.arrays.num_scenes
-        parts = [of_scenes(runtime.fetch(x).astype(np.float64), count) for x in (self.elastic, self.contact)]
-        parts += [part.energies(self.held_at) for part in self.hosts]
-        J = of_scenes(runtime.fetch(self.J), count)
-        return sum(x.sum(1) for x in parts), sum(np.abs(x).sum(1) for x in parts), J
+    def energies_beside(self):
+        own = [part.energies(self.held_at) for part in self.hosts]
+        return np.concatenate([np.zeros((self.arrays.num_scenes, 0)), *own], 1)
 
     def product(self, w, convex=False):
         runtime.fill(self.skip, 0)

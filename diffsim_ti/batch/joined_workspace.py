@@ -91,13 +91,11 @@ class JoinedWorkspace(ImplicitWorkspace):
         near = self._in_front(u, held, starts, problem)
         newton.going = ~self.left
         best, least = near, np.zeros(self.num_scenes)
-        if starts:
-            self.potential.place(near)
-            before = self.potential.energies()
+        rise_of = newton.rises_from(near, problem) if starts else None
         for start in starts:
             share = newton.spread(self.collisions.past(near, start - near))
             there = near + share * (start - near)
-            rise = newton.rises(near, before, there, problem)
+            rise = rise_of(there)
             better = rise < least
             best, least = np.where(newton.spread(better), there, best), np.minimum(rise, least)
         there, solved = newton.solve_all(best, problem, ~self.left, stage.static)
@@ -123,12 +121,11 @@ class JoinedWorkspace(ImplicitWorkspace):
         if not meets.any():
             return near
         collisions.put(before)
-        self.potential.only(meets)
-        self.potential.place(held)
-        energies = self.potential.energies()
+        self.newton.going = meets
+        rise_of = self.newton.rises_from(held, problem)
         for start in starts:
             led = meets & (collisions.detection.shares(u, start - u, before, drift) == 1)
-            led &= self.newton.rises(held, energies, start, problem) <= 0
+            led &= rise_of(start) <= 0
             near, meets = np.where(spread(led), start, near), meets & ~led
         near = self._in_parts(near, step, before, drift, problem, meets)
         collisions.put(after)

@@ -110,6 +110,9 @@ class Potential:
             self.joints.settle(self.held_at)
         return self.held_at
 
+    def only(self, bodies: np.ndarray) -> None:
+        """Of a batch, let what follows be of some bodies (batch/joined_potential.py)."""
+
     def hold(self, history, slot: int) -> None:
         """Hold the state that the law has in a slot."""
         if self.z is not None:
@@ -167,29 +170,23 @@ class Potential:
         self.launch("energy", lanes=False)
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
         contact = np.concatenate([contact, self.energies_beside()])
-        if self.joints:
-            contact = np.concatenate([contact, self.joints.energies()])
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
 
     def energies_beside(self) -> np.ndarray:
-        """Those of pairs and from the host [J]."""
-        of_pairs = self.pairs.energies() if self.pairs else np.zeros(0)
-        return np.concatenate([of_pairs, *(part.energies(self.held_at) for part in self._on_host())])
-
-    def forces_beside(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those from the host [N], and the sums of their sizes."""
-        forces, sizes = np.zeros_like(self.held_at), np.zeros(len(self.held_at))
-        for part in self._on_host():
-            forces, sizes = forces + part.forces(self.held_at), sizes + part.sizes(self.held_at)
-        return forces, sizes
+        """Those of pairs, from the host and of joints [J]."""
+        own = [self.pairs.energies()] if self.pairs else []
+        own += [part.energies(self.held_at) for part in self._on_host()]
+        return np.concatenate([np.zeros(0), *own, *([self.joints.energies()] if self.joints else [])])
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(forces -dE/du [N], sum of the sizes of the forces that meet at each vertex)."""
         if self.pairs:
             self.pairs.forces(self.u, 0, self.arrays.corner)
         self.launch("forces")
-        forces, sizes = self.forces_beside()
-        return runtime.fetch_row(self.y, 0) + forces, runtime.fetch(self.size).astype(np.float64) + sizes
+        forces, sizes = runtime.fetch_row(self.y, 0), runtime.fetch(self.size).astype(np.float64)
+        for part in self._on_host():
+            forces, sizes = forces + part.forces(self.held_at), sizes + part.sizes(self.held_at)
+        return forces, sizes
 
     def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
         """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
@@ -309,10 +306,6 @@ class Potential:
     def put_contact_blocks(self) -> None:
         """All of them, on the device."""
         self.launch("contact_blocks", lanes=False, out=self.barriers)
-        self.leave_contact_blocks()
-
-    def leave_contact_blocks(self) -> None:
-        """Those of pairs and from the host join those of obstacles on the device."""
         if self.pairs:
             self.pairs.add_blocks(self.u, self.barriers.blocks)
         for part in self._on_host():

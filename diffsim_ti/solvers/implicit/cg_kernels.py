@@ -10,19 +10,21 @@ from diffsim_ti.runtime import PRECISIONS, Kernel
 A = ti.template()
 # places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature, 3 r . z <= 0
 RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST, LIMIT = range(8)
-NUMBERS, ROOM = 8, 48  # of these; of those behind them, which are Newton's method's (newton_kernels.py), too
+NUMBERS, ROOM = 8, 56  # of these; of those behind them, which are Newton's method's (newton_kernels.py), too
 
 
 @dataclass(frozen=True)
 class CGKernels:
     """scene: precision of the products; vectors: that of all else; guided: whether vertices are fixed in some directions
-    only; more: whether a matrix of blocks joins the potential's Hessian."""
+    only; more: whether a matrix of blocks joins the potential's Hessian; several: whether there are several systems of equal
+    size, one after the other, each with its row of `state` and as many chunks."""
 
     scene: str
     vectors: str
     parallel: bool
     guided: bool
     more: bool
+    several: bool = False
 
     @property
     def fp(self):
@@ -33,11 +35,32 @@ class CGKernels:
         return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
     @ti.func
-    def add_up(self, part: A, rows: A, chunks):
-        """part[k, 0] = the sum of what chunks have left in each of so many rows k."""
-        for c in range(1, chunks):
+    def add_up(self, part: A, rows: A, b, plan: A):
+        """The first chunk c of system b; part[k, c] = the sum of what its chunks have left in each of so many rows k."""
+        first = b * (plan.chunks // plan.systems)
+        for c in range(first + 1, first + plan.chunks // plan.systems):
             for k in ti.static(range(rows)):
-                part[k, 0] = part[k, 0] + part[k, c]
+                part[k, first] = part[k, first] + part[k, c]
+        return first
+
+    @ti.func
+    def system(self, i, count, plan: A):
+        """Of which system an entry is, of so many of all."""
+        b = 0
+        if ti.static(self.several):
+            b = i // (count // plan.systems)
+        return b
+
+    @ti.func
+    def span(self, c, length, count, plan: A):
+        """(first entry of a chunk with so many, the one after its last), of so many of all."""
+        begin, end = c * length, ti.min((c + 1) * length, count)
+        if ti.static(self.several):
+            per, own = plan.chunks // plan.systems, count // plan.systems
+            b = c // per
+            begin = b * own + (c - b * per) * length
+            end = ti.min(begin + length, (b + 1) * own)
+        return begin, end
 
     @ti.func
     def to(self, fp: A, v):
@@ -46,12 +69,17 @@ class CGKernels:
 
     @ti.func
     def is_wanted(self, cg: A, plan: A):
-        return cg.state[STOPPED] == 0
+        wanted = cg.state[0, STOPPED] == 0
+        if ti.static(self.several):
+            for b in range(1, cg.state.shape[0]):
+                if cg.state[b, STOPPED] == 0:
+                    wanted = True
+        return wanted
 
     @cached_property
     def wanted(self) -> Kernel:
-        """Whether the solve goes on, for `Repeated`."""
-        return Kernel("wanted", self.is_wanted, self.vectors, dict(cg=dict(state="scalars")), {})
+        """Whether a solve goes on, for `Repeated`."""
+        return Kernel("wanted", self.is_wanted, self.vectors, dict(cg=dict(state="scalars2")), {})
 
     @ti.func
     def divide(self, cg: A, plan: A):
@@ -96,35 +124,42 @@ class CGKernels:
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
             rz = ti.cast(0, self.fp)
-            for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
+            begin, end = self.span(c, plan.length, plan.nodes, plan)
+            for i in range(begin, end):
                 rz += self.dot(cg.r[0, i], cg.z[0, i])
             cg.part[0, c] = rz
         ti.loop_config(serialize=True)
-        for _ in range(1):
-            self.add_up(cg.part, 1, plan.chunks)
-            rz, old = cg.part[0, 0], cg.state[RZ]
-            if cg.state[STOPPED] == 0 and not rz > 0:
-                cg.state[STOPPED] = ti.cast(3, self.fp)
-            cg.state[BETA] = ti.cast(0, self.fp)
-            if cg.state[COUNT] > 0 and cg.state[STOPPED] == 0:
-                cg.state[BETA] = rz / old
-            if cg.state[STOPPED] == 0:
-                cg.state[RZ] = rz
+        for b in range(plan.systems):
+            if cg.state[b, STOPPED] == 0:
+                rz, old = cg.part[0, self.add_up(cg.part, 1, b, plan)], cg.state[b, RZ]
+                cg.state[b, RZ] = rz
+                cg.state[b, BETA] = ti.cast(0, self.fp)
+                if not rz > 0:
+                    cg.state[b, STOPPED] = ti.cast(3, self.fp)
+                elif cg.state[b, COUNT] > 0:
+                    cg.state[b, BETA] = rz / old
+            if ti.static(self.several):
+                at.skip[b] = ti.cast(cg.state[b, STOPPED], ti.i32)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
-            if cg.state[STOPPED] == 0:
+            b = self.system(i, plan.nodes, plan)
+            if cg.state[b, STOPPED] == 0:
                 p = cg.z[0, i]
-                if cg.state[BETA] != 0:  # else p is of another solve
-                    p += cg.p[0, i] * cg.state[BETA]
+                if cg.state[b, BETA] != 0:  # else p is of another solve
+                    p += cg.p[0, i] * cg.state[b, BETA]
                 cg.p[0, i] = p
                 at.w[0, i] = self.to(PRECISIONS[self.scene], p)
+
+    def _kernel(self, name: str, function, cg: dict, at: dict, **numbers) -> Kernel:
+        arrays = dict(cg=dict(part="scalars2", state="scalars2") | cg, at=at)
+        sizes = dict.fromkeys(("chunks", "length", "nodes", "systems"), "int")
+        return Kernel(name, function, self.vectors, arrays, sizes | numbers)
 
     @cached_property
     def turn(self) -> Kernel:
         """The next direction p = z + beta p."""
-        own = dict(part="scalars2", state="scalars") | dict.fromkeys(("r", "z", "p"), "vectors2")
-        arrays = dict(cg=own, at=dict(w=f"vectors2_{self.scene}"))
-        return Kernel("turn", self.first, self.vectors, arrays, dict(chunks="int", length="int", nodes="int"))
+        at = dict(w=f"vectors2_{self.scene}") | (dict(skip="ints") if self.several else {})
+        return self._kernel("turn", self.first, dict.fromkeys(("r", "z", "p"), "vectors2"), at)
 
     @ti.func
     def block(self, columns: A, k, v):
@@ -160,52 +195,56 @@ class CGKernels:
         cg.part[0, c], cg.part[1, c], cg.part[2, c] = curvature, pp, qq
 
     @ti.func
-    def choose(self, cg: A, plan: A):
-        """alpha = r . z / p . A p, zero once it has stopped."""
-        self.add_up(cg.part, 3, plan.chunks)
-        curvature, size = cg.part[0, 0], ti.sqrt(cg.part[1, 0] * cg.part[2, 0])
-        cg.state[ALPHA] = ti.cast(0, self.fp)
-        if cg.state[STOPPED] == 0:
-            cg.state[COUNT] = cg.state[COUNT] + ti.cast(1, self.fp)
-            if curvature > plan.rounding * size:
-                cg.state[ALPHA] = cg.state[RZ] / curvature
-            else:
-                cg.state[STOPPED] = ti.cast(2, self.fp)
+    def choose(self, b, cg: A, plan: A):
+        """alpha = r . z / p . A p, unless p . A p is not positive."""
+        c = self.add_up(cg.part, 3, b, plan)
+        cg.state[b, COUNT] = cg.state[b, COUNT] + ti.cast(1, self.fp)
+        if cg.part[0, c] > plan.rounding * ti.sqrt(cg.part[1, c] * cg.part[2, c]):
+            cg.state[b, ALPHA] = cg.state[b, RZ] / cg.part[0, c]
+        else:
+            cg.state[b, STOPPED] = ti.cast(2, self.fp)
+
+    @ti.func
+    def go(self, c, b, cg: A, plan: A):
+        """x and r of a chunk, and r . r."""
+        square, alpha, count = ti.cast(0, self.fp), cg.state[b, ALPHA], cg.state[b, COUNT]
+        begin, end = self.span(c, plan.length, plan.nodes, plan)
+        for i in range(begin, end):
+            x = cg.p[0, i] * alpha
+            if count > 1:  # else x is of another solve
+                x += cg.x[0, i]
+            cg.x[0, i] = x
+            cg.r[0, i] = cg.r[0, i] + cg.q[0, i] * -alpha
+            square += self.dot(cg.r[0, i], cg.r[0, i])
+        cg.part[0, c] = square
 
     @ti.func
     def advance(self, cg: A, at: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
-            self.multiply(c, c * plan.length, ti.min((c + 1) * plan.length, plan.nodes), cg, at)
+            if cg.state[self.system(c, plan.chunks, plan), STOPPED] == 0:
+                begin, end = self.span(c, plan.length, plan.nodes, plan)
+                self.multiply(c, begin, end, cg, at)
         ti.loop_config(serialize=True)
-        for _ in range(1):
-            self.choose(cg, plan)
+        for b in range(plan.systems):
+            if cg.state[b, STOPPED] == 0:
+                self.choose(b, cg, plan)
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
-            square, alpha = ti.cast(0, self.fp), cg.state[ALPHA]
-            for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
-                if alpha != 0:
-                    x = cg.p[0, i] * alpha
-                    if cg.state[COUNT] > 1:  # else x is of another solve
-                        x += cg.x[0, i]
-                    cg.x[0, i] = x
-                    cg.r[0, i] = cg.r[0, i] + cg.q[0, i] * -alpha
-                square += self.dot(cg.r[0, i], cg.r[0, i])
-            cg.part[0, c] = square
+            b = self.system(c, plan.chunks, plan)
+            if cg.state[b, STOPPED] == 0:
+                self.go(c, b, cg, plan)
         ti.loop_config(serialize=True)
-        for _ in range(1):
-            self.add_up(cg.part, 1, plan.chunks)
-            cg.state[SQUARE] = cg.part[0, 0]
-            if cg.state[STOPPED] == 0 and cg.state[SQUARE] <= cg.state[LEAST]:
-                cg.state[STOPPED] = ti.cast(1, self.fp)
+        for b in range(plan.systems):
+            if cg.state[b, STOPPED] == 0:
+                cg.state[b, SQUARE] = cg.part[0, self.add_up(cg.part, 1, b, plan)]
+                if cg.state[b, SQUARE] <= cg.state[b, LEAST]:
+                    cg.state[b, STOPPED] = ti.cast(1, self.fp)
 
     @cached_property
     def step(self) -> Kernel:
         """x and r after a step along p, y being what the potential's product makes of it."""
-        own = dict(part="scalars2", state="scalars", mass="scalars", free="scalars")
-        own |= dict.fromkeys(("x", "r", "p", "q"), "vectors2")
+        own = dict(mass="scalars", free="scalars") | dict.fromkeys(("x", "r", "p", "q"), "vectors2")
         own |= dict(guide="ints", held="vectors2") if self.guided else {}
         own |= dict(start="ints", column="ints", blocks="vectors2") if self.more else {}
-        arrays = dict(cg=own, at=dict(y=f"vectors2_{self.scene}"))
-        numbers = dict(chunks="int", length="int", nodes="int", rounding="float")
-        return Kernel("step", self.advance, self.vectors, arrays, numbers)
+        return self._kernel("step", self.advance, own, dict(y=f"vectors2_{self.scene}"), rounding="float")

@@ -16,13 +16,13 @@ class DeviceCG:
     """Solves A x = b for A = c M + d2E/du2 of a potential as `linear.conjugate_gradients` does. Vectors have float64 where
     the device has it.
 
-    free: what vertices may do (free.py), not of sets that move by few numbers.
+    free: what vertices may do (free.py); of sets that move by few numbers it keeps arrays alone, for rounds.py.
     cycle: the preconditioner, z = cycle(r) (cycle.py); None: `put_inverse` sets its blocks, one for each vertex.
     An iteration is one kernel, but on Vulkan, and a launch makes many.
     """
 
     most_chunks, shortest = 256, 32
-    kernels_kind = CGKernels
+    systems, several = 1, False  # how many; whether there may be more than one
     many = 50  # iterations in a launch on one thread, which stops by itself
 
     def __init__(self, potential, cycle, free: Free, parallel: bool):
@@ -30,10 +30,10 @@ class DeviceCG:
         self.potential, self.cycle, self.nodes, self.parallel = potential, cycle, n, parallel
         self.precision = "f64" if arch_name() != "vulkan" else "f32"
         self._vector, fp = array_types(self.precision)["vectors"].dtype, PRECISIONS[self.precision]
-        self.length = max(self.shortest, -(-n // self.most_chunks))
-        self.chunks = -(-n // self.length)
+        self.length = max(self.shortest, -(-n // max(self.most_chunks, self.systems)))
+        self.chunks = self.systems * -(-n // (self.systems * self.length))
         self.x, self.r, self.z, self.p, self.q = (runtime.array(self._vector, 1, n) for _ in range(5))
-        self.part, self.state = runtime.array(fp, 6, self.chunks), runtime.array(fp, ROOM)
+        self.part, self.state = runtime.array(fp, 6, self.chunks), runtime.array(fp, self.systems, ROOM)
         self.mass, self.free = runtime.array(fp, n), runtime.array(fp, n)
         runtime.fill(self.free, mask_of(free)[:, 0])
         self.guided = isinstance(free, FreeDirections)
@@ -43,11 +43,9 @@ class DeviceCG:
             self.guide, self.held = runtime.upload(guide, ti.i32), self._columns(free.sliding_supports)
         if cycle is None:
             self.inverse = runtime.array(self._vector, 3, n)
-        self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
-        self._is_one_kernel = Repeated.is_possible(parallel)
-        whole = runs_on_cpu() and not parallel and self._is_one_kernel
-        # whether rounds of Newton's method are on the device, too
-        self.takes_rounds = self._is_one_kernel and self.precision == "f64"
+        self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n, systems=self.systems)
+        self.is_one_kernel = Repeated.is_possible(parallel)
+        whole = runs_on_cpu() and not parallel and self.is_one_kernel
         # iterations between looks at the state; on a card so many as the solve before took
         self._look, self.last = self.many if whole else 1 if runs_on_cpu() else 0, 10
         # (with a matrix, convex) -> iterate(times, rounding), numbers of its products, what tells whether arrays are others
@@ -85,8 +83,8 @@ class DeviceCG:
     def parts(self, more: bool, products: list) -> list:
         """An iteration, as [(kernel, records, numbers)] of `Repeated`; products: those of the potential."""
         potential, own = self.potential, dict(cg=self, at=self.potential)
-        kind = self.kernels_kind
-        kernels = kernels_of(kind, potential.arrays.precision, self.precision, self.parallel, self.guided, more)
+        how = potential.arrays.precision, self.precision, self.parallel, self.guided, more
+        kernels = kernels_of(CGKernels, *how, self.several)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
         before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
         return [*before, *products, (kernels.step, own, None)]
@@ -98,7 +96,7 @@ class DeviceCG:
     def _iteration(self, more: bool, convex: bool, products: list):
         """(times, rounding) -> so many iterations."""
         parts, potential, lanes = self.parts(more, products), self.potential, runs_on_cpu()
-        if self._is_one_kernel:
+        if self.is_one_kernel:
             repeated = Repeated("cg", [parts], self.parallel, lanes)
             return lambda times, rounding: repeated(times, **potential.sizes(), **self._sizes, rounding=rounding)
         launches = [
@@ -148,6 +146,27 @@ class DeviceCG:
             self._put(more)
         self.put_mass(mass)
 
+    def solve(self, b: np.ndarray, tolerance, going, most: int, eps: float, more=False, convex=False) -> tuple:
+        """(x, rows of `state`) of all systems, whose mass and matrix are on the device; of one that is not `going` 0. A
+        system that meets a direction of negative curvature has the x before it or, if it is the first, the preconditioned b.
+        """
+        rows = b.reshape(self.systems, -1)
+        size, state = np.linalg.norm(rows, axis=1), np.zeros((self.systems, ROOM))
+        wanted, done = going & (size > 0), 0
+        runtime.fill(self.r, (rows / np.where(wanted, size, np.inf)[:, None]).reshape(1, -1, 3))
+        state[:, LEAST], state[:, LIMIT], state[:, STOPPED] = tolerance**2, most, ~wanted
+        runtime.fill(self.state, state)
+        while done < most and ((state[:, STOPPED] == 0) & np.isfinite(state[:, SQUARE])).any():
+            self.iterate(done, most, eps, more, convex)
+            state = runtime.fetch(self.state)
+            done = max(done + 1, int(state[:, COUNT].max()))
+        self.last, x = int(state[:, COUNT].max()), runtime.fetch_row(self.x, 0).reshape(rows.shape)
+        first = (state[:, STOPPED] == 2) & (state[:, COUNT] == 1)
+        if first.any():
+            x = np.where(first[:, None], runtime.fetch_row(self.p, 0).reshape(rows.shape), x)
+        known = wanted & (state[:, COUNT] > 0)
+        return np.where(known[:, None], x * size[:, None], 0.0).reshape(b.shape), state
+
     def __call__(
         self, mass: Mass, more, convex: bool, b: np.ndarray, tolerance: float, max_iterations: int, eps: float
     ):
@@ -156,28 +175,11 @@ class DeviceCG:
         mass: c m, shape (num_vertices, 1); more: a SciPy matrix that joins A, or None; convex: of contact between surfaces
         only its convex part.
         """
-        size = np.linalg.norm(b)
-        if size == 0:
-            return np.zeros_like(b), 0.0, 0, None
         self.put_system(mass, more)
-        runtime.fill(self.r, (b / size)[None])
-        state = np.zeros(ROOM)
-        state[LEAST], state[LIMIT] = tolerance**2, max_iterations
-        runtime.fill(self.state, state)
-        done = 0
-        while done < max_iterations:
-            self.iterate(done, max_iterations, eps, more is not None, convex)
-            state = runtime.fetch(self.state)
-            done = max(done + 1, int(state[COUNT]))
-            if state[STOPPED] or not np.isfinite(state[SQUARE]):
-                break
+        x, (state,) = self.solve(b, tolerance, True, max_iterations, eps, more is not None, convex)
+        count = int(state[COUNT])
         if state[STOPPED] == 3:  # the preconditioner is not positive definite
-            return np.zeros_like(b), np.inf, int(state[COUNT]), None
+            return np.zeros_like(b), np.inf, count, None
         if not np.isfinite(state[SQUARE]):
             raise FloatingPointError("the stiffness of this state is not finite")
-        count = self.last = int(state[COUNT])
-        negative = None
-        if state[STOPPED] == 2:
-            negative = runtime.fetch_row(self.p, 0)
-        x = runtime.fetch_row(self.x, 0) if count > 1 or negative is None else negative
-        return x * size, float(np.sqrt(state[SQUARE])), count, negative
+        return x, float(np.sqrt(state[SQUARE])), count, runtime.fetch_row(self.p, 0) if state[STOPPED] == 2 else None

@@ -19,16 +19,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diffsim_ti.common.errors import NotConverged
-from diffsim_ti.inputs import ConsistentMass, diagonal_of
+from diffsim_ti.inputs import diagonal_of
 from diffsim_ti.mechanics.host_force import NONE, HostForces
 from diffsim_ti.mechanics.obstacles.collision_detection import Met
 from diffsim_ti.mechanics.stress.projection import Projection
-from diffsim_ti.mechanics.supports.free import Free, FreeDirections, cleaned, linear_of, mask_of
-from diffsim_ti.solvers.implicit.device_newton import DeviceNewton
+from diffsim_ti.mechanics.supports.free import Free, cleaned, linear_of, mask_of
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
-from diffsim_ti.solvers.implicit.newton_kernels import BEFORE, DONE, FLOOR, PHASE, ROUND
-
-LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction that are doubled while Phi falls
+from diffsim_ti.solvers.implicit.newton_kernels import DONE, MANY
+from diffsim_ti.solvers.implicit.rounds import Rounds
 
 
 @dataclass
@@ -63,14 +61,15 @@ class Newton:
     trusted = 10  # iterations after which the direction before an indefinite one is good enough
     slight = 0.01, 0.0  # which negative eigenvalues of tetrahedra may stay (projection.py), the second where that fails
     # relative residual of the linear solves of the last rounds, or the root of the round's own if that is less; of those
-    # before at most (`_forcing`)
+    # before at most (`NewtonKernels.force`)
     inexact, rough = 1e-3, 0.1
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most (`_goes_on`)
     steady = 10  # rounds that halve the residual while more than asked for are taken; 0: none are
     by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
-    detection = None  # of obstacles (obstacles/collision_detection.py); without, rounds are the host's
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
+    indefinite = False  # whether the last direction that the host found is one of negative curvature
+    going = True  # which bodies are looked at
 
     def __init__(
         self,
@@ -123,80 +122,36 @@ class Newton:
         u = self.potential.place(start)
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
-        E, norm, rough, solved, far = None, np.inf, False, False, np.abs(u).max(1, keepdims=True)
-        most, floor, self.upright, on_host = self.max_iterations if rounds is None else rounds, 0.0, None, False
-        while self._goes_on(most, rounds is None):
-            device = None if on_host else self._on_device()
-            if device:
-                left = max(most - len(report.residuals), 1)
-                u, numbers = device(self, left, rough, 0.0 if rounds is None else self.roughly)
-                if numbers[PHASE] == DONE and not leave_saddles:
-                    return u
-                u, E, norm, floor = self.potential.place(u), None, numbers[BEFORE] or np.inf, numbers[FLOOR]
-                if numbers[ROUND]:
-                    report.residuals.pop()
-                on_host = True  # goes on with this round
-                continue
-            on_host = False
-            if E is None:
-                E = self._evaluate(u)
-                self.upright = bool(np.all(E[2] > 0)) if self.upright is None else self.upright
-            (R, size), before = self._residual(u), norm
-            rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far) + self.rigid.rounding
-            floor = 4 * np.linalg.norm(self._rigidity() * rounding * self.moves)
-            norm = np.linalg.norm(R)
-            report.residuals.append(norm / size if size > 0 else 0.0)
-            if rounds is not None and norm <= self.roughly * size:
-                return u
-            solved = norm <= self.tolerance * size + floor and (not self.volumes or self.volumes.met(u))
-            if solved and (not rough or norm <= floor):
+        most, done, here = self.max_iterations if rounds is None else rounds, report.residuals, self.loop
+        here.start(self, 0.0 if rounds is None else self.roughly, most)
+        while True:
+            phase, norm, floor, solved = here.run(most)
+            if phase == DONE:
                 downhill = self._downhill() if leave_saddles and not self.by_residual else None
                 if downhill is None:
-                    return u
+                    return here.end()
                 report.saddles += 1
-                moved = self._search(u, *downhill, E)
-                if moved is None:
-                    return u
-                u, E = moved
-                continue
-            if not np.isfinite(norm):
+                here.go(*downhill)
+            elif phase == MANY:
+                last = done.pop()
+                if not self._goes_on(most, rounds is None):
+                    break
+                done.append(last)
+                here.go_on()
+            elif not np.isfinite(norm) or not self.volumes or not here.stiffen():
                 break
-            norm = norm or np.inf  # only a volume is not as it is to be
-            self.preconditioner.update(u)
-            forcing = self._forcing(norm, before, solved, size, floor)
-            rough = forcing > max(self.inexact, 0.3 * floor / norm)
-            direction, R = self._step(u, R, max(forcing, 10 * self.eps))
-            moved = self._search(u, direction, R, E)
-            if self.volumes:
-                self._recount(u, moved, direction)
-            if moved is None and self.volumes and self.volumes.can_stiffen():
-                self.potential.place(u)
-                continue
-            if moved is None:
-                if solved and self.by_residual:  # |R| is as small as rounding lets it be
-                    return self.potential.place(u)
-                break
-            u, E = moved
+        u = here.end()
         if solved or norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
             return u
         report.place = u
-        raise NotConverged(self._why(report.residuals), report.residuals)
+        raise NotConverged(self._why(done), done)
 
-    def _on_device(self) -> DeviceNewton | None:
-        """What takes rounds on the device; None where the host takes part in linear solves."""
-        potential, preconditioner, static = self.potential, self.preconditioner, not diagonal_of(self.mass).any()
-        plain = self.detection and (isinstance(self.free, np.ndarray) or type(self.free) is FreeDirections)
-        on_host = self.others or self.volumes or self.rigid or potential.joints
-        if not plain or on_host or not preconditioner.solver.takes_rounds:
-            return None
-        if preconditioner.given_up or static and preconditioner.spent > 2 * preconditioner.patience:
-            return None
-        if preconditioner.rounds is None:
-            beside = bool(potential.pairs or potential.hosts or isinstance(self.mass, ConsistentMass))
-            known = len(potential.hosts.matrices(potential.held_at)) == len(potential.hosts)
-            of = potential, preconditioner, self.detection, beside
-            preconditioner.rounds = DeviceNewton(*of) if known else False
-        return preconditioner.rounds or None
+    @property
+    def loop(self) -> Rounds:
+        """What takes the rounds with the present preconditioner."""
+        if self.preconditioner.rounds is None:
+            self.preconditioner.rounds = Rounds(self, self.preconditioner)
+        return self.preconditioner.rounds
 
     def _why(self, done: list) -> str:
         """What a solve that failed says, and what helps: more rounds where they gained to the last."""
@@ -241,52 +196,39 @@ class Newton:
     def residual_at(self, u: np.ndarray) -> np.ndarray:
         """-dPhi/du of the last solve [N]."""
         self.potential.place(u)
-        return self._residual(u)[0]
+        return self.residual(u)[0]
 
     def residual_of(self, problem: tuple) -> np.ndarray:
         """The same where the potential stands, of mass, inertial and loads of `solve`."""
         self.mass, self.inertial, self.loads = problem
-        return self._residual(self.potential.held_at)[0]
-
-    def _rigidity(self) -> np.ndarray:
-        """How much force a small displacement makes at each vertex [N/m], contact and friction included."""
-        contact = self.potential.contact_blocks()
-        return self.stiffness if contact is None else self.stiffness + np.abs(contact).sum((1, 2))[:, None]
+        return self.residual(self.potential.held_at)[0]
 
     def operator(self) -> Operator:
         """The Hessian of Phi where the potential stands."""
         return Operator(self.potential, self.mass, self.free, self.others)
 
-    def _residual(self, u):
+    def system(self) -> tuple | None:
+        """(diagonal mass, SciPy matrix of blocks or None) that join the potential's Hessian; None where a product needs the
+        host."""
+        found = self.operator().on_device()
+        return found and found[:2]
+
+    def residual(self, u) -> tuple[np.ndarray, np.ndarray]:
+        """(R, shape (num_vertices, 3); the root of the squares of the forces at each vertex that it is measured by)"""
         f, sizes = self.potential.forces()
         inertia = self.mass * (u - self.inertial)
         if self.others:
             f, sizes = f + self.others.forces(u), sizes + self.others.sizes(u)
-        size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.moves).sum())
         R = f + self.loads - inertia
         self.rigid.feel(R)
-        return R * self.free, size
+        return R * self.free, np.sqrt(sizes**2 + (self.loads**2 + inertia**2 * self.moves).sum(1))
 
-    def _forcing(self, norm, before, solved, size, floor) -> float:
-        """Relative residual of a round's linear solve: rough while rounds gain little, but not of the last one, whose error
-        slow motions of stiff bodies would show. Eisenstat, Walker 1996, Choosing the Forcing Terms in an Inexact Newton
-        Method, choice 2, doi:10.1137/0917003."""
-        if not np.isfinite(norm):
-            return self.inexact
-        last = 0.3 * self.tolerance * size / norm  # what makes this round the last one, if that is within reach
-        exact = min(self.inexact, np.sqrt(norm / size), last if last > 0.03 * self.inexact else 1.0)
-        exact = max(exact, 0.3 * floor / norm)  # rounding would hide more
-        gained = min(norm / before, 1.0) if np.isfinite(before) else 1.0
-        return exact if solved else max(exact, min(self.rough, 0.9 * gained**2))
-
-    def _step(self, u, R, forcing):
+    def step(self, u, R, forcing):
         """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by. Friction that
         the direction before turned round is bounded (mechanics/surfaces/lagged_friction.py)."""
         friction = self.potential.surface_friction
         with friction.bounded(self.turning) if friction else nullcontext():
             direction, R = self._direction_of(u, R, forcing)
-        if friction:
-            self.turning = friction.turns(u, u + direction)
         return cleaned(linear_of(self.free), direction), R
 
     def _direction_of(self, u, R, forcing):
@@ -307,21 +249,20 @@ class Newton:
             self.report.products, R = self.report.products + A.products - done, R + change
         return direction, R
 
-    def _recount(self, u, moved, direction) -> None:
-        """Multipliers go as far as the step from u along a direction that was found."""
-        step = (u if moved is None else moved[0]) - u
+    def recount(self, u, step, direction) -> None:
+        """Multipliers go as far as a step from u along a direction that was found."""
         share = float((step * direction).sum()) / max(float((direction * direction).sum()), 1e-300)
         self.volumes.arrive(u + step, min(max(share, 0.0), 1.0), self._rise)
 
     def _direction(self, A, R, forcing):
         limit = 10 * len(R)
         if self.by_residual:
-            self._indefinite = False
+            self.indefinite = False
             d, *_ = gmres(A, R, self.preconditioner, forcing, limit)
             self.report.products += A.products
             return self.rigid.motion(d)
         d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
-        self._indefinite = negative is not None
+        self.indefinite = negative is not None
         if negative is not None:
             self.report.indefinite += 1
             if count <= self.trusted and not A.saddle_is_known:
@@ -342,108 +283,23 @@ class Newton:
         self.report.products += A.products
         if p is None:
             return None
-        p, self._indefinite = p * (self.reach / np.abs(p).max()), True
+        p, self.indefinite = p * (self.reach / np.abs(p).max()), True
         return p, -p * float((p * A(p)).sum()) / float((p * p).sum())
-
-    def _evaluate(self, u):
-        E, parts, J = self.potential.energy()
-        self.report.trials += 1
-        return E, parts, J
-
-    def _search(self, u, d, R, before):
-        """(u + t d, what was evaluated there) for the first t of 1, 1/2, ... that is admissible and lower; None if there is
-        none. Along an indefinite direction t = 2, 4, ... are tried while they are lower still: its length says little."""
-        slope, best = float((R * d).sum()), None
-        longest = self._safe_share(u, d)
-        fraction = min(1.0, longest)
-        while fraction > self.shortest:
-            trial, after, change, noise = self._try(u, fraction * d, before, self.upright and fraction > self.insist)
-            if self.by_residual:
-                early = len(self.report.residuals) <= self.by_work and slope > 0
-                lower = early and change <= -1e-4 * fraction * slope
-                lower = lower or (np.isfinite(change) and self._residual_falls(trial, R, fraction))
-            else:
-                drowned = abs(slope) * fraction <= noise >= change
-                lower = change <= -1e-4 * fraction * slope or (drowned and self._falls(trial, d, slope))
-            if lower:
-                best = trial, after, change
-                self.upright = self.upright and fraction > self.insist
-                break
-            fraction *= 0.5
-            self.report.halvings += 1
-        while best is not None and self._indefinite and fraction in LONGER and 2 * fraction <= longest:
-            fraction *= 2
-            trial, after, change, _ = self._try(u, fraction * d, before, self.upright)
-            if not change < best[2]:
-                self.potential.place(best[0])
-                break
-            best = trial, after, change
-        return None if best is None else best[:2]
-
-    def _safe_share(self, u, d) -> float:
-        """The longest step along d in which surfaces stay apart, from obstacles and from each other."""
-        pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
-        free = self.collisions(u, d, most)[0]
-        free = min(free, pairs.safe_share(u, d, free)) if pairs else free
-        self.report.cuts += free < 1
-        return free
 
     def is_free(self, u, step) -> bool:
         """Whether nothing is met on the way of a step."""
         pairs = self.potential.pairs
         return self.collisions(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
-    def _against_loads(self, u, step) -> float:
-        """Change of Phi along a step without those of E and W."""
-        return float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
-
-    def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[np.ndarray], float]:
-        """there -> how much higher Phi is at another place than at u. Forces without an energy do no more work on the way
-        than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+    def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[np.ndarray], np.ndarray]:
+        """there -> how much higher Phi of each body is at another place than at u. Forces without an energy do no more work
+        on the way than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
         self.pose(problem)
-        device = self._on_device()
-        if device:
-            device.stand(self, u)
-            return device.rise
-        self.potential.place(u)
-        E, _, J0 = self.potential.energy()
-
-        def rise(there: np.ndarray) -> float:
-            step = self.potential.place(there) - u
-            after, _, J = self.potential.energy()
-            if np.any((J0 > 0) & ~((J > 0.1 * J0) & (J < 10 * J0))):
-                return np.inf
-            change = after - E + self._against_loads(u, step)
-            if self.others:
-                change -= min(float((self.others.forces(u) * step).sum()), self.others.work(u, step))
-            return change
-
-        return rise
+        here = self.loop
+        here.stand(self, u)
+        return here.rise
 
     def pose(self, problem: tuple) -> None:
         """What is solved: mass, inertial and loads of `solve`."""
         self.mass, self.inertial, self.loads = problem
         self.preconditioner, self.stiffness = self.preconditioners(self.mass)
-
-    def _falls(self, u, d, slope) -> bool:
-        """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in
-        rounding. Hager, Zhang 2005, A New Conjugate Gradient Method with Guaranteed Descent, doi:10.1137/030601880."""
-        R, _ = self._residual(u)
-        return float((R * d).sum()) >= -0.8 * slope
-
-    def _residual_falls(self, u, R, fraction) -> bool:
-        """Whether the residual at u is less than R, after a share of a step."""
-        return np.linalg.norm(self._residual(u)[0]) <= (1 - 1e-4 * fraction) * np.linalg.norm(R)
-
-    def _try(self, u, step, before, upright):
-        """(displacement, what is there, change of Phi, rounding of that change); infinite change if not admissible."""
-        there = self.rigid.nearest(u + step)  # which may turn on another way than `_safe_share` saw
-        met = bool(self.rigid) and not self.is_free(u, there - u)
-        trial = self.potential.place(there)
-        E, parts, J = before
-        after, step = self._evaluate(trial), trial - u
-        change = after[0] - E + self._against_loads(u, step) - self.others.work(u, step)
-        if met or (upright and np.any(~(after[2] > 0.1 * J))):
-            change = np.inf
-        rounding = parts + after[1] + float((self.stiffness * trial**2).sum())  # of strains that come from large u
-        return trial, after, change, 10 * self.eps * rounding

@@ -24,7 +24,7 @@ class Preconditioner:
 
     spent, given_up, unfit, has_warned = 0, False, False, False
     quick = 1  # products with multigrid take so many times as long
-    rounds = None  # of Newton's method with it on the device (device_newton.py)
+    rounds = None  # of Newton's method with it (rounds.py)
 
     def begin(self) -> None:
         self.spent, self.given_up, self.unfit = 0, False, False
@@ -61,7 +61,7 @@ class BlockJacobi(Preconditioner):
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray | float, parallel: bool = True):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
-        self.solver = None if isinstance(free, FreeBodies) else DeviceCG(potential, None, free, parallel)
+        self.solver = DeviceCG(potential, None, free, parallel)
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
@@ -74,7 +74,7 @@ class BlockJacobi(Preconditioner):
         self._inverse = self._inverted(0.5 * (D + np.swapaxes(D, 1, 2)))
         if isinstance(self.free, FreeDirections):
             self._inverse = self.free.around(self._inverse)
-        if self.solver:
+        if not isinstance(self.free, FreeBodies):
             self.solver.put_inverse(self._inverse)
 
     def updating(self) -> tuple[list, object]:

@@ -1,0 +1,400 @@
+"""The rounds of Newton's method: kernels that decide what comes next, and what the host does between them."""
+
+import weakref
+from collections.abc import Callable
+from contextlib import nullcontext
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import ConsistentMass, diagonal_of
+from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections
+from diffsim_ti.runtime import Repeated, kernels_of, runs_on_cpu
+from diffsim_ti.solvers.implicit import newton_kernels as nk
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, LIMIT, ROOM, SQUARE, STOPPED
+from diffsim_ti.solvers.implicit.newton_kernels import NewtonKernels
+
+
+class Rounds:
+    """Takes the rounds of a `Newton` with a preconditioner.
+
+    A round is a launch for a trial of the line search and the residual of what is taken, some for the preconditioner, and
+    those of conjugate gradients; of small bodies on the processor they are one kernel, and a solve is a launch or few. What
+    comes next is a number on the device, `PHASE`; of what crosses to the host there are a few numbers a round.
+
+    The host solves where something is unusual in a linear system (`Newton.step`), and takes part between the launches where
+    there is something `beside` the kernels: pairs of surfaces, of which it keeps the list, forces of its own, masses that
+    are no diagonal, volumes, joints of robots, sets that move by few numbers. It adds energies and work, and says R.
+
+    `state` has a row of numbers for each body of a batch (batch/joined_newton.py), else one. Bodies are in the same phases
+    but where one halves its step more often than another.
+    """
+
+    small, many = 300, 200  # vertices up to which a solve on one thread is one kernel; phases in a launch of it
+    short = 600  # variables of a law's longest kernel up to which one kernel of all compiles soon
+    most_rounds = 64  # before the host looks at their residuals
+
+    def __init__(self, newton, preconditioner):
+        potential, detection = newton.potential, newton.detection
+        self.potential, self.detection = potential, detection
+        self.preconditioner = weakref.proxy(preconditioner)  # which holds this: no circle
+        self.cg, a, n = preconditioner.solver, potential.arrays, potential.arrays.num_vertices
+        cg, points, free = self.cg, potential.J.shape[0], preconditioner.free
+        reduced, consistent = isinstance(free, FreeBodies), isinstance(newton.mass, ConsistentMass)
+        by_host, self.several = newton.others or potential.joints or reduced, cg.several
+        self.beside = beside = bool(by_host or potential.pairs or potential.hosts or consistent)
+        self.solves_on_host = newton.system() is None
+        self.contact = contact = bool(a.contacts or potential.pairs or potential.hosts)
+        how = a.precision, cg.precision, cg.parallel, isinstance(free, FreeDirections)
+        kernels = kernels_of(NewtonKernels, *how, contact, beside, self.several)
+        fp, vector = runtime.PRECISIONS[cg.precision], runtime.array_types(cg.precision)["vectors"].dtype
+        self.u, self.d, self.R, self.inertial, self.loads = (runtime.array(vector, n) for _ in range(5))
+        self.far, self.stiffness, self.history = (runtime.array(fp, k) for k in (n, n, self.most_rounds + 1))
+        self.J, self._filled = runtime.array(a.fp, points), {}
+        self.sizes = dict(chunks=cg.chunks, length=cg.length, nodes=n, count=detection.count, systems=cg.systems)
+        self.sizes |= dict(points=points, points_length=-(-(points // cg.systems) // (cg.chunks // cg.systems)))
+        way, barriers = (detection.way, potential.barriers) if contact else (None, None)
+        own = dict(cg=cg, at=potential, newton=(self, way), out=detection.found, barriers=barriers)
+        of_potential = dict(scene=a, pass_=potential, at=potential, out=potential)
+        tries, judges, updates, solves = kernels.wanted
+        direction, residual = [(kernels.direction, own)], []
+        if a.contacts and not potential.joints:
+            of_way = dict(scene=a, way=way, at=potential, out=detection.found)
+            direction += [(detection.kernels.shares, of_way), (kernels.bound, own)]
+        if not beside:
+            residual.append((potential.kernels.forces, of_potential))
+            if contact:
+                residual.append((potential.kernels.contact_blocks, of_potential | dict(out=barriers)))
+        energy, move = (potential.kernels.energy, of_potential), [(kernels.move, own)]
+        compare, judge = [(kernels.choose, own)], [(kernels.judge, own)]
+        groups = [[(tries, own), *direction, *move, energy, *compare], [(judges, own), *residual, *judge]]
+        direction, move, compare, judge, *groups = (
+            [(*part, None) for part in group] for group in (direction, move, compare, judge, *groups)
+        )
+        update, hard = ([], None) if beside or self.several else preconditioner.updating()
+        update = [*update, (kernels.ready, dict(cg=cg, body=hard), None)] if update else []
+        self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small
+        self.whole &= potential.kernels.blocks.variables <= self.short and not (beside or self.several)
+        self._always, self._update = self.sizes | dict(kept=detection.kept), self._in_turn(update)
+        if self.whole:
+            groups += [[(updates, own, None), *update]] if update else []
+            groups.append([(solves, own, None), *cg.parts(False, potential.multiplying())[1:]])
+        self._trial = self._residual = self._steps = self._more = None
+        if self.whole:
+            self._trial = Repeated("newton", groups, cg.parallel, vectorized=True)
+        elif beside or self.several or runs_on_cpu() or not cg.is_one_kernel:
+            self._steps = [self._in_turn(group) for group in (direction, move, compare, judge)]
+        else:
+            self._trial, self._residual = (Repeated(f"newton{k}", [own], True) for k, own in enumerate(groups))
+        if self.whole:
+            launch, always = self._trial, self._always | dict(most=1.0)
+            cg.serve(lambda times, rounding: launch(times, **always, **potential.sizes(), rounding=rounding))
+
+    def _in_turn(self, parts: list) -> Callable | None:
+        """Kernels that are launched one by one, as others launch them, so that they are compiled once."""
+        in_vectors = self.potential.kernels.forces, self.potential.kernels.blocks
+        bound = [
+            (kernel.bind(kernel in in_vectors and self.potential.arrays.in_vectors, **records), own or {})
+            for kernel, records, own in parts
+        ]
+
+        def launch(times: int, **numbers) -> None:
+            for one, own in bound:
+                one(**(numbers | own))
+
+        return launch if parts else None
+
+    # ---- what is solved ----------------------------------------------------------------------------------------------
+
+    def _put(self, name: str, data: np.ndarray) -> None:
+        """Set an array, unless it holds the same object's numbers."""
+        if self._filled.get(name) is not data:
+            runtime.fill(getattr(self, name), data)
+            self._filled[name] = data
+
+    def _begin(self, newton, phase: int) -> None:
+        """Tell the device the problem of a solve, and that it begins where the potential stands."""
+        self.newton, self._base, self._direction = weakref.proxy(newton), self.potential.held_at, None
+        self.cg.put_mass(newton.mass if isinstance(newton.mass, np.ndarray) else np.zeros((self.cg.nodes, 1)))
+        self._put("inertial", newton.inertial)
+        self._put("loads", newton.loads)
+        runtime.fill(self.stiffness, newton.stiffness.ravel())
+        if self.potential.arrays.contacts:
+            self.detection.put(runtime.fetch(self.potential.poses)[::3])
+        told = {nk.TOLERANCE: newton.tolerance, nk.EPS: newton.eps, nk.INSIST: newton.insist, nk.FRACTION: 1.0}
+        told |= {nk.SHORTEST: newton.shortest, nk.INEXACT: newton.inexact, nk.ROUGHEST: newton.rough, nk.UPRIGHT: -1}
+        self.state = np.zeros((self.cg.systems, ROOM))
+        self.state[:, list(told)] = list(told.values())
+        self.state[:, STOPPED], self.state[:, nk.RECOUNTS] = nk.WAITS, bool(newton.volumes)
+        self.state[:, nk.PHASE] = np.where(newton.going, phase, nk.DONE)
+        if self.several:
+            runtime.fill(self.u, self._base)
+
+    # ---- rises of the potential --------------------------------------------------------------------------------------
+
+    def stand(self, newton, u: np.ndarray) -> None:
+        """Measure `rise` from u."""
+        self.potential.place(u)
+        self._begin(newton, nk.BASE)
+        self.advance()
+        self._based = self.state
+
+    def rise(self, there: np.ndarray) -> np.ndarray:
+        """How much higher Phi of each body is there; infinite where a tetrahedron changes its volume more than tenfold."""
+        self.potential.place(there)
+        self.state = self._based.copy()
+        self.state[:, nk.PHASE] = np.where(self.newton.going, nk.PROBE, nk.DONE)
+        self.advance()
+        return self.state[:, nk.RISE]
+
+    # ---- a solve -----------------------------------------------------------------------------------------------------
+
+    def start(self, newton, roughly: float, most: int) -> None:
+        """Begin a solve where the potential stands, which also ends where R is `roughly` small, or after so many rounds."""
+        self._begin(newton, nk.START)
+        self.state[:, nk.ROUGHLY], self.state[:, nk.MOST], self.state[:, LIMIT] = roughly, most, self._limit()
+
+    def run(self, most: int) -> tuple[float, float, float, bool]:
+        """(why they end: DONE, TROUBLE or MANY; |R|, what of it is rounding, whether R is small) after rounds until the
+        report of Newton has so many residuals, and one more."""
+        report, state = self.newton.report, self.state[0]
+        state[nk.ROUND], state[nk.MOST] = 0, min(max(most - len(report.residuals), 0), self.most_rounds)
+        state[list(nk.COUNTED.values())] = 0
+        self.advance()
+        state = self.state[0]
+        self.preconditioner.spent += int(state[nk.PRODUCTS])
+        report.residuals += runtime.fetch(self.history)[: int(state[nk.ROUND])].tolist()
+        for name, place in nk.COUNTED.items():
+            setattr(report, name, getattr(report, name) + int(state[place]))
+        self.newton.upright = state[nk.UPRIGHT] == 1
+        return int(state[nk.PHASE]), float(state[nk.NORM]), float(state[nk.FLOOR]), state[nk.SOLVED] == 1
+
+    def go_on(self) -> None:
+        """With a round more than asked for."""
+        self.state[0, nk.PHASE], self.state[0, LIMIT] = nk.UPDATE, self._limit()
+
+    def go(self, direction: np.ndarray, R: np.ndarray) -> None:
+        """Along a direction in which Phi falls though R is zero; R: of which it is as if it were Newton's."""
+        self._take(direction, R, 0)
+        self._direction = None  # along which volumes are as they are
+
+    def stiffen(self) -> bool:
+        """Begin again where no step along the last direction was taken, with stiffer chambers, if they may be so."""
+        if self._direction is None:
+            return False
+        self.newton.recount(self._base, np.zeros_like(self._base), self._direction)
+        if not self.newton.volumes.can_stiffen():
+            return False
+        self.potential.place(self._base)
+        self.state[0, nk.PHASE], self.state[0, STOPPED] = nk.START, nk.WAITS
+        return True
+
+    def end(self) -> np.ndarray:
+        """Where the last step that was taken has led, where the potential then stands."""
+        if self.state[0, nk.PHASE] == nk.DONE:
+            return self._here()
+        return self.potential.place(runtime.fetch(self.u).astype(np.float64))
+
+    # ---- rounds ------------------------------------------------------------------------------------------------------
+
+    def _limit(self) -> int:
+        """Products of a linear solve on the device; none where the host solves."""
+        own, static = self.preconditioner, not diagonal_of(self.newton.mass).any()
+        slow = own.given_up or static and own.spent > 2 * own.patience
+        return 0 if self.solves_on_host or slow else min(10 * self.cg.nodes // self.cg.systems, own.patience)
+
+    def _send(self) -> None:
+        runtime.fill(self.cg.state, self.state)
+
+    def _receive(self) -> None:
+        self.state = runtime.fetch(self.cg.state).astype(np.float64, copy=False)
+
+    def advance(self) -> None:
+        """From one phase to the next until it is over."""
+        cg, served = self.cg, False
+        numbers = self._always | self.potential.sizes() | dict(rounding=10 * self.newton.eps)
+        if nk.START in self.state[:, nk.PHASE]:
+            self.preconditioner.follow(self.potential.held_at)
+        self._send()
+        while max(phases := self.state[:, nk.PHASE].tolist()) > nk.MANY:
+            solves = nk.SOLVE in phases
+            if solves and (odd := self._odd()).any():
+                self._solve(odd)
+                self._send()
+                continue
+            found = solves and not (self.state[:, STOPPED] == 0).any()
+            tries = found or any(nk.BASE <= phase <= nk.TRY for phase in phases)
+            judges, updates = not tries and nk.JUDGE in phases, nk.UPDATE in phases
+            updates = updates and not (tries or judges)
+            solves = not (tries or judges or updates)
+            if updates and (served or not self._update):
+                self._follow()
+                served = False
+                continue
+            numbers["most"] = nk.LONGEST_STEP if self.state[:, nk.INDEFINITE].any() else 1.0
+            # a card goes on before the host has looked, but not to conjugate gradients
+            ahead = not (self.whole or self._steps or solves) and phases[0] >= nk.START
+            if self.whole:
+                self._trial(self.many, **numbers)
+            elif tries:
+                self._try(numbers)
+            elif solves:
+                self._iterate()
+            if not self.whole and (judges or ahead and tries):
+                self._judge(numbers)
+            served = bool(self._update) and (self.whole or updates or ahead)
+            if served and not self.whole:
+                if self._steps:
+                    self.preconditioner.follow(self._here())
+                self._update(1, **numbers)
+            if self.whole or not solves:
+                self._receive()
+            elif (self.state[:, STOPPED] == 1).any():
+                cg.last = int(self.state[:, COUNT].max())
+                if not self.several:
+                    self.preconditioner.learn(float(np.sqrt(self.state[0, SQUARE])), cg.last)
+            if judges and self.beside:
+                taken = self.state[:, nk.ACCEPTED] == 1
+                self._base = self.potential.held_at if taken.all() else self._where(taken, self._base)
+
+    def _follow(self) -> None:
+        """The preconditioner goes to where steps that were taken led, and conjugate gradients begin."""
+        here = self.potential.place(runtime.fetch(self.u).astype(np.float64)) if self.several else self._here()
+        self.preconditioner.update(here)
+        if self.beside and self.state[:, LIMIT].any():
+            mass, self._more = self.newton.system()
+            self.cg.put_system(mass, self._more)
+        on = self.state[:, nk.PHASE] == nk.UPDATE
+        self.state[on, nk.PHASE], self.state[on, STOPPED] = nk.SOLVE, 0
+        self._send()
+
+    def _where(self, which: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Where the potential stands of some bodies, else an other displacement."""
+        return np.where(np.repeat(which, len(other) // len(which))[:, None], self.potential.held_at, other)
+
+    def _odd(self) -> np.ndarray:
+        """Which linear solves are at their limits, or have met negative curvature or something that is not finite."""
+        state = self.state
+        fails = (state[:, STOPPED] == 2) | (state[:, STOPPED] == 3) | ~np.isfinite(state[:, SQUARE])
+        fails |= (state[:, STOPPED] == 0) & (state[:, COUNT] >= state[:, LIMIT])
+        return (state[:, nk.PHASE] == nk.SOLVE) & fails
+
+    def _here(self) -> np.ndarray:
+        """The displacement on the device, of which the host is told."""
+        self.potential.held_at = runtime.fetch_row(self.potential.u, 0)
+        return self.potential.held_at
+
+    # ---- linear solves -----------------------------------------------------------------------------------------------
+
+    def _iterate(self) -> None:
+        """Conjugate gradients until they stop."""
+        friction, more = self.potential.surface_friction, self._more is not None
+        with friction.bounded(self.newton.turning) if friction else nullcontext():
+            while np.any(on := (self.state[:, STOPPED] == 0) & ~self._odd()):
+                done, most = (int(self.state[on, k].max()) for k in (COUNT, LIMIT))
+                self.cg.iterate(done, most, self.newton.eps, more)
+                self._receive()
+
+    def _solve(self, odd: np.ndarray) -> None:
+        """The host's direction; of several bodies what is left to those that are odd."""
+        if self.several:
+            return self.newton.leave(self, odd)
+        newton, state = self.newton, self.state[0]
+        R, forcing = runtime.fetch(self.R).astype(np.float64), float(np.sqrt(state[LEAST]))
+        direction, R = newton.step(self._here(), R, forcing)
+        early = len(newton.report.residuals) + state[nk.ROUND] <= newton.by_work
+        self._take(direction, R, 0 if not newton.by_residual else nk.BY_WORK if early else nk.BY_RESIDUAL)
+
+    def _take(self, direction: np.ndarray, R: np.ndarray, measure: int) -> None:
+        """A direction that goes down by R is what a linear solve has found; measure: of what makes a step good."""
+        state, self._direction = self.state[0], direction
+        runtime.fill(self.cg.x, direction[None])
+        runtime.fill(self.R, R)
+        state[nk.PHASE], state[STOPPED], state[COUNT], state[SQUARE] = nk.SOLVE, 1, 0, 0
+        state[nk.SCALE], state[nk.INDEFINITE], state[LIMIT] = 1.0, self.newton.indefinite, self._limit()
+        state[nk.MEASURE], state[nk.TO_LOWER] = measure, np.linalg.norm(R)
+
+    # ---- where kernels are launched in turn, with what the host has beside them --------------------------------------
+
+    def _set(self, numbers: dict) -> None:
+        """Numbers of the state, by their places."""
+        self._receive()
+        for place, number in numbers.items():
+            self.state[:, place] = number
+        self._send()
+
+    def _try(self, numbers: dict) -> None:
+        """Energies of a trial, of a new direction or along the same."""
+        if self._steps is None:
+            return self._trial(1, **numbers)
+        (direct, move, compare, _), phases = self._steps, self.state[:, nk.PHASE]
+        tried = (nk.BASE <= phases) & (phases <= nk.TRY) | (phases == nk.SOLVE)
+        phase = phases[tried].max()
+        if phase == nk.SOLVE:
+            direct(1, **numbers)
+            if self.potential.pairs or (self.potential.joints and self.contact):
+                self._shorten()
+        move(1, **numbers)
+        self.potential.only(tried)
+        if self.beside:
+            self._set(self._beside(phase))
+        self.potential.launch("energy", lanes=False)
+        compare(1, **numbers)
+
+    def _shorten(self) -> None:
+        """Not farther along a new direction than to where surfaces meet, or links that give way."""
+        potential, newton, u = self.potential, self.newton, self._base
+        self._receive()
+        step, cuts = runtime.fetch_row(self.detection.way.step, 0), self.state[0, nk.CUTS]
+        share = longest = float(self.state[0, nk.LONGEST])
+        if potential.joints:
+            share = newton.collisions(u, step, longest)[0]
+        if potential.pairs:
+            share = min(share, potential.pairs.safe_share(u, step, share, placed=True))
+        if potential.surface_friction:
+            newton.turning = potential.surface_friction.turns(u, u + step)
+        numbers = {nk.CUTS: cuts + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share)}
+        self._set(numbers | ({} if share > newton.shortest else {nk.PHASE: nk.TROUBLE}))
+
+    def _beside(self, phase: int) -> dict:
+        """What the host adds to the energies where something is tried, and to their change on the way there."""
+        potential, newton, base = self.potential, self.newton, self._base
+        moved, met = phase in (nk.SOLVE, nk.TRY), False
+        if moved and newton.rigid:  # which may turn on another way than the step that was looked at
+            there = newton.rigid.nearest(runtime.fetch_row(potential.u, 0))
+            met = not newton.is_free(base, there - base)
+            u = potential.place(there)
+        else:
+            u = potential.arrive(on_way=True) if moved else potential.held_at
+        if newton.rigid and phase == nk.START:
+            runtime.fill(self.far, runtime.fetch(self.far) + newton.rigid.rounding.ravel() / newton.eps)
+        rows = lambda x: x.reshape(self.cg.systems, -1)  # noqa: E731
+        energies, change, step, mass = rows(potential.energies_beside()), 0.0, u - base, newton.mass
+        if isinstance(mass, ConsistentMass):
+            change = rows(step * (mass * (base + 0.5 * step - newton.inertial))).sum(1)
+        if newton.others and step.any():
+            work = newton.others.work(base, step)
+            if phase == nk.PROBE:
+                work = np.minimum(rows(newton.others.forces(base) * step).sum(1), work)
+            change = change - work
+        whole = {nk.BESIDE: energies.sum(1), nk.BESIDE_PARTS: np.abs(energies).sum(1)}
+        return whole | {nk.BESIDE_CHANGE: np.inf if met else change}
+
+    def _judge(self, numbers: dict) -> None:
+        """The residual of what is tried."""
+        if self._steps is None:
+            return self._residual(1, **numbers)
+        potential, newton, u = self.potential, self.newton, self.potential.held_at
+        potential.only(self.state[:, nk.PHASE] == nk.JUDGE)
+        if newton.volumes and not self.state[0, nk.DOUBTED]:
+            if self._direction is not None:
+                newton.recount(self._base, u - self._base, self._direction)
+                self._direction = None
+            self._set({nk.UNMET: not newton.volumes.met(u)})
+        if self.beside:
+            runtime.fill(self.R, np.column_stack(newton.residual(u)))
+        else:
+            potential.launch("forces")
+        if self.contact:
+            potential.put_contact_blocks()
+        self._steps[3](1, **numbers)
