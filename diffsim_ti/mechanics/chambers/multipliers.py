@@ -54,6 +54,7 @@ class VolumeConstraints:
     def __init__(self, forces: list, free, rest: np.ndarray, tolerance: float, eps: float):
         self.forces, self.free, self.rest, self.tolerance, self.eps = forces, free, rest, tolerance, eps
         self.laws = [law for force in forces for law in force.laws]
+        self.have_energy = any(force.has_energy for force in forces)
         self.places = [k for force in forces if isinstance(force, HeldPressure) for k in force.places]
 
     def stiffen(self, stiffness: np.ndarray) -> None:

@@ -1,7 +1,7 @@
 """Bodies that overlap where an equilibrium is looked for, pressed apart first.
 
 Each vertex that lies behind a triangle of another body, or nearer to it than a gap, goes to that gap along the triangle's
-normal n, and the bodies follow as their stiffness K at rest lets them,
+normal n, edges that have passed each other likewise, and the bodies follow as their stiffness K at rest lets them,
 
     min_du  1/2 du . K du + k/2 sum (n . (du_i - sum_a w_a du_a) + d - gap)^2,    d = n . (x_i - sum_a w_a x_a),
 
@@ -43,8 +43,11 @@ def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
         K = assemble(potential, np.zeros((len(u), 1)), free)[0].tocsr()
     K, stiff, deepest, place = K + SOFT * diags(K.diagonal()), STIFF * K.diagonal().max(), 0.0, u
     for _ in range(ROUNDS):
-        rows, missing = _near(inner, rest + spread(place), gap)
+        x = rest + spread(place)
+        rows, missing = _near(inner, x, gap)
         deepest = max(deepest, missing.max(initial=gap) - gap)
+        if missing.max(initial=0.0) < 0.5 * gap:  # vertices are apart: are edges?
+            rows, missing = _crossed(inner, x, gap, max(deepest, gap))
         if missing.max(initial=0.0) < 0.5 * gap:
             pairs.begin(place)
             try:
@@ -66,7 +69,6 @@ def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
 def _near(pairs, x: np.ndarray, gap: float):
     """(d = n . (x_i - sum_a w_a x_a) of places x as rows of a sparse matrix, gap less d), of vertices and the nearest
     triangles of other bodies that face one of theirs, d < gap."""
-    from scipy.sparse import csr_matrix
     from scipy.spatial import cKDTree
 
     triangles, reach = pairs.mesh.surface_triangles, pairs.list.typical
@@ -99,6 +101,42 @@ def _near(pairs, x: np.ndarray, gap: float):
     _, once = np.unique(i[first] * len(triangles) + t[first], return_index=True)
     i, t, w, d = (a[first[once]] for a in (i, t, w, d))
     vertices, weights = np.column_stack([i, triangles[t]]), np.column_stack([np.ones(len(i)), -w])
+    return _rows(vertices, weights, normals[t], x.size), gap - d
+
+
+def _crossed(pairs, x: np.ndarray, gap: float, most: float):
+    """The same of edges of two bodies that face and pass each other, from -most < d < gap."""
+    from scipy.spatial import cKDTree
+
+    t = pairs.mesh.surface_triangles
+    normals = np.cross(x[t[:, 1]] - x[t[:, 0]], x[t[:, 2]] - x[t[:, 0]])
+    sides = np.sort(t[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    edges, which = np.unique(sides, axis=0, return_inverse=True)
+    out = np.zeros((len(edges), 3))
+    np.add.at(out, which.ravel(), np.repeat(normals / np.linalg.norm(normals, axis=1, keepdims=True), 3, 0))
+    out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
+    middles, along = x[edges].mean(1), x[edges[:, 1]] - x[edges[:, 0]]
+    tree = cKDTree(middles)
+    a, b = tree.query_pairs(np.linalg.norm(along, axis=1).max() + most, output_type="ndarray").T
+    facing = (pairs.body[edges[a, 0]] != pairs.body[edges[b, 0]]) & ((out[a] * out[b]).sum(1) < FACING)
+    a, b = a[facing], b[facing]
+    n, r = np.cross(along[a], along[b]), x[edges[b, 0]] - x[edges[a, 0]]
+    square = (n**2).sum(1)
+    crosses = square > 1e-6 * (along[a] ** 2).sum(1) * (along[b] ** 2).sum(1)
+    a, b, n, r, square = (part[crosses] for part in (a, b, n, r, square))
+    s, t = ((np.cross(r, along[k]) * n).sum(1) / square for k in (b, a))
+    n *= (np.sign((n * out[b]).sum(1)) / np.sqrt(square))[:, None]
+    d = -(r * n).sum(1)
+    meet = (np.minimum(s, t) > 0) & (np.maximum(s, t) < 1) & (d < gap) & (d > -most) & ((n * out[b]).sum(1) > -FACING)
+    a, b, n, s, t, d = (part[meet] for part in (a, b, n, s, t, d))
+    vertices, weights = np.column_stack([edges[a], edges[b]]), np.column_stack([1 - s, s, t - 1, -t])
+    return _rows(vertices, weights, n, x.size), gap - d
+
+
+def _rows(vertices: np.ndarray, weights: np.ndarray, n: np.ndarray, size: int):
+    """n . sum w_a x_a of some four vertices as rows of a sparse matrix."""
+    from scipy.sparse import csr_matrix
+
     columns = 3 * vertices[:, :, None] + np.arange(3)
-    entries = (weights[:, :, None] * normals[t][:, None]).ravel(), columns.ravel(), 12 * np.arange(len(i) + 1)
-    return csr_matrix(entries, (len(i), x.size)), gap - d
+    entries = (weights[:, :, None] * n[:, None]).ravel(), columns.ravel(), 12 * np.arange(len(n) + 1)
+    return csr_matrix(entries, (len(n), size))

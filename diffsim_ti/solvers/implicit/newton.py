@@ -177,6 +177,8 @@ class Newton:
                     return self.potential.place(u)
                 break
             u, E = moved
+            if self.volumes and self.volumes.have_energy:  # which counts from u
+                E = None
         if solved or norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
             return u
         report.place = u
