@@ -198,7 +198,7 @@ def test_a_press_fit_by_contact_and_what_friction_holds_of_it():
     area, across = HEIGHT * SECTOR * FIT, 2 * np.sin(SECTOR / 2) / SECTOR
     first, second = frames["self_contact_force"][1:]
     assert first[0] == pytest.approx(-pressure * area * across, rel=0.01)
-    assert np.abs(first[1:]).max() < 1e-3 * pressure * area
+    assert np.abs(first[1:]).max() < 5e-3 * pressure * area  # faces of tetrahedra are no mirror images
     radius = np.hypot(*mesh.vertices[:, :2].T)
     radial = (frames.displacements[1, :, :2] * mesh.vertices[:, :2]).sum(1) / radius
     grown = 2 * pressure / E_RING * FIT**2 * RIM / (RIM**2 - FIT**2)

@@ -20,7 +20,6 @@ from diffsim_ti.mechanics.stress.frozen_strains import FrozenStrains
 from diffsim_ti.mechanics.stress.law_state import LawStateKernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
-from diffsim_ti.mechanics.surfaces.overlap import pressed_apart
 from diffsim_ti.mechanics.surfaces.pair_shares import PairShares
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.monitor.energy_balance import EnergyWatch
@@ -31,6 +30,7 @@ from diffsim_ti.solvers.implicit.load_stepping import LoadStepping
 from diffsim_ti.solvers.implicit.multigrid import Following
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
+from diffsim_ti.solvers.implicit.overlap import pressed_apart
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.solvers.implicit.prescribed import PrescribedInPasses
 from diffsim_ti.state.history import History
