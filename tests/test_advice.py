@@ -299,6 +299,10 @@ FOLLOWED = {
         lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0)]), 1, outputs=ds.Length("rope")),
         lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0, name="rope")]), 1, outputs=ds.Length("rope")),
     ),
+    ("outputs/modes.py", "give it a stiffness="): (
+        lambda: ds.modes(scene(terms=[ds.MultiPointConstraint([7], [[1, 0, 0]])], fixed="xmin"), 1),
+        lambda: ds.modes(scene(terms=[ds.MultiPointConstraint([7], [[1, 0, 0]], stiffness=1e11)], fixed="xmin"), 1),
+    ),
     ("outputs/load_path.py", "reduced=; leave it out"): (
         lambda: ds.load_path(
             scene(mesh=JOINED, reduced={"body_1": "affine"}, terms=[ds.Gravity()]), "gravity", steps=1

@@ -41,6 +41,40 @@ def test_stress_of_a_bar_held_at_both_ends():
     assert held.outputs["reaction"][-1][0] == pytest.approx(E * STRAIN / (1 - 2 * NU), rel=1e-4)
 
 
+def test_a_bar_with_a_gradient_of_temperature_bends_without_stress():
+    """Of ten nodes, heated by a field at vertices: its curvature is alpha dT/dz."""
+    length, h, slope = 1.0, 0.1, 0.02
+    mesh = ds.TetrahedralMesh.create_box((4, 2, 2), (length, h, h), "five").quadratic()
+    x, y, z = mesh.vertices.T
+    corners = {"o": (x + y + z == 0), "a": (x == length) & (y + z == 0), "b": (y == h) & (x + z == 0)}
+    for name, chosen in corners.items():
+        mesh = mesh.with_vertex_set(name, chosen)
+    grown = ds.Grown(ds.LinearElastic(E=E, nu=NU), mesh.at_stress_points(slope * z))
+    scene = ds.Scene(mesh, grown, fixed={"o": "xyz", "a": "yz", "b": "z"}, precision="f64")
+    stress = ds.Stress(at="vertices")
+    r = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-12), 1, outputs=[stress, ds.ElasticEnergy()], gradients="all")
+    frames = r.forward()
+    assert np.abs(frames["stress"][-1]).max() < 1e-9 * E * slope * h
+    low = (y == 0) & (z == 0)
+    np.testing.assert_allclose(frames.displacements[-1, low, 2], slope / 2 * x[low] * (length - x[low]), atol=1e-12)
+    assert ds.dot_product_test(r) < 1e-9
+    with pytest.raises(ValueError, match=r"at points expected shape \(\d+, 4\) of a mesh with ten nodes"):
+        ds.Scene(mesh, ds.Grown(ds.LinearElastic(E=E, nu=NU), np.zeros((3, 4))))
+
+
+@pytest.mark.parametrize("kind", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver], ids=lambda s: s.__name__)
+def test_every_number_at_points(kind):
+    rng, mesh = np.random.default_rng(2), ds.TetrahedralMesh.create_box(2, 0.5, "five").quadratic()
+    grown = ds.Grown(ds.StableNeoHookean(E, NU), 0.05 * rng.standard_normal((mesh.num_tetrahedra, 4)))
+    scene = ds.Scene(mesh, grown, terms=ds.Growth(0.01), fixed="xmin", precision="f64")
+    options = {} if kind.explicit else dict(tolerance=1e-13)
+    r = ds.Rollout(kind(scene, dt=1e-3, **options), 2, gradients="all")
+    assert_transposed(r, 1e-11 if kind.explicit else 1e-8)
+    if kind.explicit:
+        report = ds.check_gradients(r, inputs=["growth", "growth_over_time"])
+        assert all(row.relative_error < 1e-6 for row in report.rows), report
+
+
 @pytest.mark.parametrize("kind", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver], ids=lambda s: s.__name__)
 def test_every_number(kind):
     rng, mesh = np.random.default_rng(1), cube()

@@ -61,6 +61,25 @@ def test_a_balloon_goes_through_its_greatest_pressure():
     assert exact == pytest.approx(differences, rel=1e-4) and exact * wall > 0.5 * limit.factor
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_a_gas_in_a_balloon_goes_through_the_same_pressures():
+    mesh = eighth_sphere(1.0, 1.2, layers=1, around=3)
+    pressed = inflated(mesh)
+    gas = pressed.replace(terms=[ds.GasChamber(0.1 * MU, "inside", outside=0.0)])
+    volume = gas.terms[0].enclosure.volume
+    ways = []
+    for scene, name in ((pressed, "pressure"), (gas, "gas_pressure")):
+        path = ds.load_path(scene, name, step=0.5, until=lambda s, u: inner_stretch(mesh, u) > 1.6)
+        V = np.array([volume(mesh.vertices + u) for u in path.displacements])
+        amount = volume(mesh.vertices) / V if scene is gas else 1.0
+        ways.append((V, path.factors * amount))
+    (V, p), (own, q) = ways
+    inside = own < V[-1]
+    assert inside.sum() > 4 and np.interp(own[inside], V, p) == pytest.approx(q[inside], rel=0.02, abs=0.02)
+    with pytest.raises(ValueError, match="grow over the steps of a StaticSolver"):
+        ds.load_path(pressed.replace(terms=[ds.FilledChamber(0.6, "inside")]), "chamber_volume")
+
+
 HALF, RISE, H, MODULUS = 1.0, 0.06, 0.02, 1e7  # of a clamped arch: half its span, rise, thickness and width [m], [Pa]
 RADIUS = (HALF**2 + RISE**2) / (2 * RISE)
 OPENING = np.arcsin(HALF / RADIUS)

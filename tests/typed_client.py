@@ -22,6 +22,7 @@ def fall() -> float:
     mesh = ds.TetrahedralMesh.create_cube(resolution=3, size=0.5)
     assert_type(mesh.num_vertices, int)
     assert_type(mesh.vertices, np.ndarray)
+    assert_type(mesh.at_stress_points(mesh.vertices[:, 0]), np.ndarray)
     material = ds.StableNeoHookean(youngs_modulus=1e5, poissons_ratio=0.3)
     terms = [ds.Gravity(), ds.Drag(1.0), ds.Ground(height=-0.1)]
     scene = ds.Scene(mesh, material, density=1e3, terms=terms, fixed="xmin", precision="f64")

@@ -167,10 +167,10 @@ def estimated(
         raise ValueError(
             f"accuracy is of equilibria and implicit steps, not of {rollout.solver!r}: take StaticSolver or BDF2Solver"
         )
-    if rollout.scene.holds_volumes or rollout.scene.reduced:
+    if rollout.scene.has_multipliers or rollout.scene.reduced:
         raise ValueError(
-            "accuracy does not support chambers that hold volumes, and vertices that move by few numbers or are tied: "
-            "compare runs on two meshes instead"
+            "accuracy does not support what is held exactly (volumes, relations), and vertices that move by few numbers or "
+            "are tied: compare runs on two meshes instead"
         )
     begin = time.perf_counter()
     value, own, frames = _run(rollout, number, values, given)

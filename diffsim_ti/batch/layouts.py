@@ -159,11 +159,13 @@ def why_not(solver) -> str | None:
     terms = dict(self_contact=scene.term(SelfContact))
     terms |= {x.name: True for x in scene.interactions if solver.explicit and x.apart}
     terms |= dict(contact_by_pairs=any(term.primitives is not None for term in scene.terms))
+    values = scene.inputs.values
+    terms |= dict(numbers_at_points=any(values[x].ndim == 2 for x in scene.material.at_points if x in values))
     terms |= dict(mesh_obstacles=any(term.table.size for term in scene.ordered_terms if term.acts_on_surface))
     if solver.explicit:
         terms |= dict(reduced_sets=scene.reduced)
     else:
-        terms |= dict(reduced_sets_or_ties=scene.reduced, chambers_of_given_volume=scene.holds_volumes)
+        terms |= dict(reduced_sets_or_ties=scene.reduced, volumes_or_relations_that_are_held=scene.has_multipliers)
         terms |= dict(robots=scene.terms_of(Robot))
     if there := [name.replace("_", " ") for name, some in terms.items() if some]:
         return f"it has {' and '.join(there)}"

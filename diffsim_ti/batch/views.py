@@ -256,7 +256,7 @@ class TetrahedronOfScenes(Tetrahedron):
         return (EightScenes if self.lanes else OneScene)(self.fp, self.nodes.count)
 
     @traced
-    def coefficients_of(self, item, array) -> list:
+    def coefficients_of(self, item, array, q: int = 0) -> list:
         K = len(self.law.coefficient_names)
         return self.items.numbers(array, 0, K, K, item)
 

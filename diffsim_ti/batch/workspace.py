@@ -91,6 +91,10 @@ class BatchWorkspace:
         """Bring the scenes' numbers to the device and, with `start`, set their start."""
         a, self.derived = self.arrays, derived
         first = derived[0]
+        if any(d.coefficients.ndim == 3 for d in derived):
+            raise ValueError(
+                "a Batch takes numbers at points where its scene has them: give them to the material first"
+            )
         if any(d.coefficients.ndim != first.coefficients.ndim for d in derived):
             m = a.num_tetrahedra
             whole = [np.broadcast_to(d.coefficients, (m, d.coefficients.shape[-1])) for d in derived]

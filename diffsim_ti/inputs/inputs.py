@@ -31,7 +31,7 @@ class Derived:
 
     displacement: np.ndarray  # (num_vertices, 3) [m]
     velocity: np.ndarray  # (num_vertices, 3) [m/s]
-    coefficients: np.ndarray  # (K,) or (num_tetrahedra, K)
+    coefficients: np.ndarray  # (K,), (num_tetrahedra, K) or (num_tetrahedra, points, K)
     mass: np.ndarray  # (num_vertices,) [kg]
     parameters: np.ndarray  # the numbers of all terms, one after the other
     rest: np.ndarray  # (num_vertices, 3) [m]

@@ -27,7 +27,8 @@ class Around(Material):
         self.material, self.own, self.J_floor, self._extra = material, tuple(numbers), None, ""
         self.density, self.valid_to = material.density, material.valid_to
         self._numbers = numbers | material._numbers
-        self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
+        given = {name: np.ravel(x) if self._is_at_points(name, x) else x for name, x in self._numbers.items()}
+        self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in given.items()})
 
     remembers = True  # whether its law has a state
 
@@ -68,6 +69,8 @@ class Around(Material):
     @staticmethod
     def _joined(columns: list, of_material: np.ndarray) -> np.ndarray:
         parts = [*(np.asarray(x, np.float64)[..., None] for x in columns), of_material]
+        if any(part.ndim == 3 for part in parts):  # numbers at points
+            parts = [part[:, None] if part.ndim == 2 else part for part in parts]
         shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
         return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], -1)
 
@@ -92,7 +95,8 @@ class Around(Material):
         first = count - len(self.material.law("f64").coefficient_names)
         own = self.own_vjp(self._numbers_of(values), [adj[..., k] for k in range(first)])
         out = self._columns_vjp(values, self.own, own)
-        out |= self.material.coefficients_vjp(self.inner(values), adj[..., first:])
+        within = adj[..., first:]
+        out |= self.material.coefficients_vjp(self.inner(values), within.sum(1) if adj.ndim == 3 else within)
         if self.takes_moduli:
             for name, part in self.isotropic.lame_vjp(self._moduli_values(values), *own[-2:]).items():
                 out[name] = out[name] + part

@@ -142,8 +142,10 @@ class Grown(Around):
         psi = det(F_g) psi_material(F F_g^-1) [J/m^3], P = det(F_g) P_material(F F_g^-1) F_g^-T
 
     growth [-], > -1: growth or swelling (shrinkage below zero) as strain along each edge; of heat alpha (T - T_0). One
-    number, one for each tetrahedron, or by named sets as all numbers of materials; an input with gradient, "growth". A free
-    body with uniform growth takes its new size without stress. Mass stays that of the rest shape.
+    number, one for each tetrahedron, or by named sets as all numbers of materials; of ten nodes also one at each of the four
+    points of the stresses, shape (num_tetrahedra, 4), such as `mesh.at_stress_points(x)` of a field x at vertices. An input
+    with gradient, "growth". A free body with uniform growth takes its new size without stress, and one of ten nodes with
+    growth that is linear in space its curved one. Mass stays that of the rest shape.
     `Grown(material, strain=e)`: a stretch at rest that has directions, such as of wood that swells or a membrane that was
     stretched before it was glued: F_g = 1 + e, e = (xx, yy, zz, yz, xz, xy) [-], shear as half the angle; shape (6,),
     (num_tetrahedra, 6) or by sets; input "growth_strain". Matter that was stretched to its rest shape by U has e = U^-1 - 1.
@@ -156,6 +158,7 @@ class Grown(Around):
     units = {"growth": "-", "growth_strain": "-"}
     shapes = {"growth_strain": (6,)}
     takes_moduli = False
+    at_points = ("growth",)
 
     def __init__(self, material: Material, growth: PerTetrahedron | None = None, strain: PerTetrahedron | None = None):
         given = {name: x for name, x in (("growth", growth), ("growth_strain", strain)) if x is not None}
@@ -182,6 +185,7 @@ class Grown(Around):
 
     def lame(self, values):
         stretches = self._stretches(values)
+        stretches = stretches.max(1) if stretches.ndim == 3 else stretches  # of points
         most = stretches[..., 0] if self.own == ("growth",) else stretches.prod(-1) / stretches.min(-1) ** 2
         return tuple(part * np.maximum(most, 1) for part in self.material.lame(self.inner(values)))
 

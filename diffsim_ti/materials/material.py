@@ -50,6 +50,7 @@ class Material(metaclass=Public):
     spellings = (("youngs_modulus", "poissons_ratio"), ("mu", "lam"))
     shapes: dict[str, tuple] = {}
     units: dict[str, str] = {}
+    at_points: tuple[str, ...] = ()  # names of numbers that each point of the stresses of ten nodes may have its own of
     from_lame = np.eye(2)
     to_lame: np.ndarray | None = None
     from_own: np.ndarray | None = None  # None: the coefficients are the numbers themselves
@@ -115,12 +116,19 @@ class Material(metaclass=Public):
 
         Raises ValueError for a wrong length, an unknown or overlapping set, or tetrahedra left out.
         """
-        values = {name: _on_mesh(name, number, mesh, self.shape_of(name)) for name, number in self._numbers.items()}
+        values = {}
+        for name, number in self._numbers.items():
+            each = (mesh.num_tetrahedra, mesh.reference.num_points) if self._is_at_points(name, number) else None
+            values[name] = _on_mesh(name, number, mesh, self.shape_of(name), each)
         self.check(values)
         return values
 
     def spread(self, refinement: Refinement) -> "Material":
         """The same on a finer mesh, whose tetrahedra have the numbers of those that they lie in."""
+        if of_points := [name for name, number in self._numbers.items() if self._is_at_points(name, number)]:
+            raise ValueError(
+                f"{of_points[0]} is given at points, which a finer mesh has others of: give one per tetrahedron"
+            )
         out = copy(self)
         out._numbers = {name: refinement.spread(number) for name, number in self._numbers.items()}
         return out
@@ -128,7 +136,12 @@ class Material(metaclass=Public):
     def described(self, mesh: TetrahedralMesh) -> list[Input]:
         """The inputs of a body of this material: each number (or vector) is one, or one per tetrahedron."""
         shapes = {name: (self.shape_of(name), ("tetrahedra", *self.shape_of(name))) for name in self.inputs}
+        points = (("tetrahedra", mesh.reference.num_points),) if mesh.order == 2 else ()
+        shapes |= {name: shapes[name] + points for name in self.at_points if name in shapes}
         return [Input(name, value, shapes[name], self.unit_of(name)) for name, value in self.values(mesh).items()]
+
+    def _is_at_points(self, name: str, number) -> bool:
+        return name in self.at_points and not isinstance(number, Mapping) and np.ndim(number) == 2
 
     def links(self) -> list[Link]:
         """From the inputs to what the law's kernels read: the links that write "coefficients"."""
@@ -298,6 +311,8 @@ def summed(adjoint: np.ndarray, value, shape: tuple = ()) -> np.ndarray:
     adjoint, uniform = np.asarray(adjoint, np.float64), np.ndim(value) == len(shape)
     if uniform:
         return adjoint.reshape(-1, *shape).sum(0)
+    if adjoint.ndim > np.ndim(value):  # of points
+        adjoint = adjoint.sum(1)
     return adjoint if adjoint.shape == np.shape(value) else np.broadcast_to(adjoint, np.shape(value))
 
 
@@ -348,9 +363,17 @@ def _all_values(name: str, number, shape: tuple) -> np.ndarray:
     return np.array([_one(f"{name}[{key!r}]", value, shape) for key, value in number.items()])
 
 
-def _on_mesh(name: str, number, mesh, shape: tuple) -> np.ndarray:
+def _on_mesh(name: str, number, mesh, shape: tuple, each: tuple | None) -> np.ndarray:
+    """each: shape of a number that is given at points."""
     if isinstance(number, dict):
         return values_of_sets(name, number, mesh, shape)
+    if each is not None:
+        if np.shape(number) != each or mesh.order == 1:
+            raise ValueError(
+                f"{name}: at points expected shape {each} of a mesh with ten nodes, as mesh.at_stress_points(x) has, got "
+                f"shape {np.shape(number)}"
+            )
+        return np.asarray(number, np.float64)
     value, whole = _number(name, number, shape), (mesh.num_tetrahedra, *shape)
     if value.shape not in (shape, whole):
         one = f"{shape[0]} numbers or {shape[0]}" if shape else "one number or one"

@@ -1,30 +1,82 @@
-"""Linear relations between displacements, held by a penalty: E = sum of stiffness / 2 g^2, g = sum c . u - value."""
+"""Linear relations between displacements: in implicit steps and statics held by a penalty,
+
+    E = sum of stiffness / 2 g^2,    g = sum c . u - value,
+
+in explicit steps exactly, by a stage."""
+
+import weakref
+from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.loads import PressureRows
+from diffsim_ti.mechanics.chambers.pressures import PrescribedVolume
+from diffsim_ti.mechanics.chambers.volume_constraints import ChamberWalls, VolumeConstraints, along, slopes
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.pressure.follower_pressure import pressures_at
 from diffsim_ti.terms.multi_point_constraint import MultiPointConstraint
 
 
+def rows_of(coefficients: list[np.ndarray], vertices: list[np.ndarray], num_vertices: int):
+    """Relations as rows of a SciPy CSR matrix."""
+    from scipy.sparse import csr_matrix
+
+    columns = [(3 * at[:, None] + np.arange(3)).ravel() for at in vertices]
+    start = np.cumsum([0, *map(len, columns)])
+    entries = np.concatenate([c.ravel() for c in coefficients]), np.concatenate(columns), start
+    return csr_matrix(entries, (len(columns), 3 * num_vertices))
+
+
 class ConstraintForce(HostForce):
-    """Of each relation its vertices, shape (k,), and where its coefficients and stiffness stand among the parameters."""
+    """Of each relation its vertices, shape (k,), and where its coefficients and stiffness stand among the parameters.
+
+    A relation with a stiffness pushes with p = -stiffness g, f_j = p c_j; one without with what holds it (multipliers.py).
+    laws: of the latter, whose numbers are `held`.
+    """
 
     has_energy = symmetric = True
 
     def __init__(self, vertices: list[np.ndarray], rows: list[slice]):
         self.vertices, self.rows = vertices, rows
+        self.held = [k for k, (at, row) in enumerate(zip(vertices, rows)) if row.stop - row.start == 3 * len(at)]
+        self.laws = [PrescribedVolume() for _ in self.held]
 
     def take(self, values, instant):
         numbers = [values.parameters[row] for row in self.rows]
-        self.c, self.k = [x[:-1].reshape(-1, 3) for x in numbers], [x[-1] for x in numbers]
+        self.c = [x[: 3 * len(at)].reshape(-1, 3) for x, at in zip(numbers, self.vertices)]
+        self.given = [x[-1] for x in numbers]
+        if values.relations is None:  # of no step
+            return super().take(values, instant)
         self.value = instant.load * pressures_at(values.relations, instant)
+        for law, k in zip(self.laws, self.held):
+            law.target = float(self.value[k])
         return super().take(values, instant)
 
-    def _gaps(self, u, value) -> list[float]:
-        return [float((c * u[at]).sum()) - x for c, at, x in zip(self.c, self.vertices, value)]
+    def stiffest(self, values, schedule):
+        """Explicit steps hold relations without a stiffness."""
+        super().stiffest(values, schedule)
+        self.given = [0.0 for _ in self.given]
+        return self
+
+    @property
+    def k(self) -> list[float]:
+        """-dp/dg [N/m]."""
+        out = list(self.given)
+        for law, k in zip(self.laws, self.held):
+            out[k] = law.gamma
+        return out
+
+    def _along(self, u) -> list[float]:
+        return [float((c * u[at]).sum()) for c, at in zip(self.c, self.vertices)]
+
+    def _pushes(self, u) -> list[float]:
+        along = self._along(u)
+        out = [-k * (x - value) for k, x, value in zip(self.given, along, self.value)]
+        for law, k in zip(self.laws, self.held):
+            out[k] = law.pressure(along[k])
+        return out
 
     def _spread(self, amounts, shape) -> np.ndarray:
         out = np.zeros(shape)
@@ -33,37 +85,47 @@ class ConstraintForce(HostForce):
         return out
 
     def forces(self, u):
-        return self._spread([-k * g for k, g in zip(self.k, self._gaps(u, self.value))], u.shape)
+        return self._spread(self._pushes(u), u.shape)
 
     def energies(self, u):
-        return np.array([0.5 * k * g**2 for k, g in zip(self.k, self._gaps(u, self.value))])
+        along = self._along(u)
+        out = np.array([0.5 * k * (x - value) ** 2 for k, x, value in zip(self.given, along, self.value)])
+        for law, k in zip(self.laws, self.held):
+            gone = along[k] - law.volume
+            out[k] = gone * (0.5 * law.gamma * gone - law.multiplier)
+        return out
 
     def jvp(self, u, du, dv, moved=None):
-        none = np.zeros(len(self.k))
-        out = self._spread([-k * g for k, g in zip(self.k, self._gaps(du, none))], u.shape)
+        k = self.k
+        push = [-stiff * x for stiff, x in zip(k, self._along(du))]
+        out = self._spread(push, u.shape)
         if moved is None:
             return out
         dvalue = self.instant.load * pressures_at(moved.relations, self.instant)
-        for c, k, at, g, row, dx in zip(self.c, self.k, self.vertices, self._gaps(u, self.value), self.rows, dvalue):
+        parts = zip(self.c, k, self.vertices, self._along(u), self._pushes(u), self.rows, dvalue, self.value)
+        for n, (c, stiff, at, x, p, row, dx, value) in enumerate(parts):
             change = moved.parameters[row]
-            dc, dk = change[:-1].reshape(-1, 3), change[-1]
-            np.add.at(out, at, -(dk * g + k * (float((dc * u[at]).sum()) - dx)) * c - k * g * dc)
+            dc, dk = change[: c.size].reshape(-1, 3), 0.0 if n in self.held else change[-1]
+            np.add.at(out, at, -(dk * (x - value) + stiff * (float((dc * u[at]).sum()) - dx)) * c + p * dc)
         return out
 
     def vjp(self, u, w, adj=None):
-        none = np.zeros(len(self.k))
-        pulled = self._gaps(w, none)
+        k, pulled = self.k, self._along(w)
         if adj is not None:
-            by_value = []
-            for k, at, g, row, p in zip(self.k, self.vertices, self._gaps(u, self.value), self.rows, pulled):
-                adj.parameters[row] += np.append(-k * (p * u[at] + g * w[at]), -g * p)
-                by_value.append(self.instant.load * k * p)
-            at = self.instant
-            at.schedule.add_pressure(adj.relations, at.j, at.share, np.array(by_value))
-        return self._spread([-k * p for k, p in zip(self.k, pulled)], u.shape), 0.0
+            by_value = [self.instant.load * stiff * x for stiff, x in zip(k, pulled)]
+            for n, (stiff, at, p, row, x) in enumerate(zip(k, self.vertices, self._pushes(u), self.rows, pulled)):
+                adj.parameters[row][: 3 * len(at)] += (p * w[at] - stiff * x * u[at]).ravel()
+                if n not in self.held:
+                    adj.parameters[row][-1] -= (self._along(u)[n] - self.value[n]) * x
+            self._add_values(adj, np.array(by_value))
+        return self._spread([-stiff * x for stiff, x in zip(k, pulled)], u.shape), 0.0
+
+    def _add_values(self, adj, by_value: np.ndarray) -> None:
+        at = self.instant
+        at.schedule.add_pressure(adj.relations, at.j, at.share, by_value)
 
     def product(self, u, w, convex=False):
-        return self._spread([k * p for k, p in zip(self.k, self._gaps(w, np.zeros(len(self.k))))], u.shape)
+        return self._spread([k * x for k, x in zip(self.k, self._along(w))], u.shape)
 
     def blocks(self, u):
         out = np.zeros((len(u), 3, 3))
@@ -72,25 +134,62 @@ class ConstraintForce(HostForce):
         return out
 
     def matrix(self, u):
-        from scipy.sparse import csr_matrix
-
-        columns = [(3 * at[:, None] + np.arange(3)).ravel() for at in self.vertices]
-        start = np.cumsum([0, *map(len, columns)])
-        entries = np.concatenate([c.ravel() for c in self.c]), np.concatenate(columns), start
-        C = csr_matrix(entries, (len(self.k), u.size))
+        C = rows_of(self.c, self.vertices, len(u))
         return C.T @ C.multiply(np.array(self.k)[:, None]).tocsr()
 
     def resisted(self):
-        which = np.repeat(np.arange(len(self.k)), [len(at) for at in self.vertices])
+        which = np.repeat(np.arange(len(self.c)), [len(at) for at in self.vertices])
         return which, np.concatenate(self.vertices), np.concatenate(self.c)
 
     def turning(self, u, w):
         return 0.0
 
+    # ---- of relations that are held, as of volumes (multipliers.py) -----------------------------------------------------
+
+    def volumes_at(self, u):
+        along = self._along(u)
+        return [along[k] for k in self.held]
+
+    def gradients(self, u):
+        return [self._spread(np.arange(len(self.c)) == k, u.shape) for k in self.held]
+
+    def targets_jvp(self, u, du, moved):
+        dvalue = self.instant.load * pressures_at(moved.relations, self.instant)
+        turned = [moved.parameters[self.rows[k]].reshape(-1, 3) for k in self.held]
+        along = self._along(du)
+        return [dvalue[k] - float((dc * u[self.vertices[k]]).sum()) - along[k] for k, dc in zip(self.held, turned)]
+
+    def add_targets(self, nu, u, adj):
+        by_value, every = np.zeros(len(self.c)), np.zeros(len(self.c))
+        for k, own in zip(self.held, nu):
+            by_value[k], every[k] = self.instant.load * own, -own
+            adj.parameters[self.rows[k]] -= own * u[self.vertices[k]].ravel()
+        self._add_values(adj, by_value)
+        return self._spread(every, u.shape)
+
 
 class Constraints(Interaction):
-    name, kinds, works = "relations", (MultiPointConstraint,), "constraints"
+    name, kinds, works, apart, in_kernels = "relations", (MultiPointConstraint,), "constraints", True, False
     derived = dict(relations="vectors2")  # values as each step begins and ends, and 0, (1 or steps, relations, 3)
+
+    def check_solver(self, solver):
+        exact = [term for term in self.terms if solver.explicit or term.is_exact]
+        if not exact:
+            return
+        coefficients = [term.described[1].value for term in exact]
+        indices, free = [term.indices(self.mesh) for term in exact], self.scene.supports.freedom(self.mesh.num_vertices)
+        held = [c - np.einsum("kij,kj->ki", free[at], c) for c, at in zip(coefficients, indices)]
+        C = rows_of(coefficients, indices, self.mesh.num_vertices)
+        size = np.sqrt(np.asarray(C.power(2).sum(1)))
+        if max(np.abs(x).max() for x in held) > 1e-12 * size.max():
+            raise ValueError(
+                "MultiPointConstraint: what is held exactly names no vertices along directions in which they are fixed: "
+                "leave them out, and what they are moved by comes to the value"
+            )
+        if np.linalg.matrix_rank((C @ C.T).toarray() / (size @ size.T), tol=1e-9) < len(exact):
+            raise ValueError(
+                "MultiPointConstraint: relations that are held exactly follow from each other: leave one out"
+            )
 
     def links(self, own):
         return [PressureRows([row for t in self.terms for row in t.rows_in_time(own[t])], "relations")]
@@ -98,3 +197,69 @@ class Constraints(Interaction):
     def host(self):
         rows = [self.scene.inputs.parameters.of(term) for term in self.terms]
         return ConstraintForce([term.indices(self.mesh) for term in self.terms], rows)
+
+
+@dataclass
+class RelatedVertices(ChamberWalls):
+    """The same of vertices with relations between their displacements x, whose coefficients are in the place of dV/dx."""
+
+    held: "HeldRelations"
+
+    def gradients(self, y):
+        return self.held.c
+
+    def turned(self, dx):
+        return self.held.c_dot
+
+    def turned_vjp(self, weights, w):
+        self.held.c_adj += weights[:, None, None] * w
+        return np.zeros_like(self.x)
+
+    def moved(self, y):
+        return along(self.held.c_dot, y)
+
+    def moved_vjp(self, weights, y):
+        self.held.c_adj += weights[:, None, None] * y
+
+    def meet(self, y, targets):
+        return np.linalg.solve(slopes(self.g, self.d), targets - along(self.g, y))
+
+
+class HeldRelations(VolumeConstraints):
+    """Explicit passes hold relations as they hold volumes (volume_constraints.py), sum c . u in the place of V."""
+
+    numbers, is_shown = "relations", False
+
+    def __init__(self, workspace):
+        self.ws, scene = weakref.proxy(workspace), workspace.scene
+        terms = scene.terms_of(MultiPointConstraint)
+        indices = [term.indices(scene.mesh) for term in terms]
+        self.places = self.columns = list(range(len(terms)))
+        self._hold(workspace, np.unique(np.concatenate(indices)))
+        self._own_numbers = [scene.inputs.parameters.of(term) for term in terms]
+        self._at = [np.searchsorted(self.nodes, own) for own in indices]
+
+    def _coefficients(self, parameters: np.ndarray) -> np.ndarray:
+        """Of all relations and vertices, shape (relations, vertices, 3)."""
+        out = np.zeros((len(self._at), len(self.nodes), 3))
+        for c, at, own in zip(out, self._at, self._own_numbers):
+            np.add.at(c, at, parameters[own][: 3 * len(at)].reshape(-1, 3))
+        return out
+
+    def walls(self, u):
+        values = self.ws.arrays.values
+        self.c = self._coefficients(values.parameters)
+        return RelatedVertices([], u, 1 / values.mass[self.nodes, None], self.free, self)
+
+    def of_rest(self, x):
+        return np.zeros((len(self.nodes), 3))
+
+    def take_change(self, change: Derived):
+        self.c_dot = self._coefficients(change.parameters)
+
+    def clear_adjoint(self):
+        self.c_adj = np.zeros((len(self._at), len(self.nodes), 3))
+
+    def collect(self, out: Derived, by_rest):
+        for by_c, at, own in zip(self.c_adj, self._at, self._own_numbers):
+            out.parameters[own][: 3 * len(at)] += by_c[at].ravel()

@@ -74,6 +74,7 @@ class Workspace:
         self.restart()
         if self.pairs:
             self.pairs.load(self.state.u)
+            self.check_surfaces()
 
     def restart(self) -> None:
         """Set the state to the start."""
@@ -112,6 +113,10 @@ class Workspace:
         key = (kernel, *map(id, parts))
         return self.kept(key, lambda: (kernel.bind(self.arrays.in_vectors, scene=self.arrays, **records), parts))[0]
 
+    def check_surfaces(self) -> None:
+        """Raise Overlap where surfaces of the state touch or pass through each other; there are pairs."""
+        self.pairs.check_apart(self.state.u)
+
     def check_apart(self) -> None:
         """Raise Overlap where the state is in an obstacle and steps could not bring it out."""
 
@@ -120,6 +125,7 @@ class Workspace:
         self.changes += 1
         if self.pairs:
             self.pairs.forget(self.state.u)
+            self.check_surfaces()
 
     def checked_law_state(self, law_state) -> np.ndarray:
         """What a law shall remember, as an array; raises ValueError for another shape."""

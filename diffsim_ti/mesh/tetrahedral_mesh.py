@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.common.checked import instance, listed
+from diffsim_ti.common.checked import instance, listed, numbers
 from diffsim_ti.common.origin import warn_of_rounding
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.common.warn import warn
@@ -243,6 +243,15 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
     def centroids(self) -> np.ndarray:
         """Mean of the four vertices [m], shape (num_tetrahedra, 3)."""
         return frozen(self.vertices[self.tetrahedra].mean(1))
+
+    def at_stress_points(self, values: ArrayLike) -> np.ndarray:
+        """A field given at the vertices, shape (num_vertices,), such as a temperature, as the elements interpolate it where
+        stresses are: (num_tetrahedra,), of ten nodes (num_tetrahedra, 4)."""
+        values = numbers("values at the vertices", values)
+        if values.shape != (self.num_vertices,):
+            raise ValueError(f"values: expected one for each vertex, shape {(self.num_vertices,)}, got {values.shape}")
+        out = values[self.elements] @ self.reference.functions(self.reference.points).T
+        return out[:, 0] if self.order == 1 else out
 
     @cached_property
     def bounding_box(self) -> np.ndarray:

@@ -11,7 +11,7 @@ from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads
 from diffsim_ti.outputs.output import Change, Frames, Output
-from diffsim_ti.outputs.stresses import PatchPressure
+from diffsim_ti.outputs.stresses import PatchPressure, at_points
 from diffsim_ti.scene import Scene
 
 
@@ -75,8 +75,7 @@ class ElasticEnergy(Output):
 
     def _at_points(self, coefficients: np.ndarray) -> np.ndarray:
         """Of all points, shape (points, K)."""
-        K = len(self.law.coefficient_names)
-        return np.repeat(np.broadcast_to(coefficients, (len(self.all), K)), self.points, 0)
+        return at_points(coefficients, len(self.all), self.points).reshape(-1, coefficients.shape[-1])
 
     def value(self, frames: Frames) -> np.ndarray:
         derived, _, psi, *_, at = self._densities(frames)
@@ -104,9 +103,10 @@ class ElasticEnergy(Output):
             by_theta, by_lam, own = at.vjp(0.5 * scaled * at.theta)
             H_adj = H_adj + (by_theta + 0.5 * scaled * at.value)[..., None, None] * at.G
             by_p, by_V = at.split_vjp(by_p, by_lam), by_V + own + (0.5 * weight * at.value * at.theta).sum(0)
-        by_p = by_p.reshape(len(self.all), self.points, -1).sum(1)
+        by_p = by_p.reshape(len(self.all), self.points, -1)
+        by_p = by_p if derived.coefficients.ndim == 3 else by_p.sum(1)
         positions, adjoint.gradients = deformation.vjp(H_adj, frames.positions.shape[1])
-        adjoint.coefficients = by_p if derived.coefficients.ndim == 2 else by_p.sum(0)
+        adjoint.coefficients = by_p.sum(0) if derived.coefficients.ndim == 1 else by_p
         adjoint.volumes, adjoint.rest = by_V.reshape(derived.volumes.shape), -positions.sum(0)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         by_state = self.remembered_vjp(frames, scaled.reshape(by_z.shape[:3])[..., None] * by_z)

@@ -10,13 +10,14 @@ from diffsim_ti.common.checked import number, shown
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.inputs.description import InputValue
+from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
 from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads, BodyForces, at_end
 from diffsim_ti.outputs.modes import FOURTH_ORDER, free_directions
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import StaticSolver
-from diffsim_ti.terms import Chamber, SelfContact
+from diffsim_ti.terms import Robot, SelfContact
 
 
 class Equilibria:
@@ -84,6 +85,8 @@ class Equilibria:
 
     def factorised(self) -> "Tangent":
         """Of -dR/dq."""
+        from scipy.sparse import csr_matrix
+
         self.potential.blocks()
         n, more = len(self.u), []
         for force in self.loads.hosts.take(self.derived, at_end(1)):
@@ -91,6 +94,9 @@ class Equilibria:
             if matrix is None:
                 raise ValueError(f"load_path: the matrix of {type(force).__name__} is not known: write its `matrix`")
             more.append(matrix)
+            if isinstance(force, ChamberPressure):  # whose pressures change with their volumes
+                for a, b in force.tangent(self.u).pairs:
+                    more.append(-csr_matrix(a.reshape(-1, 1)) @ csr_matrix(b.reshape(1, -1)))
         A = self.T.T @ assemble(self.potential, np.zeros((n, 1)), np.ones((n, 1)), more)[0] @ self.T
         return Tangent((0.5 * (A + A.T) if self.symmetric else A).tocsc())
 
@@ -244,15 +250,15 @@ def load_path(
 
     load: name of the input that the factor s multiplies, such as "pressure", "traction", "gravity" or "prescribed_motion",
         or several; all else stays as in the scene. s = 1 is the scene's own load; what is given over time counts as it is
-        at 1 s.
+        at 1 s. "gas_pressure" is the amount of gas in a chamber, whose outside= is then 0 or among the loads.
     steps: points that follow the first; step: the first change of the factor; until: a function of (factor,
         displacements) that says True where the path ends sooner.
     branch: a branch point, from which the path that crosses there is followed in the direction of its mode (a column beyond
         its buckling load); else s = 0. tolerance: of |R| over the size of the forces that meet at the vertices.
     values: of the scene's inputs, instead of its own, such as youngs_modulus=2e5 or rest_positions=X.
 
-    Raises ValueError for obstacles, self-contact, chambers, reduced sets, laws with a state or rates, and names that are
-    no input; NotConverged where no step of the path, however short, converges.
+    Raises ValueError for obstacles, self-contact, filled chambers, reduced sets, laws with a state or rates, and names that
+    are no input; NotConverged where no step of the path, however short, converges.
     Riks 1979, doi:10.1016/0020-7683(79)90081-7; Crisfield 1981, doi:10.1016/0045-7949(81)90108-5.
     """
     scene = _checked(scene).with_values(values)
@@ -282,11 +288,16 @@ def _checked(scene: Scene) -> Scene:
         raise ValueError(f"load_path: scene must be a Scene, got {shown(scene)}")
     scene = scene if scene.precision == "f64" else scene.replace(precision="f64")
     law = scene.law.in_steps()
-    others = (*scene.obstacles, *scene.terms_of(SelfContact, Chamber))
+    if scene.holds_volumes:
+        raise ValueError(
+            "load_path does not support FilledChamber: let its volume grow over the steps of a StaticSolver, which follows "
+            "it beyond the greatest pressure, or press by Pressure"
+        )
+    others = (*scene.obstacles, *scene.terms_of(SelfContact, Robot))
     if others:
         raise ValueError(
-            f"load_path does not support {type(others[0]).__name__}: leave it out, press by Pressure instead of a "
-            "chamber, or follow the motion by ImplicitEulerSolver with Drag"
+            f"load_path does not support {type(others[0]).__name__}: leave it out, or follow the motion by "
+            "ImplicitEulerSolver with Drag"
         )
     if any(body.kind != "tie" for body in scene.reduced.bodies):
         raise ValueError("load_path does not support sets that are reduced=; leave it out")

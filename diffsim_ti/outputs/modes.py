@@ -14,6 +14,7 @@ from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.outputs.forces_at_frames import BodyForces
 from diffsim_ti.scene import Scene
+from diffsim_ti.terms import MultiPointConstraint
 
 SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to which all of them are computed
 
@@ -125,6 +126,11 @@ def free_directions(scene: Scene):
     moves one vertex."""
     from scipy.sparse import csc_matrix
 
+    if any(term.is_exact for term in scene.terms_of(MultiPointConstraint)):
+        raise ValueError(
+            "modes and paths do not know a MultiPointConstraint that is held exactly: give it a stiffness= of a million "
+            "times E times the body's size"
+        )
     held = np.zeros((scene.mesh.num_vertices, 3, 3))
     held[scene.held] = scene.supports.held
     held[scene.mesh.unused_vertices] = np.eye(3)  # which have no mass

@@ -9,6 +9,13 @@ from diffsim_ti.materials.evaluate import LawOnArrays
 from diffsim_ti.mesh.patches import volume_patches
 
 
+def at_points(coefficients: np.ndarray, count: int, points: int) -> np.ndarray:
+    """Coefficients at the points of all tetrahedra, shape (count, points, K)."""
+    K = coefficients.shape[-1]
+    each = coefficients if coefficients.ndim == 3 else np.broadcast_to(coefficients, (count, K))[:, None]
+    return np.broadcast_to(each, (count, points, K))
+
+
 class TetrahedronStress:
     """P at the points of the tetrahedra `chosen`, by frames; `read`: those whose displacement gradients H, shape (frames,
     points, 3, 3), it takes, here the same."""
@@ -27,8 +34,8 @@ class TetrahedronStress:
 
     def _coefficients(self, coefficients: np.ndarray) -> np.ndarray:
         """Of the points, (points, K)."""
-        every = np.broadcast_to(coefficients, (self.scene.mesh.num_tetrahedra, coefficients.shape[-1]))
-        return np.repeat(every[self.read], self.points, 0)
+        every = at_points(coefficients, self.scene.mesh.num_tetrahedra, self.points)
+        return every[self.read].reshape(-1, coefficients.shape[-1])
 
     def _numbers(self, coefficients: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Coefficients and what the law remembers of the points of all frames, (frames points, K + S)."""
@@ -61,7 +68,8 @@ class TetrahedronStress:
         return by_H.reshape(H.shape), z_adj
 
     def _add_coefficients(self, by_p, derived, adjoint) -> None:
-        by_p = by_p.reshape(-1, self.points, by_p.shape[-1]).sum(1)
+        by_p = by_p.reshape(-1, self.points, by_p.shape[-1])
+        by_p = by_p if derived.coefficients.ndim == 3 else by_p.sum(1)
         if derived.coefficients.ndim == 1:
             adjoint.coefficients = adjoint.coefficients + by_p.sum(0)
         else:

@@ -118,6 +118,7 @@ class Simulator(metaclass=Public):
         self.workspace.place_obstacles(0)
         if self.workspace.pairs:
             self.workspace.pairs.forget(self.workspace.state.u)
+            self.workspace.check_surfaces()
         self.workspace.check_apart()
 
     def __reduce__(self):

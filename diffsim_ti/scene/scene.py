@@ -23,7 +23,7 @@ from diffsim_ti.mechanics.interactions import NUMBERS, interactions_of
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.sets import values_of_sets
 from diffsim_ti.scene.locking import LOCKING_RATIO, warn_if_locking
-from diffsim_ti.terms import Chamber, Drag, Gravity, Growth, Obstacle, SelfContact, Term, Tie
+from diffsim_ti.terms import Chamber, Drag, Gravity, Growth, MultiPointConstraint, Obstacle, SelfContact, Term, Tie
 from diffsim_ti.terms.glued import Glued
 from diffsim_ti.terms.mass_scaling import MassScaling
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
@@ -316,6 +316,11 @@ class Scene(MadeAgain):
     def holds_volumes(self) -> bool:
         """Whether some chamber holds a given volume."""
         return any(t.holds for t in self.terms_of(Chamber))
+
+    @property
+    def has_multipliers(self) -> bool:
+        """Whether implicit steps find Lagrange multipliers: of volumes, or of relations that are held exactly."""
+        return self.holds_volumes or any(t.is_exact for t in self.terms_of(MultiPointConstraint))
 
     def place_among(self, own: tuple[Term, ...], asked: Term | str, kind: str) -> int:
         """Place among some of its terms of one that is given by its name, or as the scene lists it."""

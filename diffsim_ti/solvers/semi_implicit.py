@@ -15,7 +15,7 @@ from diffsim_ti.solvers.explicit.solver import CONTACT_DAMPING, ExplicitSolver, 
 from diffsim_ti.solvers.substeps import Substeps
 from diffsim_ti.state.schedule import Schedule, StagedSteps
 from diffsim_ti.state.viscous_stages import MOST, ViscousStages
-from diffsim_ti.terms import Drag, Gravity
+from diffsim_ti.terms import Drag, FilledChamber, Gravity, MultiPointConstraint
 
 
 class SemiImplicitOptions(TypedDict, total=False):
@@ -167,8 +167,9 @@ class SemiImplicitSolver(ExplicitSolver):
                 f"viscous_stages={self.viscous_stages}: {scene.material.name} has no viscosity, so that additional kicks "
                 "in a substep have no effect; put KelvinVoigt around it, or leave viscous_stages out"
             )
-        if self.viscous_stages > 1 and (scene.holds_volumes or scene.reduced):
-            what = "a FilledChamber takes" if scene.holds_volumes else "reduced sets take"
+        held = scene.term(FilledChamber) or scene.term(MultiPointConstraint)
+        if self.viscous_stages > 1 and (held or scene.reduced):
+            what = f"a {type(held).__name__} takes" if held else "reduced sets take"
             raise ValueError(f"viscous_stages: {what} one kick for each substep; take substeps, or an implicit solver")
 
     def describe(self):

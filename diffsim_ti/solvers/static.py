@@ -20,8 +20,11 @@ class StaticSolver(ImplicitSolver):
     Raises ValueError, which names the motions, if supports, springs, cables and foundations leave a piece of the body free
     to move rigidly, or parts that meet at a vertex or an edge alone free to turn, as about a hinge. Where the scene has
     obstacles or SelfContact such a piece goes, as the loads pull it, by up to the body's size to where contact holds it,
-    with a warning; NotConverged if nothing does. NotConverged, too, where the body does not bear the load of a step, which
-    names the share of it that it bears. Warns Buckled where it leaves a branch of stable equilibria.
+    with a warning; NotConverged if nothing does. Bodies whose surfaces overlap at the start by less than an edge of these,
+    such as parts of a press fit, are pressed apart first, with a warning: the equilibrium is that of bodies as they are at
+    rest, and so are its gradients; in that step they have no friction on each other. NotConverged, too, where the body does
+    not bear the load of a step, which names the share of it that it bears. Warns Buckled where it leaves a branch of stable
+    equilibria.
     Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, ch. 3 and 7, doi:10.1007/978-0-387-40065-5.
 
     >>> import diffsim_ti as ds

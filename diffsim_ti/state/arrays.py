@@ -176,6 +176,7 @@ class SceneArrays:
             **said,
             interactions=tuple(x.kernel(self.values, self.precision, shape) for x in self.interactions),
             uniform=self.values.coefficients.ndim == 1,
+            by_points=self.values.coefficients.ndim == 3,
             density=density,
             shape=shape,
         )
@@ -330,9 +331,20 @@ class SceneArrays:
         return (self.num_tetrahedra, *points, len(self.law.state_names))
 
     def coefficient_blocks(self, coefficients: np.ndarray) -> np.ndarray:
-        """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
+        """Blocks of coefficients, shape (K,), (num_tetrahedra, K) or (num_tetrahedra, points, K); a single block serves all
+        if they are uniform."""
         uniform = np.zeros(LANES, int) if coefficients.ndim == 1 else None
         return self.to_blocks(np.atleast_2d(coefficients), uniform)
+
+    @property
+    def coefficients_each(self) -> int:
+        """How many a tetrahedron has."""
+        return self.num_coefficients * (self.points if self.features().by_points else 1)
+
+    def coefficients_from_blocks(self, blocks: np.ndarray) -> np.ndarray:
+        """The inverse, for adjoints, which each tetrahedron has its own of."""
+        out = self.from_blocks(blocks, self.coefficients_each)
+        return out.reshape(-1, self.points, self.num_coefficients) if self.features().by_points else out
 
     def growth_blocks(self, growth: np.ndarray | None):
         """Blocks of growths (rows, 2, 1 or num_tetrahedra), (rows, 2 blocks, LANES), beginning and end of a step in turn;

@@ -65,6 +65,7 @@ class Features:
     moving: int = 0  # columns of the paths that obstacles follow
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra
+    by_points: bool = False  # whether each point of the stresses has its own
     recorded: bool = False  # whether a loss names what a contact stage does
     balanced: bool = False  # whether the work of the body's own forces is counted
     density: bool = False  # the last two: adjoints that cost extra, only if asked for
@@ -146,7 +147,7 @@ class Features:
     def of_state(self) -> "Features":
         """What energies, forces and their derivatives in a given state see of it: scenes that differ in the rest share their
         kernels."""
-        kept = "order groups growing growth_per_step growth_uniform uniform density shape".split()
+        kept = "order groups growing growth_per_step growth_uniform uniform by_points density shape".split()
         numbers = self.num_parameters if self.density or self.shape else 0  # say where other sums begin
         return Features(**{name: getattr(self, name) for name in kept}, num_parameters=numbers)
 

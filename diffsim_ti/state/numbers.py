@@ -45,7 +45,7 @@ PARTS = {
         lambda a, x: a.with_stress(a.from_blocks(x, a.points).reshape(a.values.volumes.shape)),
     ),
     "coefficients": Part(
-        "blocks", lambda a, d: a.coefficient_blocks(d.coefficients), lambda a, x: a.from_blocks(x, a.num_coefficients)
+        "blocks", lambda a, d: a.coefficient_blocks(d.coefficients), lambda a, x: a.coefficients_from_blocks(x)
     ),
     "growths": Part("blocks2", lambda a, d: a.growth_blocks(d.growths), lambda a, x: a.from_growth_blocks(x)),
     "mass": Part("scalars", _given("mass")),
@@ -142,7 +142,7 @@ class Adjoint:
         self._arrays, self._features = arrays, features
         a, blocks = arrays, arrays.num_blocks
         shape = a.points * blocks if features.shape else 0
-        self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
+        self.coefficients = runtime.array(a.lanes, a.coefficients_each * blocks)
         self.gradients, self.volumes = runtime.array(a.lanes, 9 * shape), runtime.array(a.lanes, shape)
         self.growths = runtime.array(a.lanes, *((a.growths.shape[0], 2 * blocks) if features.growing else (1, 1)))
         self.sums = runtime.array(a.fp, features.sums().total, a.num_vertices)

@@ -18,24 +18,31 @@ from diffsim_ti.terms.term import Term
 
 
 class MultiPointConstraint(GivenOverTime, Term):
-    """Holds a linear relation between displacements u [m] of several vertices by a penalty,
+    """Holds a linear relation between displacements u [m] of several vertices,
 
-        g = sum_j c_j . u_j - value,    E = stiffness / 2 g^2,    f_j = -stiffness g c_j
+        g = sum_j c_j . u_j - value = 0,
 
-    such as equal motion of two places, the mean motion of a face, or a lever. In implicit and static solvers.
+    such as equal motion of two places, the mean motion of a face, or a lever, exactly by the forces f_j = p c_j: in implicit
+    steps and statics p is a Lagrange multiplier, in explicit ones it leads there in each substep (SHAKE) and velocities
+    follow value (RATTLE). With a stiffness implicit steps and statics have the penalty E = stiffness / 2 g^2 instead, for
+    vertices that are fixed too, and for `modes`, `load_path` and `accuracy`.
 
     vertices: a vertex set's name, several, indices or a mask; coefficients c_j [-]: shape (k, 3), in the order of the
         indices, of sets and masks in that of ascending indices.
     value [m], over time as the amount of `Pressure`; static load steps apply it in parts.
-    stiffness [N/m]: g is the force over it; a hundred to a million times E times the body's size costs little, for solvers
-        know the relation's matrix. `MultiPointConstraint.mean` makes the relation of a face's mean motion.
+    stiffness [N/m], or None: exactly. g is the force over it; a hundred to a million times E times the body's size costs
+        little, for solvers know the relation's matrix. Explicit steps do not read it.
+    `MultiPointConstraint.mean` makes the relation of a face's mean motion.
     Inputs with gradient: "constraint_value", "constraint_coefficients", "constraint_stiffness", or "<name>.value", ...
     Raises ValueError for other shapes, unknown sets, coefficients that are all zero, and stiffness not above zero.
-    Explicit solvers refuse it. Cook, Malkus, Plesha, Witt, Concepts and Applications of Finite Element Analysis, 2001, 13.3.
+    Relations that are held exactly must not follow from each other, nor name vertices along directions in which they are
+    fixed; explicit steps refuse reduced sets and ties beside them.
+    Cook, Malkus, Plesha, Witt, Concepts and Applications of Finite Element Analysis, 2001, 13.3; Leimkuhler, Reich,
+    Simulating Hamiltonian Dynamics, 2004, 7.2.
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_box((5, 3, 3), size=(0.4, 0.1, 0.1))
-    >>> lift = ds.MultiPointConstraint.mean(mesh, "xmax", (0, 1, 0), value=0.02, stiffness=1e8)
+    >>> lift = ds.MultiPointConstraint.mean(mesh, "xmax", (0, 1, 0), value=0.02)
     >>> scene = ds.Scene(mesh, ds.StableNeoHookean(E=1e5, nu=0.3), terms=[lift], fixed="xmin", precision="f64")
     >>> tip = ds.Rollout(ds.StaticSolver(scene), steps=1).forward().displacements[-1][mesh.vertex_sets["xmax"]]
     >>> print(f"{tip[:, 1].mean():.2f} m")
@@ -48,7 +55,7 @@ class MultiPointConstraint(GivenOverTime, Term):
         coefficients: ArrayLike,
         value: OverTime = 0.0,
         *,
-        stiffness: float,
+        stiffness: float | None = None,
         name: str | None = None,
     ):
         self.vertices, c = vertices, numbers("MultiPointConstraint: coefficients", coefficients)
@@ -56,9 +63,12 @@ class MultiPointConstraint(GivenOverTime, Term):
             raise ValueError(
                 f"MultiPointConstraint: coefficients must have shape (k, 3), not all zero, got shape {c.shape}"
             )
-        c = Input("coefficients", c, (c.shape,), "-", plain="constraint_coefficients", label="coefficients")
-        k = Input("stiffness", stiffness, ((),), "N/m", POSITIVE, plain="constraint_stiffness", label="stiffness")
-        super().__init__(amount("value", value, (), "m", "constraint_value"), c, k, name=name)
+        more = [Input("coefficients", c, (c.shape,), "-", plain="constraint_coefficients", label="coefficients")]
+        if stiffness is not None:
+            k = Input("stiffness", stiffness, ((),), "N/m", POSITIVE, plain="constraint_stiffness", label="stiffness")
+            more.append(k)
+        self.is_exact = stiffness is None
+        super().__init__(amount("value", value, (), "m", "constraint_value"), *more, name=name)
         self._give(value)
 
     @classmethod
@@ -69,13 +79,13 @@ class MultiPointConstraint(GivenOverTime, Term):
         direction: ArrayLike,
         value: OverTime = 0.0,
         *,
-        stiffness: float,
+        stiffness: float | None = None,
         turn: bool = False,
         name: str | None = None,
     ) -> "MultiPointConstraint":
         """The mean motion of a surface along a `direction`, by areas at rest; with turn=True its mean rotation [rad] about
-        that direction through its centre, for small rotations, with value [rad] and stiffness [N m]. The surface stays free
-        to deform."""
+        that direction through its centre, for small rotations, with value [rad] and stiffness [N m]. The surface stays
+        free to deform."""
         faces = mesh.faces_of(surface)
         vertices, n = np.unique(faces), numbers("MultiPointConstraint: direction", direction)
         if n.shape != (3,) or not n.any():
@@ -89,7 +99,7 @@ class MultiPointConstraint(GivenOverTime, Term):
     @property
     def num_numbers(self) -> int:
         """Coefficients and stiffness; the value over time lies in an array of its own."""
-        return self.described[1].value.size + 1
+        return sum(described.value.size for described in self.described[1:])
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Vertices in the order of the coefficients."""
@@ -103,7 +113,7 @@ class MultiPointConstraint(GivenOverTime, Term):
 
     def links(self, names: dict[str, str], own: str) -> Sequence[Link]:
         in_time = InTime(names[self.plain], f"{own} in time", 1, self.keyed)
-        return [in_time, Joined([names["constraint_coefficients"], names["constraint_stiffness"]], own)]
+        return [in_time, Joined([names[described.plain] for described in self.described[1:]], own)]
 
     def drawn(self, moment):
         return [Points(self.name or "constraint", moment.positions[self.indices(moment.mesh)])]

@@ -105,8 +105,10 @@ def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> lis
     return [ds.Muscle(fibre, stress, over_time(rng, steps, duration, how)(1.0), some)]
 
 
-def couplings(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list:
-    """Loads at remote points and, in implicit ones, relations, in a quarter of the structures behind those of golden.py."""
+def couplings(kind, seed: int, mesh, steps: int, duration: float, E: float, start, held) -> list:
+    """Loads at remote points and relations, in a quarter of the structures behind those of golden.py: in implicit ones half
+    of them with a stiffness; those that are held exactly of vertices that are free, in explicit steps from where they start.
+    """
     if kind.number < 60 or np.random.default_rng([44, kind.number]).random() > 0.25:
         return []
     rng = np.random.default_rng([45, seed])
@@ -121,12 +123,17 @@ def couplings(kind, seed: int, mesh, steps: int, duration: float, E: float) -> l
         load = np.multiply.outer(over, size)
     point = None if rng.random() < 0.5 else mesh.vertices[0] + CELL * rng.standard_normal(3)
     out = [ds.RemoteLoad(load, some_faces(rng, mesh), point)]
-    if not kind.explicit:
-        which = rng.permutation(mesh.num_vertices)[: rng.integers(1, 6)]
-        value = over_time(rng, steps, duration, how)(1e-3 * CELL)
-        c = rng.standard_normal((len(which), 3))
-        out.append(ds.MultiPointConstraint(which, c, value, stiffness=E * CELL * rng.uniform(0.1, 10)))
-    return out
+    which = rng.permutation(mesh.num_vertices)[: rng.integers(1, 6)]
+    value = over_time(rng, steps, duration, how)(1e-3 * CELL)
+    c, stiffness = rng.standard_normal((len(which), 3)), E * CELL * rng.uniform(0.1, 10)
+    exact = kind.explicit or np.random.default_rng([46, kind.number]).random() < 0.5
+    if exact and (kind.rollers or np.isin(which, held).all()):
+        return out
+    if exact:
+        c, which, stiffness = c[~np.isin(which, held)], which[~np.isin(which, held)], None
+    if kind.explicit:
+        value = float((c * (start - mesh.vertices)[which]).sum())
+    return [*out, ds.MultiPointConstraint(which, c, value, stiffness=stiffness)]
 
 
 def grown(kind, seed: int, law, mesh):
@@ -136,7 +143,8 @@ def grown(kind, seed: int, law, mesh):
     if not (elastic and chosen and kind.volume == "tetrahedra"):
         return law
     rng = np.random.default_rng([29, seed])
-    return ds.Grown(law, rng.uniform(-0.01, 0.02, () if rng.random() < 0.5 else mesh.num_tetrahedra))
+    shape = () if rng.random() < 0.5 else (mesh.num_tetrahedra, *(4,) * (mesh.order == 2 and kind.number >= 60))
+    return ds.Grown(law, rng.uniform(-0.01, 0.02, shape))
 
 
 def pose(kind, seed: int, number: int, path, x, duration: float, calm: float) -> dict:

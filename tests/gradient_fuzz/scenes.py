@@ -151,7 +151,7 @@ def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configu
         terms.append(tie(name, more, mesh, steps, duration, mass, beat))
 
     terms += newer.muscles(kind, seed, mesh, steps, duration, E)
-    terms += newer.couplings(kind, seed, mesh, steps, duration, E)
+    terms += newer.couplings(kind, seed, mesh, steps, duration, E, start, [] if fixed is None else fixed)
     if kind.chamber:
         own = chamber(kind.chamber, more, mesh, start, steps, duration, E)
         terms.insert(int(more.integers(0, len(terms) + 1)), own)
@@ -257,7 +257,11 @@ def _solver(kind, scene, dt, substeps):
         return ds.StaticSolver(scene, load_steps=substeps, tolerance=tolerance, parallel=kind.parallel)
     if kind.explicit:
         how = dict(contact=kind.contact, contact_damping=kind.contact_damping)
-        if kind.solver is ds.SemiImplicitSolver and scene.law.viscous and not (scene.holds_volumes or scene.reduced):
+        if (
+            kind.solver is ds.SemiImplicitSolver
+            and scene.law.viscous
+            and not (scene.holds_volumes or scene.reduced or scene.term(ds.MultiPointConstraint))
+        ):
             how["viscous_stages"] = 1 + kind.number % 4
         return kind.solver(scene, dt=dt, substeps=substeps, parallel=kind.parallel, **how)
     return kind.solver(scene, dt=dt, substeps=substeps, tolerance=tolerance, parallel=kind.parallel)

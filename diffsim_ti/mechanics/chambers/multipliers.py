@@ -18,18 +18,44 @@ from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
 class HeldPressure(ChamberPressure):
     """What chambers push with that hold their volume."""
 
+    def volumes_at(self, u: np.ndarray) -> np.ndarray:
+        """V of each [m^3]."""
+        return self.volumes(self.rest + u)
+
+    def gradients(self, u: np.ndarray) -> list[np.ndarray]:
+        """dV/du of each."""
+        return [enclosure.gradient(self.rest + u) for enclosure in self.enclosures]
+
+    def targets_jvp(self, u: np.ndarray, du: np.ndarray, moved) -> list:
+        """Change of targets for that of the numbers, less that of volumes by du and by the rest shape."""
+        instant, dx = self.instant, du + moved.rest
+        changes = instant.schedule.pressure(moved.follower, instant.j, instant.share)
+        of_targets = [law.target_by_numbers() @ changes[own] for law, own in zip(self.laws, self.rows)]
+        return [x - float((G * dx).sum()) for x, G in zip(of_targets, self.gradients(u))]
+
+    def add_targets(self, nu: np.ndarray, u: np.ndarray, adj) -> np.ndarray:
+        """Add to the adjoints of numbers and of the rest shape what comes by targets; returns that of u by volumes."""
+        for law, rows, own in zip(self.laws, self.rows, nu):
+            self.add_numbers(adj, rows, own * law.target_by_numbers())
+        by_u = -sum(own * G for own, G in zip(nu, self.gradients(u)))
+        adj.rest += by_u
+        return by_u
+
 
 class VolumeConstraints:
-    """Of the chambers of a HeldPressure.
+    """Of the chambers of a HeldPressure, and of relations between places that have no stiffness (constraints.py), whose g
+    and value are in the place of V and its target.
 
     free: what vertices may do, sets that do not deform all; eps: rounding of displacements.
     """
 
     share = 0.1  # measured: a hundredth loses thick spheres, all of it halves the steps
 
-    def __init__(self, follower: HeldPressure, free, rest: np.ndarray, tolerance: float, eps: float):
-        self.follower, self.free, self.rest, self.tolerance, self.eps = follower, free, rest, tolerance, eps
-        self.laws, self.places = follower.laws, follower.places
+    def __init__(self, forces: list, free, rest: np.ndarray, tolerance: float, eps: float):
+        self.forces, self.free, self.rest, self.tolerance, self.eps = forces, free, rest, tolerance, eps
+        self.laws = [law for force in forces for law in force.laws]
+        self.have_energy = any(force.has_energy for force in forces)
+        self.places = [k for force in forces if isinstance(force, HeldPressure) for k in force.places]
 
     def stiffen(self, stiffness: np.ndarray) -> None:
         """Set gamma so that gamma |g|^2 is a tenth of the stiffness of a vertex [N/m], shape (num_vertices, 1)."""
@@ -47,11 +73,11 @@ class VolumeConstraints:
 
     def gradients(self, u: np.ndarray) -> list[np.ndarray]:
         """dV/du of each."""
-        return [enclosure.gradient(self.rest + u) for enclosure in self.follower.enclosures]
+        return [g for force in self.forces for g in force.gradients(u)]
 
     def place(self, u: np.ndarray, multipliers: np.ndarray | None = None) -> None:
         """Count from the volumes at u, at the pressures there or at `multipliers`."""
-        V = self.follower.volumes(self.rest + u)
+        V = [x for force in self.forces for x in force.volumes_at(u)]
         for k, (law, now) in enumerate(zip(self.laws, V)):
             law.multiplier = law.pressure(now) if multipliers is None else float(multipliers[k])
             law.volume = float(now)
@@ -119,21 +145,16 @@ class VolumeConstraints:
 
     def targets_jvp(self, u: np.ndarray, du: np.ndarray, moved) -> np.ndarray:
         """Change of targets for that of the numbers, less that of volumes by du and by the rest shape."""
-        instant, dx = self.follower.instant, du + moved.rest
-        changes = instant.schedule.pressure(moved.follower, instant.j, instant.share)
-        of_targets = [law.target_by_numbers() @ changes[own] for law, own in zip(self.laws, self.follower.rows)]
-        return np.array(of_targets) - [float((G * dx).sum()) for G in self.gradients(u)]
+        return np.array([x for force in self.forces for x in force.targets_jvp(u, du, moved)])
 
     def add_targets(self, nu: np.ndarray, u: np.ndarray, adj) -> np.ndarray:
         """Add to the adjoints of numbers and of the rest shape what comes by targets; returns that of u by volumes."""
-        for law, rows, own in zip(self.laws, self.follower.rows, nu):
-            self.follower.add_numbers(adj, rows, own * law.target_by_numbers())
-        by_u = -sum(own * G for own, G in zip(nu, self.gradients(u)))
-        adj.rest += by_u
-        return by_u
+        ends = np.cumsum([0, *(len(force.laws) for force in self.forces)])
+        return sum(force.add_targets(nu[a:b], u, adj) for force, a, b in zip(self.forces, ends, ends[1:]))
 
     def adjoint(self, u: np.ndarray, y: np.ndarray, by_pressure: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
         """(w, nu) from y = K'^-T p: the adjoint of R, and what comes to that of targets, and less to that of volumes."""
         G, Z, S = self._border(u, solve)
+        by_pressure = np.pad(by_pressure, (0, len(G) - len(by_pressure)))  # relations show none
         nu = np.linalg.solve(S, by_pressure + np.array([float((g * y).sum()) for g in G]))
         return y - sum(m * z for m, z in zip(nu, Z)), nu

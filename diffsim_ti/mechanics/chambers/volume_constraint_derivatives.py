@@ -84,9 +84,17 @@ def recorded(held: VolumeConstraints, at: Passes, shows: bool = False) -> Volume
         a, gravity = ws.arrays.values, ws.arrays.features().gravity
         weight = a.parameters[gravity:][:3] if gravity >= 0 else np.zeros(3)
         v = v + now.pre * walls.freed(walls.inverse * held.rows(history.f, slot) + weight)
-        change, one.q = held.tangent_part(walls, v, held.rates(ws.arrays.rows["follower"], j))
+        change, one.q = held.tangent_part(walls, v, held.rates(ws.arrays.rows[held.numbers], j))
         one.shown = v + change
     return one
+
+
+def _record_of(held: VolumeConstraints, run) -> ChamberRecord:
+    """What a run knows of the frames' pressures, where these are shown."""
+    record = ChamberRecord(held.ws.solver, held.places)
+    if held.is_shown:
+        run.chamber_record = record
+    return record
 
 
 class VolumeConstraintTangent(Stage):
@@ -94,8 +102,9 @@ class VolumeConstraintTangent(Stage):
 
     def __init__(self, held: VolumeConstraints, run):
         self.held, self.change = held, run.tangent
-        run.chamber_record = self.chambers = ChamberRecord(held.ws.solver, held.places)
-        self.rest, mass = self.change.rest[held.nodes], held.ws.arrays.values.mass[held.nodes, None]
+        self.chambers = _record_of(held, run)
+        held.take_change(self.change)
+        self.rest, mass = held.of_rest(self.change.rest), held.ws.arrays.values.mass[held.nodes, None]
         self.inverse = -self.change.mass[held.nodes, None] / mass**2
 
     @contextmanager
@@ -108,11 +117,12 @@ class VolumeConstraintTangent(Stage):
     def _after(self, at: Passes, dx: np.ndarray) -> None:
         """The rest of a pass is done, whose beginning changed by dx."""
         held, run, j, one = self.held, at.run, at.j, recorded(self.held, at)
-        walls, rows = one.walls, self.change.follower
+        walls, rows = one.walls, getattr(self.change, held.numbers)
         if one.s is not None:
             du, dv = held.rows(run.u, 0), held.rows(run.v, 0)
             G, pushed = walls.gradients(one.ends), walls.pushed_jvp(one.s, dx, self.inverse)
-            ds = np.linalg.solve(slopes(G, walls.d), held.targets(rows, j) - along(G, self.rest + du + pushed))
+            left = held.targets(rows, j) - along(G, self.rest + du + pushed) - walls.moved(one.ends)
+            ds = np.linalg.solve(slopes(G, walls.d), left)
             way = np.tensordot(ds, walls.d, 1) + pushed
             held.put(run.u, 0, du + way)
             by_ratio = run.rate_dot * one.ratio_by_rate * np.tensordot(one.s, walls.d, 1)
@@ -133,12 +143,13 @@ class VolumeConstraintAdjoint(Stage):
 
     def __init__(self, held: VolumeConstraints, run):
         self.held, self.drag = held, run.features.drag
-        run.chamber_record = self.chambers = ChamberRecord(held.ws.solver, held.places)
+        self.chambers = _record_of(held, run)
 
     def clear(self) -> None:
         n, values = len(self.held.nodes), self.held.ws.arrays.values
         self.rest, self.inverse, self.by_rate = np.zeros((n, 3)), np.zeros((n, 1)), 0.0
-        self.follower, self.halted = np.zeros_like(values.follower), None
+        self.follower, self.halted = np.zeros_like(getattr(values, self.held.numbers)), None
+        self.held.clear_adjoint()
 
     @contextmanager
     def adjoint(self, at: Passes):
@@ -167,6 +178,7 @@ class VolumeConstraintAdjoint(Stage):
             G, displacement_adj = walls.gradients(one.ends), u_adj + one.ratio * v_adj
             mu = np.linalg.solve(slopes(G, walls.d).T, along(walls.d, displacement_adj) + by_pressure)
             z = -np.tensordot(mu, G, 1)
+            walls.moved_vjp(-mu, one.ends)
             self._push(walls, one.s, displacement_adj + z)
             self.rest += z
             held.put(run.u, 0, u_adj + z)
@@ -200,7 +212,7 @@ class VolumeConstraintAdjoint(Stage):
         mu = np.linalg.solve(slopes(walls.g, walls.d).T, along(walls.d, frame_adj))
         z = -np.tensordot(mu, walls.g, 1)
         self._push(walls, one.q, frame_adj + z)
-        self.by_x -= sum(m * e.gradient_jvp(walls.x, one.shown) for m, e in zip(mu, walls.enclosures))
+        self.by_x = self.by_x + walls.turned_vjp(-mu, one.shown)
         rate = self._of_all(mu) / schedule.step_length(one.j - 1)
         row = rows[schedule.load_row(rows, one.j - 1)]
         row[:, 0] -= rate
@@ -224,12 +236,11 @@ class VolumeConstraintAdjoint(Stage):
 
     def collect(self, out: Derived) -> None:
         nodes = self.held.nodes
-        out.follower += self.follower
+        targets = getattr(out, self.held.numbers)
+        targets += self.follower
         by_mass = np.zeros(len(out.displacement))
         by_mass[nodes] = -self.inverse[:, 0] / self.held.ws.arrays.values.mass[nodes] ** 2
         out.mass = out.mass + by_mass
-        rest = np.zeros_like(out.displacement)
-        rest[nodes] = self.rest
-        out.rest = out.rest + rest
+        self.held.collect(out, self.rest)
         if self.drag >= 0:
             out.parameters[self.drag] += self.by_rate

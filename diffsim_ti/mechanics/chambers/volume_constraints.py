@@ -17,6 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
+from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.pressures import rows_of
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mesh.enclosure import Enclosure
@@ -81,11 +82,20 @@ class ChamberWalls:
 
     def pushed_vjp(self, s: np.ndarray, adjoint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Its adjoint: of x and of 1 / m, shape (n, 1)."""
-        by_x, by_inverse, w = np.zeros_like(self.x), np.zeros_like(self.inverse), self.freed(adjoint)
-        for s_k, g, enclosure in zip(s, self.g, self.enclosures):
-            by_inverse += s_k * (g * w).sum(1, keepdims=True)
-            by_x += s_k * enclosure.gradient_jvp(self.x, self.inverse * w)
-        return by_x, by_inverse
+        w = self.freed(adjoint)
+        by_inverse = sum(s_k * (g * w).sum(1, keepdims=True) for s_k, g in zip(s, self.g))
+        return self.turned_vjp(s, self.inverse * w), by_inverse
+
+    def turned_vjp(self, weights: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Adjoint of x, for the weighted sum of dV/dx . w."""
+        return sum(by * enclosure.gradient_jvp(self.x, w) for by, enclosure in zip(weights, self.enclosures))
+
+    def moved(self, y: np.ndarray) -> np.ndarray | float:
+        """Changes of V at y for those of numbers of its own."""
+        return 0.0
+
+    def moved_vjp(self, weights: np.ndarray, y: np.ndarray) -> None:
+        """Add the adjoints of these numbers for the weighted sum of V."""
 
 
 def slopes(G: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -107,8 +117,14 @@ class VolumeConstraints(Stage):
         self.places, self.num_chambers = [chambers.index(chamber) for chamber in filled], len(chambers)
         self.columns = [rows.start for rows in rows_of(scene, filled)]  # of their targets among the numbers of loads
         closed = [chamber.enclosure for chamber in filled]
-        self.nodes = np.unique(np.concatenate([enclosure.triangles.ravel() for enclosure in closed]))
+        self._hold(workspace, np.unique(np.concatenate([enclosure.triangles.ravel() for enclosure in closed])))
         self.enclosures = [enclosure.of_nodes(self.nodes) for enclosure in closed]
+
+    numbers = "follower"  # rows of `Derived` in which targets are
+    is_shown = True  # whether frames say what holds
+
+    def _hold(self, workspace, nodes: np.ndarray) -> None:
+        scene, self.nodes = workspace.scene, nodes
         self.free = scene.supports.freedom(scene.mesh.num_vertices)[self.nodes]
         self._own = VertexRows(workspace.arrays, self.nodes)
         self.rows, self.put = self._own.get, self._own.put
@@ -128,7 +144,23 @@ class VolumeConstraints(Stage):
 
     @property
     def rest(self) -> np.ndarray:
-        return self.ws.arrays.values.rest[self.nodes]
+        return self.of_rest(self.ws.arrays.values.rest)
+
+    def of_rest(self, x: np.ndarray) -> np.ndarray:
+        """What V counts of rest positions of all vertices, or of their change."""
+        return x[self.nodes]
+
+    def take_change(self, change: Derived) -> None:
+        """A tangent begins, of these changes of numbers."""
+
+    def clear_adjoint(self) -> None:
+        """A reverse sweep begins."""
+
+    def collect(self, out: Derived, by_rest: np.ndarray) -> None:
+        """Add the adjoints of numbers of its own, and that of what is counted of the rest shape."""
+        rest = np.zeros_like(out.displacement)
+        rest[self.nodes] = by_rest
+        out.rest = out.rest + rest
 
     def walls(self, u: np.ndarray) -> ChamberWalls:
         """At displacements of theirs."""
@@ -161,7 +193,7 @@ class VolumeConstraints(Stage):
 
     def _after(self, at: Passes, u: np.ndarray, before: np.ndarray) -> None:
         """The rest of a pass, which began with displacements u and velocities `before`, is done."""
-        history, slot, j, now, given = at.history, at.end, at.j, at.now, self.ws.arrays.rows["follower"]
+        history, slot, j, now, given = at.history, at.end, at.j, at.now, self.ws.arrays.rows[self.numbers]
         walls, self.kept[slot] = self.walls(u), None
         u_next, v_next = self.rows(history.u, slot), self.rows(history.v, slot)
         if not np.all(np.isfinite(u_next)):  # the guard of the run will say so

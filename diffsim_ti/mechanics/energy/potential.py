@@ -76,9 +76,11 @@ class Potential:
         sizes = dict(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices)
         return sizes | dict(per_gamma=self.per_gamma)
 
-    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, poses: np.ndarray, ahead=None) -> None:
+    def begin(
+        self, u: np.ndarray, x: np.ndarray, per_gamma: float, poses: np.ndarray, ahead=None, presses=True
+    ) -> None:
         """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (obstacles.py); ahead: the
-        step [m] that it is expected to make."""
+        step [m] that it is expected to make; presses: whether surfaces press on each other there, for friction."""
         self.per_gamma = per_gamma
         if self.has_friction:
             runtime.fill(self.lag, np.stack([u, x]))
@@ -90,7 +92,7 @@ class Potential:
             self.pairs.follow(poses, AT_BEGIN)
             self.pairs.begin(u, np.zeros_like(u) if ahead is None else ahead)
         if self.surface_friction:
-            self.surface_friction.begin(u, x, per_gamma)
+            self.surface_friction.begin(u, x, per_gamma, presses)
         if self.pairs:
             self.pairs.follow(poses, AT_STAGE)
 

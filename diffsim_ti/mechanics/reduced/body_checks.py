@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from diffsim_ti.terms import SelfContact
+from diffsim_ti.terms import FilledChamber, MultiPointConstraint, SelfContact
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -16,8 +16,11 @@ def check_bodies(scene: "Scene", contact: str) -> None:
             f"{said} take obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
             'contact="force"'
         )
-    if scene.holds_volumes:
-        raise ValueError(f"{said} and FilledChamber do not go together in explicit steps: take an implicit solver")
+    for kind in (FilledChamber, MultiPointConstraint):
+        if scene.term(kind):
+            raise ValueError(
+                f"{said} and {kind.__name__} do not go together in explicit steps: take an implicit solver"
+            )
     rough = [term for term in scene.terms if term.acts_on_surface and term.has_friction]
     if rough and scene.reduced.by_basis:
         raise ValueError(

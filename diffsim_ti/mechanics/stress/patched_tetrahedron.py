@@ -28,7 +28,7 @@ def functions_of(law, features, lanes: bool) -> Tetrahedron:
     """The element of a law and a scene's features; patches for a PatchLaw."""
     kind = PatchedTetrahedron if isinstance(law, PatchLaw) else Tetrahedron
     growth = (features.growth_per_step, features.growth_uniform) if features.growing else None
-    return kind(law, features.uniform, lanes, features.order, growth)
+    return kind(law, features.uniform, lanes, features.order, growth, features.by_points)
 
 
 @dataclass(frozen=True)

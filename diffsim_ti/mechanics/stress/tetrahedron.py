@@ -77,6 +77,7 @@ class Tetrahedron(Growing):
     lanes: bool
     order: int = 1
     growth: tuple | None = None  # (whether each step, whether all tetrahedra alike) where they grow over time
+    by_points: bool = False  # whether each point has coefficients of its own
 
     @property
     def fp(self):
@@ -147,10 +148,21 @@ class Tetrahedron(Growing):
         return Tensor(self.items.numbers(array, 9 * q, 9, 9 * self.nodes.points, item))
 
     @traced
-    def coefficients_of(self, item, array) -> list:
-        """The law's coefficients (the first block holds them for all if they are uniform)."""
+    def coefficients_of(self, item, array, q: int = 0) -> list:
+        """The law's coefficients at point q (the first block holds them for all if they are uniform)."""
         K = len(self.law.coefficient_names)
+        if self.by_points:
+            return self.items.numbers(array, K * q, K, K * self.nodes.points, item)
         return self.items.numbers(array, 0, K, K, 0 if self.uniform else item)
+
+    @traced
+    def add_coefficients(self, item, adjoint, q, by_p: list) -> None:
+        """Add the adjoint of those at point q."""
+        K, points = len(by_p), self.nodes.points
+        if self.by_points:
+            self.items.add(adjoint.coefficients, K * points, item, by_p, K * q)
+        else:
+            self.items.add(adjoint.coefficients, K, item, by_p)
 
     @traced
     def state_of(self, item, z, s, q: int = 0) -> list:
@@ -166,7 +178,7 @@ class Tetrahedron(Growing):
     def numbers_at(self, item, scene, at, s, q: int = 0) -> list:
         """What the law takes besides tensors at point q and slot s: its coefficients, its state, and what is held in an
         implicit pass."""
-        p = self.grown(item, self.coefficients_of(item, scene.coefficients), scene)
+        p = self.grown(item, self.coefficients_of(item, scene.coefficients, q), scene)
         p = [*p, *self.state_of(item, at.z, s, q)] if self.has_state else p
         return [*p, *self.frozen_of(item, at.held, q), self.rate_of(at)] if self.holds(at) else p
 
@@ -266,7 +278,7 @@ class Tetrahedron(Growing):
 
     @traced
     def _numbers_jvp(self, item, change, dots, q) -> list:
-        dp = self.grown(item, self.coefficients_of(item, dots.coefficients), dots)
+        dp = self.grown(item, self.coefficients_of(item, dots.coefficients, q), dots)
         dp = [*dp, *self.state_of(item, change.z, 0, q)] if self.has_state else dp
         return [*dp, *self.frozen_of(item, change.held, q), let(0 * dp[0])] if self.holds(change) else dp
 
@@ -298,6 +310,8 @@ class Tetrahedron(Growing):
                 (P,) = P
                 by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
                 self.add_shape(item, adjoint, q, by_B * minus, ti.cast(-1, self.fp) * inner(P, dH))
+            if self.by_points:
+                self.add_coefficients(item, adjoint, q, own)
             return pushes, own
 
         edges = [*self._edges_read(item, scene, at, s), self.edges(item, scene, w, 0)]
@@ -306,7 +320,8 @@ class Tetrahedron(Growing):
         self.store(item, corner, pushes, add)
         for rate in rates:
             self.store(item, adjoint.rate_corner, rate)
-        self.items.add(adjoint.coefficients, count, item, by_p)
+        if not self.by_points:
+            self.add_coefficients(item, adjoint, 0, by_p)
         self.add_growth(item, adjoint, by_p, scene)
 
     @traced
@@ -372,7 +387,7 @@ class Tetrahedron(Growing):
             by_p, by_z = self._parted(by_q)
             held = [onwards.pick(o, x) for x, o in zip(later, zero)]
             self.put_state(item, adjoint.z, 0, [a + b for a, b in zip(by_z, held)], q)
-            self.items.add(adjoint.coefficients, len(by_p), item, by_p)
+            self.add_coefficients(item, adjoint, q, by_p)
             self.add_growth(item, adjoint, by_p, scene)
             if shape:
                 self.add_shape(item, adjoint, q, D.transpose() @ by_H)

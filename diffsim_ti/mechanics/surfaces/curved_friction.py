@@ -12,7 +12,7 @@ class CurvedLaggedFriction:
     def __init__(self, pairs):
         self.pairs, self.inner, self.C = pairs, pairs.inner.friction, pairs.matrix
 
-    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, presses: bool) -> None:
         """With obstacles where the pass begins; their corners have x = g - v / per_gamma, g where forces are taken."""
         self.given, there = 0.0, self.C @ x
         if self.pairs.obstacles:
@@ -20,7 +20,7 @@ class CurvedLaggedFriction:
             self.given = np.zeros_like(there)
             self.given[first:] = obstacles.displacements_at(obstacles.rows)
             there[first:] = self.given[first:] - obstacles.velocities() / per_gamma
-        self.inner.begin(self.pairs.spread(u), there, per_gamma)
+        self.inner.begin(self.pairs.spread(u), there, per_gamma, presses)
 
     def without(self):
         return self.inner.without()

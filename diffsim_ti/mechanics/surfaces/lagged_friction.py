@@ -54,12 +54,12 @@ class LaggedFriction:
             dtype = self.a.fp if scalar else self.pairs.kernels.vec4
             setattr(self.own, name, self.pairs.list.buffers.take(f"{name} of friction", dtype, self.pairs.list.count))
 
-    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
-        """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above."""
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, presses: bool) -> None:
+        """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above; presses: whether anything does there."""
         self.u_begin, self.x, self.per_gamma = u, x, per_gamma
         self._measure_here()
         pressing, count = whole(self.own.pressing), self.pairs.list.count
-        self.felt = felt = np.flatnonzero(pressing[:count, 3] > 0)
+        self.felt = felt = np.flatnonzero(presses & (pressing[:count, 3] > 0))
         self.corners = runtime.fetch(self.pairs.list.pairs)[: 4 * count].reshape(-1, 4)[felt]
         self.w, pressing = whole(self.own.weights)[felt].astype(np.float64), pressing[felt].astype(np.float64)
         self.n, self.L = pressing[:, :3], pressing[:, 3]

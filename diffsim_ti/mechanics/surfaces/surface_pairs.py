@@ -103,7 +103,7 @@ class SurfacePairs:
         return float(self.contacts.widths[0 if self.term else 1 :].min())
 
     def load(self, u) -> None:
-        """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""
+        """New values, the start at u: raise ValueError if the width is too large."""
         self.fresh = False
         if self.kinematic:
             self.contacts.load(self.a.values.parameters)
@@ -114,7 +114,6 @@ class SurfacePairs:
             self._check_rest(rest_state)
             self._checked_rest = checked
         self.build(u, 0)
-        self.check_apart(u)
 
     def _check_rest(self, u) -> None:
         if not self.term:
@@ -153,7 +152,6 @@ class SurfacePairs:
         """The state was set from outside."""
         self.age = 0
         self.build(u, 0)
-        self.check_apart(u)
 
     obstacles = None  # whose corners are vertices of the surface: of pairs with vertices that no node gives
 

@@ -13,6 +13,7 @@ from diffsim_ti.common.checked import between
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.gases import Chambers
 from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
+from diffsim_ti.mechanics.constraints import Constraints, HeldRelations
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
@@ -166,6 +167,7 @@ class ExplicitWorkspace(Workspace):
         features, a = self.arrays.features(), self.arrays
         self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
         self.volumes = VolumeConstraints(self) if self.scene.holds_volumes else None
+        self.relations = HeldRelations(self) if self.scene.interaction(Constraints) else None
         self.projected = ProjectedSets(self) if self.scene.reduced.by_basis else None
         self.stages = stages_of(self)
         noted = ROWS * len(a.obstacles), a.num_vertices

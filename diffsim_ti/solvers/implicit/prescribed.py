@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, VolumeConstraints
+from diffsim_ti.mechanics.constraints import ConstraintForce
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.workspace import Workspace
@@ -89,9 +90,10 @@ class PrescribedInPasses(Workspace):
         return self.volumes.places if self.volumes else []
 
     def volume_constraints(self, eps: float) -> VolumeConstraints | None:
-        """The scene's chambers that hold a volume."""
-        force = self.hosts.only(HeldPressure)
-        return force and VolumeConstraints(force, self.linear, self.arrays.values.rest, self.solver.tolerance, eps)
+        """The scene's chambers that hold a volume, and relations without a stiffness."""
+        forces = [force for force in self.hosts if isinstance(force, HeldPressure | ConstraintForce) and force.laws]
+        given = self.linear, self.arrays.values.rest, self.solver.tolerance, eps
+        return VolumeConstraints(forces, *given) if forces else None
 
     def start_multipliers(self, j: int, u: np.ndarray) -> None:
         """Begin pass j with the pressures of constrained volumes that the pass before it ended with."""
@@ -116,17 +118,19 @@ class PrescribedInPasses(Workspace):
         out = np.zeros((num_frames, len(self.scene.terms_of(Chamber))))
         for frame in range(1, num_frames):
             last = self.solver.num_passes(frame * save_every) - 1
-            out[frame, self.constrained_chambers] = self.multipliers.get(
-                self.pass_of_all(last), 0.0
-            )  # of none that it came to
+            reached = self.multipliers.get(self.pass_of_all(last))  # None where it did not come to it
+            out[frame, self.constrained_chambers] = self._of_chambers(reached)
         return out
 
     def last_chamber_pressures(self) -> np.ndarray:
         """Those of chambers whose volume is constrained after the last pass, shape (chambers,); zero before the first."""
         out = np.zeros(len(self.scene.terms_of(Chamber)))
         if self.multipliers:
-            out[self.constrained_chambers] = self.multipliers[max(self.multipliers)]
+            out[self.constrained_chambers] = self._of_chambers(self.multipliers[max(self.multipliers)])
         return out
+
+    def _of_chambers(self, multipliers: np.ndarray | None) -> np.ndarray | float:
+        return 0.0 if multipliers is None else multipliers[: len(self.constrained_chambers)]
 
     @property
     def last_multipliers(self) -> np.ndarray | None:

@@ -387,10 +387,14 @@ class Rounds:
         potential, newton, u = self.potential, self.newton, self.potential.held_at
         potential.only(self.state[:, nk.PHASE] == nk.JUDGE)
         if newton.volumes and not self.state[0, nk.DOUBTED]:
+            shift = 0.0  # of the energy, where it counts from what is held at u
             if self._direction is not None:
+                counts = newton.volumes.have_energy
+                before = potential.energies_beside().sum() if counts else 0.0
                 newton.recount(self._base, u - self._base, self._direction)
+                shift = potential.energies_beside().sum() - before if counts else 0.0
                 self._direction = None
-            self._set({nk.UNMET: not newton.volumes.met(u)})
+            self._set({nk.UNMET: not newton.volumes.met(u), nk.E_TRIED: self.state[0, nk.E_TRIED] + shift})
         if self.beside:
             runtime.fill(self.R, np.column_stack(newton.residual(u)))
         else:

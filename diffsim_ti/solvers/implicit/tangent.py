@@ -107,7 +107,7 @@ class ImplicitTangent(RecordedPasses):
         if ws.volumes:
             targets = ws.volumes.targets_jvp(ws.potential.held_at, held, tangent)
             d_star, change = ws.volumes.tangent(ws.potential.held_at, d_star, targets, self.solve)
-            self.chamber_record.note(j, save_every, change)
+            self.chamber_record.note(j, save_every, change[: len(ws.constrained_chambers)])
         dq = ws.joints.follow(push - ws.joints.of_body(d_star)) if self.joints else None
         d_star = held + d_star
         if self.joints:

@@ -21,6 +21,7 @@ from diffsim_ti.mechanics.stress.law_state import LawStateKernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
 from diffsim_ti.mechanics.surfaces.pair_shares import PairShares
+from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.monitor.energy_balance import EnergyWatch
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.runtime.slots import copy_slot
@@ -29,6 +30,7 @@ from diffsim_ti.solvers.implicit.load_stepping import LoadStepping
 from diffsim_ti.solvers.implicit.multigrid import Following
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
+from diffsim_ti.solvers.implicit.overlap import pressed_apart
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.solvers.implicit.prescribed import PrescribedInPasses
 from diffsim_ti.state.history import History
@@ -65,6 +67,7 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     def load(self, derived) -> None:
         self._launches.clear()
+        self.overlaps = {}  # where equilibria are looked for from, as bytes: what was found there
         super().load(derived)
         if not self._launches.get("potential"):
             self.potential = self.potential_kind(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
@@ -263,10 +266,14 @@ class ImplicitWorkspace(PrescribedInPasses):
         if self.strains:
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
-        if stage.static and (held != u).any():
+        start = u
+        if overlap := self.overlaps and self.overlaps.get(u.tobytes()):
+            start = pressed_apart(self, u, overlap)
+            held = held + (start - u)
+        elif stage.static and (held != u).any():
             starts = self._led(u, held, problem)
         try:
-            u_star = self.solve_pass(j, u, held, starts, problem, stage)
+            u_star = self.solve_pass(j, start, held, starts, problem, stage)
         except NotConverged as error:
             raise self.collisions.explained(error, u) from None
         self.u_star = u_star
@@ -366,6 +373,15 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     # ---- what obstacles do -------------------------------------------------------------------------------------------
 
+    def check_surfaces(self) -> None:
+        """As of all solvers; equilibria are looked for where surfaces have been pressed apart."""
+        try:
+            super().check_surfaces()
+        except Overlap as error:
+            if not self.is_static or self.scene.reduced or self.scene.interaction(Robots):
+                raise
+            self.overlaps[runtime.fetch_row(self.state.u, 0).tobytes()] = error
+
     def check_apart(self) -> None:
         """Raise Overlap if a vertex is in an obstacle."""
         self.collisions.check_apart()
@@ -408,7 +424,8 @@ class ImplicitWorkspace(PrescribedInPasses):
     def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray, ahead: np.ndarray | None = None) -> None:
         """Tell the potential where obstacles are in pass j, where friction is measured from, which step is expected."""
         self.collisions.begin(j, stage)
-        self.potential.begin(u, x, 1 / stage.gamma, self.collisions.rows, ahead)
+        presses = not self.overlaps or u.tobytes() not in self.overlaps
+        self.potential.begin(u, x, 1 / stage.gamma, self.collisions.rows, ahead, presses)
         self.origin = x
         self.apply_loads(j, stage)
         if self.volumes:  # after all that the stiffness at rest is made of
