@@ -209,8 +209,8 @@ class Newton:
 
     def system(self) -> tuple | None:
         """(diagonal mass, SciPy matrix of blocks or None) that join the potential's Hessian; None where a product needs the
-        host."""
-        found = self.operator().on_device()
+        host, or more than Newton's direction is looked for."""
+        found = None if self.volumes else self.operator().on_device()
         return found and found[:2]
 
     def residual(self, u) -> tuple[np.ndarray, np.ndarray]:
