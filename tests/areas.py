@@ -46,6 +46,25 @@ LONGEST = (
 # files that start Taichi anew, the longest first: whatever comes after them compiles again what others have compiled
 LAST = "identify_experiments cli study_stability hard_use strength sweep exchange types marks identify".split()
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
+# files whose scenes are the same, so that one process compiles their kernels once
+TOGETHER = [
+    names.split()
+    for names in (
+        "term_order every_adjoint",
+        "gradients outputs unequal_steps gradient_faults checkpoints tape",
+        "muscles growth_over_time rotating_frame surface_drag",
+        "quadratic quadratic_solvers",
+        "quadratic_outputs tensor_outputs",
+        "reduced_explicit reduced reduced_rigid",
+        "contact_stage contact_gradients contact contact_crossing contact_friction",
+        "implicit solve_report",
+        "swept contact_area",
+        "self_contact_implicit self_contact",
+        "chambers held_volumes",
+        "loads supports",
+        "viscosity viscous_stages",
+    )
+]
 
 
 def place(stem: str) -> int:
@@ -54,6 +73,12 @@ def place(stem: str) -> int:
     if name in LAST:
         return len(LONGEST) + 1 + LAST.index(name)
     return LONGEST.index(name) if name in LONGEST else len(LONGEST)
+
+
+def together(path: str) -> str:
+    """What stands for a file when processes share the suite: the first of those that go to one process with it."""
+    name = Path(path).stem.removeprefix("test_")
+    return next((names[0] for names in TOGETHER if name in names), path)
 
 
 def minutes_of(reports) -> dict[str, float]:
