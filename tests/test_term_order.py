@@ -21,7 +21,7 @@ from diffsim_ti.terms import Obstacle, Term
 EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
 IMPLICIT = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 SOLVERS = (*EXPLICIT, *IMPLICIT, ds.StaticSolver)
-ORDERS = 12
+ORDERS = 6
 ROUGH = dict(friction=0.3, friction_speed=20.0)  # so that it sticks, and friction_speed is felt
 MESH = ds.TetrahedralMesh.joined([tetrahedron(0.15), tetrahedron(0.7)])  # an apex 5 cm below a face
 
