@@ -78,7 +78,7 @@ def test_every_number(kind, order):
 NAMES = ["rotor.angular_velocity", "rotor.center", "density", "rest_positions", "initial_positions"]
 
 
-@pytest.mark.parametrize("kind, order", [(ds.VelocityVerletSolver, 1), (ds.BDF2Solver, 2), (ds.StaticSolver, 1)])
+@pytest.mark.parametrize("kind, order", [(ds.VelocityVerletSolver, 1), (ds.BDF2Solver, 1), (ds.StaticSolver, 2)])
 def test_gradients_against_differences(kind, order):
     rollout = rollout_of(kind, order, outputs=ds.Reaction("xmin"))
     table = ds.check_gradients(rollout, inputs=NAMES)
