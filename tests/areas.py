@@ -34,14 +34,13 @@ AREAS = {
     "command line, resources, backends": "cli manners calls advice hard_use strength layout resources devices launch "
     "executed_ptx single_precision fewer_variables kernel_sizes tracer",
 }
-# files of a minute or so, the longest first: in several processes they come before all others
+# files of a minute or so, or that go together, the longest first: in several processes they come before all others
 LONGEST = (
-    "curved_contact gradient_fuzz readme contact_force far_from_origin optimization torch_examples quadratic_outputs "
-    "term_order every_adjoint "
-    "loads_together static_examples contact_examples examples implicit_contact swept hertz implicit "
-    "contact_gradients contact_stage outputs locking chambers springs quadratic_solvers torch_physics "
-    "quadratic_loads self_contact_implicit contact_rollers unequal_steps open_laws laws_with_state quadratic "
-    "contact_area seed_snippets quadratic_answers"
+    "examples contact_stage term_order gradients reduced_explicit readme curved_contact muscles contact_examples swept "
+    "contact_force quadratic gradient_fuzz implicit_cycle chambers batch mesh_obstacle laws_with_state "
+    "self_contact_friction open_laws contact_corpus torch_examples plasticity implicit springs quadratic_answers "
+    "resources torch energy_watch obstacle_pairs poses implicit_gradients static_examples loads locking implicit_contact "
+    "viscosity self_contact_implicit optimization"
 ).split()
 # files that start Taichi anew, the longest first: whatever comes after them compiles again what others have compiled
 LAST = "identify_experiments cli study_stability hard_use strength sweep exchange types marks identify".split()
