@@ -34,18 +34,36 @@ AREAS = {
     "command line, resources, backends": "cli manners calls advice hard_use strength layout resources devices launch "
     "executed_ptx single_precision fewer_variables kernel_sizes tracer",
 }
-# files of a minute or so, the longest first: in several processes they come before all others
+# files of a minute or so, or that go together, the longest first: in several processes they come before all others
 LONGEST = (
-    "curved_contact gradient_fuzz readme contact_force far_from_origin optimization torch_examples quadratic_outputs "
-    "term_order every_adjoint "
-    "loads_together static_examples contact_examples examples implicit_contact swept hertz implicit "
-    "contact_gradients contact_stage outputs locking chambers springs quadratic_solvers torch_physics "
-    "quadratic_loads self_contact_implicit contact_rollers unequal_steps open_laws laws_with_state quadratic "
-    "contact_area seed_snippets quadratic_answers"
+    "examples contact_stage term_order gradients reduced_explicit readme curved_contact muscles contact_examples swept "
+    "contact_force quadratic gradient_fuzz implicit_cycle chambers batch mesh_obstacle laws_with_state "
+    "self_contact_friction open_laws contact_corpus torch_examples plasticity implicit springs quadratic_answers "
+    "resources torch energy_watch obstacle_pairs poses implicit_gradients static_examples loads locking implicit_contact "
+    "viscosity self_contact_implicit optimization"
 ).split()
 # files that start Taichi anew, the longest first: whatever comes after them compiles again what others have compiled
 LAST = "identify_experiments cli study_stability hard_use strength sweep exchange types marks identify".split()
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
+# files whose scenes are the same, so that one process compiles their kernels once
+TOGETHER = [
+    names.split()
+    for names in (
+        "term_order every_adjoint",
+        "gradients outputs unequal_steps gradient_faults checkpoints tape",
+        "muscles growth_over_time rotating_frame surface_drag",
+        "quadratic quadratic_solvers",
+        "quadratic_outputs tensor_outputs",
+        "reduced_explicit reduced reduced_rigid",
+        "contact_stage contact_gradients contact contact_crossing contact_friction",
+        "implicit solve_report",
+        "swept contact_area",
+        "self_contact_implicit self_contact",
+        "chambers held_volumes",
+        "loads supports",
+        "viscosity viscous_stages",
+    )
+]
 
 
 def place(stem: str) -> int:
@@ -54,6 +72,12 @@ def place(stem: str) -> int:
     if name in LAST:
         return len(LONGEST) + 1 + LAST.index(name)
     return LONGEST.index(name) if name in LONGEST else len(LONGEST)
+
+
+def together(path: str) -> str:
+    """What stands for a file when processes share the suite: the first of those that go to one process with it."""
+    name = Path(path).stem.removeprefix("test_")
+    return next((names[0] for names in TOGETHER if name in names), path)
 
 
 def minutes_of(reports) -> dict[str, float]:

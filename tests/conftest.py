@@ -59,6 +59,19 @@ def pytest_collection_modifyitems(config, items):
         items.sort(key=lambda item: areas.place(item.path.stem))
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """With `--dist loadfile` a process takes whole files, and with a file those that have its scenes."""
+    if config.getoption("dist") == "loadfile":
+        from xdist.scheduler import LoadFileScheduling
+
+        class Together(LoadFileScheduling):
+            def _split_scope(self, nodeid):
+                return areas.together(super()._split_scope(nodeid))
+
+        return Together(config, log)
+
+
 def _id(item) -> str:
     """As left_out.py names it."""
     return item.nodeid.removeprefix("tests/").replace(".py", "", 1)

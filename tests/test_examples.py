@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 
@@ -67,10 +68,12 @@ def test_swimmer(tmp_path, capsys):
     assert "swimmer, five seconds" in capsys.readouterr().out and (tmp_path / "swimmer.gif").stat().st_size > 100_000
 
 
-def test_tutorial(tmp_path):
-    run = subprocess.run([sys.executable, EXAMPLES / "tutorial.py"], cwd=tmp_path, capture_output=True, text=True)
-    assert run.returncode == 0 and not run.stderr, run.stderr
-    assert "friction" in run.stdout and "WRONG" not in run.stdout and "E = 4.5" in run.stdout
+def test_tutorial(tmp_path, capsys, monkeypatch):
+    """As a script."""
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLES / "tutorial.py"), run_name="__main__")
+    said = capsys.readouterr()
+    assert not said.err and "friction" in said.out and "WRONG" not in said.out and "E = 4.5" in said.out, said
     assert (tmp_path / "output" / "tutorial.png").stat().st_size > 20_000
 
 

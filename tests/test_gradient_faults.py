@@ -148,7 +148,7 @@ def test_mutated_results(monkeypatch, solver, name):
 )
 def test_mutated_laws(law, dot_product_sees_it):
     """The dot product compares with the tangent, which shares dP: a symmetric mistake is for differences to find."""
-    symmetric, right = gates_passed(rollout_of(full_scene(with_law(law)), steps=3))
+    symmetric, right = gates_passed(rollout_of(free_scene(with_law(law)), steps=3))
     assert not right and symmetric != dot_product_sees_it
 
 

@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import battery_of_surfaces
 import numpy as np
+import pytest
 from example_files import example
 
 import diffsim_ti as ds
@@ -61,6 +62,7 @@ def test_slow_impact_of_a_ball_converges_to_hertz():
     np.testing.assert_allclose(fine + 2 * (fine - coarse), 1, atol=0.05)
 
 
+@pytest.mark.thorough
 def test_a_meshed_ball_presses_a_block_as_the_ball_itself_does():
     """Force and radius of the contact within a percent on the same block, by a ball of 20 480 triangles with its volume,
     which is so large that both act at the vertices of the block alone.

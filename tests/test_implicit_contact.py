@@ -12,17 +12,16 @@ solvers = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
 every = pytest.mark.parametrize("solver", [*SOLVERS, ds.StaticSolver], ids=lambda s: s.__name__)
 
 
+def floor(friction=0.3, path=lambda t: [0, 0, 0]) -> ds.Ground:
+    """Rough and with a path, whether or not a test asks for it, so that all have the same kernels."""
+    return ds.Ground(stiffness=1e4, width=0.01, friction=friction, path=path)
+
+
 @solvers
 @pytest.mark.parametrize("mass", [1e-2, 1.0, 10.0])
 def test_weight_rests_at_the_gap_where_the_barrier_carries_it(solver, mass):
     """R22, settling from a start in the barrier that is not its equilibrium, in steps of 0.01 s."""
-    scene = points(
-        tetrahedron(0.004),
-        ds.Ground(stiffness=1e4, width=0.01),
-        mass,
-        terms=[ds.Gravity(-G), ds.Drag(5.0)],
-        precision="f64",
-    )
+    scene = points(tetrahedron(0.004), floor(), mass, terms=[ds.Gravity(-G), ds.Drag(5.0)], precision="f64")
     x = ds.Rollout(solver(scene, dt=1e-2, tolerance=1e-10), 500).forward().positions[-1]
     np.testing.assert_allclose(x[:3, 1], resting_gap(mass * G), atol=1e-6)
 
@@ -49,7 +48,7 @@ def test_incline(solver):
 def test_stopping_distance(solver, friction, distance, precision):
     scene = points(
         tetrahedron(resting_gap(G)),
-        ds.Ground(stiffness=1e4, width=0.01, friction=friction),
+        floor(friction),
         terms=[ds.Gravity(-G)],
         initial_velocities=[2, 0, 0],
         precision=precision,
@@ -61,8 +60,8 @@ def test_stopping_distance(solver, friction, distance, precision):
 
 @solvers
 def test_a_moving_floor_drags(solver):
-    floor = ds.Ground(stiffness=1e4, width=0.01, friction=0.3, friction_speed=1e-3, path=lambda t: [1.5 * t, 0, 0])
-    scene = points(tetrahedron(resting_gap(G)), floor, terms=[ds.Gravity(-G)], precision="f64")
+    belt = floor(path=lambda t: [1.5 * t, 0, 0])
+    scene = points(tetrahedron(resting_gap(G)), belt, terms=[ds.Gravity(-G)], precision="f64")
     frames = ds.Rollout(solver(scene, dt=5e-3), 200, save_every=10).forward()
     np.testing.assert_allclose(frames.velocities[:, 0, 0], np.minimum(0.3 * G * frames.times, 1.5), atol=2e-2)
 
@@ -95,8 +94,8 @@ def test_midpoints_refuse_a_fast_plane_in_terms_of_it():
 
 
 def test_a_rising_floor_lifts():
-    floor = ds.Ground(stiffness=1e4, width=0.01, path=lambda t: [0, 0.1 * t, 0])
-    scene = points(tetrahedron(resting_gap(G)), floor, terms=[ds.Gravity(-G), ds.Drag(1.0)], precision="f64")
+    lift = floor(path=lambda t: [0, 0.1 * t, 0])
+    scene = points(tetrahedron(resting_gap(G)), lift, terms=[ds.Gravity(-G), ds.Drag(1.0)], precision="f64")
     frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=1e-2), 100).forward()
     assert (frames.positions[-1] - frames.positions[0])[0, 1] == pytest.approx(0.1, abs=2e-3)
 

@@ -239,9 +239,9 @@ def test_a_floor_keeps_the_cycle_symmetric():
 # ---- what Newton's method does not find at once -------------------------------------------------------------------------
 
 
-def squashed(height: float, **more) -> ds.StaticSolver:
-    """A cube of five cells between plates that go together at once."""
-    mesh = ds.TetrahedralMesh.create_box(6, size=1.0)
+def squashed(height: float, cells: int = 5, **more) -> ds.StaticSolver:
+    """A cube between plates that go together at once."""
+    mesh = ds.TetrahedralMesh.create_box(cells + 1, size=1.0)
     held = mesh.vertices_where(lambda X: (X[:, 1] < 1e-9) | (X[:, 1] > 1 - 1e-9))
     top = mesh.vertices[held, 1] > 0.5
 
@@ -258,7 +258,7 @@ def squashed(height: float, **more) -> ds.StaticSolver:
 @pytest.mark.parametrize("height", [3.0, 0.3])
 @pytest.mark.filterwarnings("ignore")
 def test_nearly_incompressible_cubes_are_stretched_and_squashed_in_one_load_step(height):
-    x = final(squashed(height))
+    x = final(squashed(height, cells=4))
     assert np.all(np.isfinite(x)) and x[:, 1].max() >= height - 1e-9
 
 

@@ -305,7 +305,7 @@ def test_sweeps_that_stop_between_steps_and_checkpoints_give_the_same(kind):
 def test_all_threads_do_what_one_does(kind):
     results = []
     for parallel in (False, True):
-        solver = ds.VelocityVerletSolver(touching(kind, "f32"), 2e-3, 10, parallel=parallel, contact="force")
+        solver = ds.VelocityVerletSolver(touching(kind), 2e-3, 10, parallel=parallel, contact="force")
         rollout = ds.Rollout(solver, 4, save_every=2, gradients="all")
         frames = rollout.forward()
         results.append((frames.positions, rollout.vjp(frames, frames.positions)["density"]))

@@ -198,9 +198,9 @@ def test_advice_is_implicit_where_explicit_steps_are_tiny():
 
 @pytest.mark.parametrize("name", ["twist", "drop"])
 def test_advice_keeps_its_promise(name):
-    """Error below the tolerance against an independent converged run: another solver, sixteen times finer."""
+    """Error below the tolerance against an independent converged run: another solver, eight times finer."""
     (scene, duration, tolerance), advice = limited_displacement(name), advised(name)
-    fine = 16 * -(-advice.steps // 8)
+    fine = 8 * -(-advice.steps // 8)
     coarse, fine = (moved(scene, ds.SemiImplicitSolver, "f64", duration, k) for k in (fine, 2 * fine))
     assert relative(from_start(advice.rollout(scene, 8)), 2 * fine - coarse) <= tolerance
     assert advice.error <= tolerance and len(advice.reasons) == 3 and advice.left_out

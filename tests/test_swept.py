@@ -17,11 +17,14 @@ def cube(n=3, size=0.1):
     return ds.TetrahedralMesh.create_box(n, size=size)
 
 
-def wall(**options):
-    return ds.Box(center=(0.25, 0.05, 0.05), size=(0.01, 1, 1), width=0.005, **options)
+STILL = lambda t: np.zeros(3)  # noqa: E731 (of obstacles that could move, so that tests share their kernels)
 
 
-def judged(simulator, solid, steps, path=lambda t: np.zeros(3)):
+def wall(path=STILL, **options):
+    return ds.Box(center=(0.25, 0.05, 0.05), size=(0.01, 1, 1), width=0.005, path=path, **options)
+
+
+def judged(simulator, solid, steps, path=STILL):
     judge = Judge(simulator.scene.mesh.surface_triangles, solid, simulator.positions, path(0.0))
     for _ in range(steps):
         simulator.step()
@@ -47,14 +50,19 @@ def test_a_plate_that_comes_pushes_a_body_along(solver):
     assert simulator.velocities[:, 0].mean() > 25
 
 
+def plates(low, high, n=3, at=0.104, **near):
+    """A cube and two plates, of which one lies above `at`, that go up at these speeds."""
+    near = dict(stiffness=1e5, width=0.005) | near
+    pair = [
+        ds.HalfSpace((0, -0.004, 0), (0, 1, 0), **near, path=lambda t: [0, low * t, 0]),
+        ds.HalfSpace((0, at, 0), (0, -1, 0), **near, path=lambda t: [0, high * t, 0]),
+    ]
+    return ds.Scene(cube(n), SOFT, terms=pair, precision="f64")
+
+
 def test_a_body_between_two_plates_is_squeezed_in_parts():
     """Its motion has nowhere to be carried: the plates come as room is made."""
-    near = dict(stiffness=1e5, width=0.005)
-    plates = [
-        ds.HalfSpace((0, -0.004, 0), (0, 1, 0), **near, path=lambda t: [0, 2 * t, 0]),
-        ds.HalfSpace((0, 0.104, 0), (0, -1, 0), **near, path=lambda t: [0, -2 * t, 0]),
-    ]
-    scene = ds.Scene(cube(), SOFT, terms=plates, precision="f64")
+    scene = plates(2, -2)
     simulator = ds.Simulator(ds.ImplicitEulerSolver(scene, dt=1e-2))
     simulator.step()  # 6.8 cm of 10.8 are left
     y = simulator.positions[:, 1]
@@ -62,11 +70,7 @@ def test_a_body_between_two_plates_is_squeezed_in_parts():
 
 
 def test_no_room_is_left():
-    plates = [
-        ds.HalfSpace((0, -0.004, 0), (0, 1, 0), stiffness=1e5, width=0.005),
-        ds.HalfSpace((0, 0.104, 0), (0, -1, 0), stiffness=1e5, width=0.005, path=lambda t: [0, -12 * t, 0]),
-    ]
-    simulator = ds.Simulator(ds.ImplicitEulerSolver(ds.Scene(cube(), SOFT, terms=plates, precision="f64"), dt=1e-2))
+    simulator = ds.Simulator(ds.ImplicitEulerSolver(plates(0, -12), dt=1e-2))
     with pytest.raises(Blocked, match=r"^step 0, t = 0 s: .*(vertex|face).* before HalfSpace.*m/s"):
         simulator.step()
     assert np.abs(simulator.displacements).max() == 0
@@ -176,8 +180,7 @@ def test_gradients_where_ways_are_cut_and_obstacles_come_in_parts(solver, monkey
 
 def test_midpoint_steps_are_not_blamed_for_the_work_of_obstacles():
     """A plate that presses a body at rest does work; steps that resolve it add next to none."""
-    plate = ds.HalfSpace((0, -0.004, 0), (0, 1, 0), stiffness=1e3, width=0.01, path=lambda t: [0, 0.5 * t, 0])
-    scene = ds.Scene(cube(2), SOFT, terms=[plate], precision="f64")
+    scene = plates(0.5, 0, n=2, at=1.0, stiffness=1e3, width=0.01)
     simulator = ds.Simulator(ds.ImplicitMidpointSolver(scene, dt=2e-4))
     simulator.run(60)
     watch = simulator.workspace.energy_watch

@@ -89,6 +89,10 @@ class ObserverKernels:
         return self._kernel("fields", self.observe, "energy", "von_mises", "J", **more)
 
 
+def _kernels(arrays) -> ObserverKernels:
+    return kernels_of(ObserverKernels, arrays.law, arrays.features().of_elements())
+
+
 class Energy(float):
     """A total energy [J] that knows its parts: kinetic, elastic, gravity (zero at y = 0 for g along y), contact, springs,
     foundations (cables are loads, and have none); of plastic laws also what they have dissipated."""
@@ -123,7 +127,7 @@ def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
         room = a.points * a.num_places
         out = SimpleNamespace(**{name: runtime.array(a.fp, room) for name in ("energy", "von_mises", "J")})
         out.stress = runtime.array(a.vector, 3, room) if a.points > 1 else None
-        return out, kernels_of(ObserverKernels, a.law, a.features()).fields.bind(scene=a, at=workspace.state, out=out)
+        return out, _kernels(a).fields.bind(scene=a, at=workspace.state, out=out)
 
     out, launch = workspace.kept("fields", bind)
     launch(num_places=a.num_places)
@@ -145,7 +149,7 @@ def elastic_energy(workspace: Workspace) -> float:
 
     def bind():
         out = SimpleNamespace(energy=runtime.array(a.fp, a.points * a.num_places))
-        return out, kernels_of(ObserverKernels, a.law, a.features()).stored.bind(scene=a, at=workspace.state, out=out)
+        return out, _kernels(a).stored.bind(scene=a, at=workspace.state, out=out)
 
     out, launch = workspace.kept("stored", bind)
     launch(num_places=a.num_places)

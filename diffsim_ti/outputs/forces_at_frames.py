@@ -210,7 +210,7 @@ class BodyForces:
         derived = self.scene.inputs.derive(values)
         self.arrays.load(derived)
         a = self.arrays
-        self.kernels = runtime.kernels_of(BodyForceKernels, a.law, a.features(True, True), a.in_lanes)
+        self.kernels = runtime.kernels_of(BodyForceKernels, a.law, a.features().of_elements(), a.in_lanes)
         return derived
 
     def _run(self, name: str, **records) -> np.ndarray:

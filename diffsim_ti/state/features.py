@@ -144,12 +144,17 @@ class Features:
         """Whether adjoints of the surface's areas are wanted: the rest shape decides about them."""
         return self.shape and any(group.force.per_area for group in self.groups)
 
+    def of_elements(self) -> "Features":
+        """What tetrahedra see of it: scenes that differ in the rest share kernels of these alone."""
+        kept = "order growing growth_per_step growth_uniform uniform by_points shape".split()
+        return Features(**{name: getattr(self, name) for name in kept})
+
     def of_state(self) -> "Features":
-        """What energies, forces and their derivatives in a given state see of it: scenes that differ in the rest share their
-        kernels."""
-        kept = "order groups growing growth_per_step growth_uniform uniform by_points density shape".split()
+        """The same of energies, forces and their derivatives in a given state, which obstacles have as well."""
+        if not self.groups:
+            return self.of_elements()
         numbers = self.num_parameters if self.density or self.shape else 0  # say where other sums begin
-        return Features(**{name: getattr(self, name) for name in kept}, num_parameters=numbers)
+        return replace(self.of_elements(), groups=self.groups, density=self.density, num_parameters=numbers)
 
     def sums(self) -> Rows:
         """Rows of the per-vertex adjoint sums: those of the parameters stand as the parameters do."""

@@ -137,10 +137,10 @@ class FrozenStrains:
     def _launch(self, name: str, features, stage: Stage, u: np.ndarray, before, **records) -> None:
         ws, a = self.ws, self.ws.arrays
         runtime.fill(self.u, np.stack([u, u if before is None else before[0]]))
-        kernel = getattr(kernels_of(FrozenStrainKernels, a.law, features, ws.parallel, a.in_lanes), name)
+        kernels = kernels_of(FrozenStrainKernels, a.law, features.of_elements(), ws.parallel, a.in_lanes)
         a0, a1 = (stage.a0, stage.a1) if before is not None else (1.0, 0.0)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices)
-        ws.bound(kernel, at=self, **records)(**sizes, a0=a0, a1=a1)
+        ws.bound(getattr(kernels, name), at=self, **records)(**sizes, a0=a0, a1=a1)
 
     def hold(self, stage: Stage, u: np.ndarray, before) -> None:
         """Those of a pass from u, and from before = (u-, v-) or None."""

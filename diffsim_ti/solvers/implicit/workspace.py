@@ -229,9 +229,9 @@ class ImplicitWorkspace(PrescribedInPasses):
     def launch_law_state(self, name: str, features, j: int, slot: int, end: int, **records) -> None:
         """Launch one of the LawStateKernels for pass j, from z in `slot` and u in slot `end`."""
         a = self.arrays
-        kernel = getattr(kernels_of(LawStateKernels, a.law, features, self.parallel, a.in_lanes), name)
+        kernels = kernels_of(LawStateKernels, a.law, features.of_elements(), self.parallel, a.in_lanes)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices, slot=slot, end=end)
-        self.bound(kernel, **records)(**sizes, h=float(self.solver.schedule.length(j)))
+        self.bound(getattr(kernels, name), **records)(**sizes, h=float(self.solver.schedule.length(j)))
 
     def read(self, history, slot: int) -> tuple:
         """(u, v, (u-, v-) or None) of a slot, in float64."""
