@@ -227,18 +227,43 @@ def test_a_crease_presses_by_both_of_its_sides():
         [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]],
         radius=0.01,
         shapeable=True,
+        friction=0.2,
+        friction_speed=0.1,
         **BARRIER | dict(width=0.1),
     )
     body = ds.TetrahedralMesh(x, body.tetrahedra, fix_orientation=True)
-    law, down = ds.StableNeoHookean(2e4, 0.3), dict(initial_velocities=(0, -1.0, 0))
+    law, down = ds.StableNeoHookean(2e4, 0.3), dict(initial_velocities=(0.1, -1.0, 0.3))
     scene = ds.Scene(body, law, 100.0, [ds.Gravity(), valley], precision="f64", **down)
     solver = ds.ImplicitEulerSolver(scene, dt=1e-2, tolerance=1e-10)
     simulator = ds.Simulator(solver)
     simulator.run(8)
     assert simulator.report.iterations <= 8 * 6
-    rollout = ds.Rollout(solver, 6, gradients=SHAPE)
+    rollout = ds.Rollout(solver, 6, gradients=[*SHAPE, "friction", "friction_speed"])
     report = ds.check_gradients(rollout, verbose=False)
     assert report.passed and ds.dot_product_test(rollout) < 1e-9, str(report)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_friction_in_a_groove_is_that_of_both_sides(turned):
+    """Two sides with 60 degrees between them hold a wedge of weight N by N / (2 sin 30) each, so that it slides along them
+    against mu N / sin 30. The bottom of the groove is out of reach: thick sides are nearer."""
+    mu, dt, width, radius = 0.2, 5e-3, 0.01, 0.02
+    sides = np.array([[x, abs(z), z * np.tan(np.pi / 6)] for x in (-1, 3) for z in (-1.0, 0.0, 1.0)])
+    path = (lambda t: (0, 0, 0, 0.3 * t, 0, 0)) if turned else None
+    groove = ds.MeshObstacle(
+        sides, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]], radius=radius, width=width, stiffness=2e3, friction=mu,
+        friction_speed=1e-3, path=path, name="groove",
+    )  # fmt: skip
+    low = 2 * (radius + 0.5 * width)
+    wedge = np.array([[0, low, 0], [0.2, low, 0], [0.1, low + 0.2, 0.1], [0.1, low + 0.2, -0.1]])
+    mesh = ds.TetrahedralMesh(wedge, [[0, 1, 2, 3]], fix_orientation=True)
+    terms = [ds.Gravity((6.0, -9.0, 0)), groove]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 3e3, terms, initial_velocities=(0.2, 0, 0), precision="f64")
+    parts = [ds.ContactForce("groove", part, name=part) for part in ("normal", "friction")]
+    frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=dt), 12, save_every=1, outputs=parts).forward()
+    normal, friction = frames["normal"][1:-1, 1], frames["friction"][2:, 0]
+    assert normal.min() > 5 and np.all(frames.velocities[:, :, 0] > 0.1)
+    np.testing.assert_allclose(-friction, mu * normal / np.sin(np.pi / 6), rtol=2e-2 if turned else 1e-4)
 
 
 def test_resolution_is_not_asked_for():

@@ -102,6 +102,13 @@ class SurfacePairs:
             return self.width
         return float(self.contacts.widths[0 if self.term else 1 :].min())
 
+    @property
+    def longest_reach(self) -> float:
+        """How far from bodies a list may have what is of obstacles [m], unless more is needed."""
+        least = self.least_slack * self.width
+        slacks = (max(least, 0.5 * (x * self.list.typical - self.width)) for x in self.largest_reach)
+        return self.width + 2 * (sum(slacks) + max(float(self.contacts.reach.max()) - self.width, 0.0))
+
     def load(self, u) -> None:
         """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""
         self.fresh = False
@@ -155,7 +162,7 @@ class SurfacePairs:
         self.build(u, 0)
         self.check_apart(u)
 
-    obstacles = None  # whose corners are vertices of the surface: of pairs with vertices that no node gives
+    obstacles = nearby = None  # of pairs with vertices that no node gives (curved_pairs.py)
 
     def follow(self, rows: np.ndarray, m: int) -> None:
         """Obstacles are where rows of poses say."""
