@@ -251,19 +251,19 @@ def test_friction_in_a_groove_is_that_of_both_sides(turned):
     sides = np.array([[x, abs(z), z * np.tan(np.pi / 6)] for x in (-1, 3) for z in (-1.0, 0.0, 1.0)])
     path = (lambda t: (0, 0, 0, 0.3 * t, 0, 0)) if turned else None
     groove = ds.MeshObstacle(
-        sides, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]], radius=radius, width=width, stiffness=2e3, friction=mu,
+        sides, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]], radius=radius, width=width, stiffness=1.5e3, friction=mu,
         friction_speed=1e-3, path=path, name="groove",
     )  # fmt: skip
     low = 2 * (radius + 0.5 * width)
     wedge = np.array([[0, low, 0], [0.2, low, 0], [0.1, low + 0.2, 0.1], [0.1, low + 0.2, -0.1]])
     mesh = ds.TetrahedralMesh(wedge, [[0, 1, 2, 3]], fix_orientation=True)
     terms = [ds.Gravity((6.0, -9.0, 0)), groove]
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 3e3, terms, initial_velocities=(0.2, 0, 0), precision="f64")
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 3e3, terms, initial_velocities=(1.0, 0, 0), precision="f64")
     parts = [ds.ContactForce("groove", part, name=part) for part in ("normal", "friction")]
     frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=dt), 12, save_every=1, outputs=parts).forward()
     normal, friction = frames["normal"][1:-1, 1], frames["friction"][2:, 0]
-    assert normal.min() > 5 and np.all(frames.velocities[:, :, 0] > 0.1)
-    np.testing.assert_allclose(-friction, mu * normal / np.sin(np.pi / 6), rtol=2e-2 if turned else 1e-4)
+    assert normal.min() > 5 and np.all(frames.velocities[:, :, 0] > 0.5)
+    np.testing.assert_allclose(-friction, mu * normal / np.sin(np.pi / 6), rtol=2e-3)  # it bounces, so not all along
 
 
 def test_resolution_is_not_asked_for():

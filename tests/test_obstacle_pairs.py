@@ -159,15 +159,15 @@ def land(long: int, **options) -> ds.MeshObstacle:
     first = (15 * np.arange(long)[:, None] + np.arange(14)).ravel()[:, None]
     triangles = np.concatenate([first + [0, 1, 15], first + [1, 16, 15]])
     vertices = np.stack([x, y, z], -1).reshape(-1, 3)
-    return ds.MeshObstacle(vertices, triangles, name="land", friction=0.2, friction_speed=0.05, **BARRIER, **options)
+    return ds.MeshObstacle(vertices, triangles, name="land", **BARRIER, **options)
 
 
 @pytest.mark.parametrize("solver, dt, steps", [(ds.ImplicitEulerSolver, 5e-3, 10), (ds.SemiImplicitSolver, 1e-3, 50)])
 def test_a_run_has_what_is_near_alone_and_finds_what_it_would_find_with_all(solver, dt, steps, monkeypatch):
     """A cube goes over rough land that rises and turns: the same frames, and gradients, as with all of its edges."""
     rise = lambda t: (0, 0.2 * t, 0, 0, 0.4 * t, 0)  # noqa: E731
-    scene, found, counts = cube(land(80, path=rise), velocity=(4.0, -0.5, 0.1)), [], set()
-    options = dict(tolerance=1e-10) if solver is ds.ImplicitEulerSolver else {}
+    options, rough = ({}, {}) if solver.explicit else (dict(tolerance=1e-10), dict(friction=0.2, friction_speed=0.05))
+    scene, found, counts = cube(land(80, path=rise, **rough), velocity=(4.0, -0.5, 0.1)), [], set()
     take = NearCorners.take
 
     def counted(self):
@@ -183,7 +183,7 @@ def test_a_run_has_what_is_near_alone_and_finds_what_it_would_find_with_all(solv
         seed = np.cos(np.arange(frames.positions.size)).reshape(frames.positions.shape)
         found.append((frames.positions, rollout.vjp(frames, positions=seed)))
     (x, of_near), (y, of_all) = found
-    assert len(counts) > 4 and max(counts) < 81 * 15 / 3
+    assert len(counts) > 3 and max(counts) < 81 * 15 / 3
     assert np.array_equal(x, y) and x[-1, :, 1].min() > -0.04
     for name, gradient in of_all.items():
         np.testing.assert_allclose(
