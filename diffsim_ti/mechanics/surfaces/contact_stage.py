@@ -124,9 +124,10 @@ class PairContact(Stage):
     def prepare(self, at: Passes, u, slot: int, anew: bool) -> None:
         """A pass begins at u[slot]; anew: what was before says nothing of the list."""
         self.follow(at, AT_BEGIN)
+        fine = self._fine(u, slot)
         if anew:
-            self.pairs.ensure(u, slot)
-        self.inner.forces(*self._fine(u, slot), self.scratch)
+            self.inner.ensure(*fine)
+        self.inner.forces(*fine, self.scratch)
         self.corners = self.obstacles.displacements if self.obstacles else None
 
     def finish(self, at: Passes) -> None:

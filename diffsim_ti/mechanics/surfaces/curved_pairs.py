@@ -184,7 +184,7 @@ class CurvedPairs:
 
     def is_covered(self, *places: np.ndarray, to=None, anew: bool = False, more: float = 0.0) -> bool:
         """Whether they are there; which, where not, `nearby` knows then."""
-        if not (self.nearby and self.nearby.many) or not all(np.isfinite(u).all() for u in places):
+        if not (self.nearby and self.nearby.many):
             return True
         at, reach = self.obstacles, self.inner.longest_reach + more
         poses = [(at.rows, m) for m in ((AT_BEGIN, AT_STAGE) if anew else (at.m,))]
