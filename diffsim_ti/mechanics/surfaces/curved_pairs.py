@@ -170,7 +170,7 @@ class CurvedPairs:
             self._sums = self.collect()
         self._hold()
         self.inner.contacts.load(self.a.values.parameters)
-        self.inner._checked_rest = gone._checked_rest
+        self.inner.checked_rest = gone.checked_rest
         if self._sums:
             self._clear()
         self.obstacles.by_rows = obstacles.by_rows

@@ -74,13 +74,13 @@ class NearCorners:
     def _made(self, part, low: np.ndarray, high: np.ndarray, poses: list) -> tuple[np.ndarray, np.ndarray]:
         """Boxes that hold boxes as an obstacle that is in poses, or between them, sees them where it was made."""
         shifts = np.array([rows[3 * part.k + m] for rows, m in poses])
-        if self.all._row(part, 0) is None:
+        if self.all.row_of(part, 0) is None:
             return low - shifts.max(0), high - shifts.min(0)
         corners, c = (
             np.stack(list(map(np.stack, product(*zip(low.T, high.T))))),
-            self.all._about(part, self.a.values.parameters),
+            self.all.about(part, self.a.values.parameters),
         )
-        back = [rotations.conjugate(rotations.from_rodrigues(rows[self.all._row(part, m)])) for rows, m in poses]
+        back = [rotations.conjugate(rotations.from_rodrigues(rows[self.all.row_of(part, m)])) for rows, m in poses]
         seen = np.stack([c + rotations.turned(q, np.swapaxes(corners, 1, 2) - t - c) for q, t in zip(back, shifts)])
         wide = np.abs(seen - seen[0]).max()  # between poses, on arcs
         return seen.min((0, 1)) - wide, seen.max((0, 1)) + wide

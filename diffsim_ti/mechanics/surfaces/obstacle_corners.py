@@ -53,28 +53,28 @@ class ObstacleCorners:
 
     # ---- poses -------------------------------------------------------------------------------------------------------
 
-    def _row(self, part, m: int) -> int | None:
+    def row_of(self, part, m: int) -> int | None:
         """The row of rotations, None of an obstacle that does not turn."""
         place = self.a.poses.place_of.get(part.k)
         return None if place is None else 3 * place + m
 
-    def _about(self, part, parameters: np.ndarray) -> np.ndarray:
+    def about(self, part, parameters: np.ndarray) -> np.ndarray:
         at = part.first + part.force.index.about
         return parameters[at : at + 3]
 
     def _arms(self, part, parameters, rows, m: int, p=None, c=None) -> np.ndarray:
         """R (p - c) of an obstacle that turns."""
         p = part.primitives.at(self._numbers(part, parameters))[0] if p is None else p
-        c = self._about(part, parameters) if c is None else c
-        return rotations.turned(rotations.from_rodrigues(rows[self._row(part, m)]), p - c)
+        c = self.about(part, parameters) if c is None else c
+        return rotations.turned(rotations.from_rodrigues(rows[self.row_of(part, m)]), p - c)
 
     def at(self, parameters: np.ndarray, rows: np.ndarray, m: int = AT_STAGE) -> np.ndarray:
         """Where corners are at the rows number m of poses."""
         out = []
         for x in self.parts:
             p, _ = x.primitives.at(self._numbers(x, parameters))
-            if self._row(x, m) is not None:
-                p = self._about(x, parameters) + self._arms(x, parameters, rows, m, p)
+            if self.row_of(x, m) is not None:
+                p = self.about(x, parameters) + self._arms(x, parameters, rows, m, p)
             out.append(p + rows[3 * x.k + m])
         return np.concatenate(out)
 
@@ -83,9 +83,9 @@ class ObstacleCorners:
         out = []
         for x in self.parts:
             dp, _ = x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))
-            row = self._row(x, m)
+            row = self.row_of(x, m)
             if row is not None:
-                dc, arms = self._about(x, change), self._arms(x, parameters, rows, m)
+                dc, arms = self.about(x, change), self._arms(x, parameters, rows, m)
                 dp = dc + np.cross(rows_dot[row], arms) + self._arms(x, parameters, rows, m, dp, dc)
             out.append(dp + rows_dot[3 * x.k + m])
         return np.concatenate(out)
@@ -93,7 +93,7 @@ class ObstacleCorners:
     def at_vjp(self, parameters, rows, by_x, by_parameters, by_rows, m: int = AT_STAGE) -> None:
         """Adds the adjoints of the parameters and of the rows for that of where corners are."""
         for x in self.parts:
-            by, row = by_x[x.own], self._row(x, m)
+            by, row = by_x[x.own], self.row_of(x, m)
             by_rows[3 * x.k + m] += by.sum(0)
             if row is not None:
                 by_rows[row] += np.cross(self._arms(x, parameters, rows, m), by).sum(0)
@@ -102,7 +102,7 @@ class ObstacleCorners:
 
     def _unturned(self, part, by, rows, m, by_parameters, by_c) -> np.ndarray:
         """R^T by, less which by_c is the adjoint of the point c."""
-        by = rotations.turned(rotations.conjugate(rotations.from_rodrigues(rows[self._row(part, m)])), by)
+        by = rotations.turned(rotations.conjugate(rotations.from_rodrigues(rows[self.row_of(part, m)])), by)
         at = part.first + part.force.index.about
         by_parameters[at : at + 3] += by_c - by.sum(0)
         return by
@@ -124,7 +124,7 @@ class ObstacleCorners:
 
     def _chord(self, part, rows) -> tuple[np.ndarray, np.ndarray]:
         """(angular velocity, the turn of the chord)"""
-        row = self._row(part, 0)
+        row = self.row_of(part, 0)
         return rows[row + RATE], rows[row + TAU, 0] * rows[row + RATE]
 
     def velocity(self, parameters, rows) -> np.ndarray:
@@ -132,7 +132,7 @@ class ObstacleCorners:
         out = np.zeros((self.count, 3))
         for x in self.parts:
             out[x.own] = rows[3 * x.k + RATE]
-            if self._row(x, 0) is not None:
+            if self.row_of(x, 0) is not None:
                 omega, turn = self._chord(x, rows)
                 arms = self._arms(x, parameters, rows, AT_BEGIN)
                 out[x.own] += np.cross(omega, arms @ rotations.left_jacobian(turn).T)
@@ -141,7 +141,7 @@ class ObstacleCorners:
     def velocity_jvp(self, parameters, change, rows, rows_dot) -> np.ndarray:
         out = np.zeros((self.count, 3))
         for x in self.parts:
-            out[x.own], row = rows_dot[3 * x.k + RATE], self._row(x, AT_BEGIN)
+            out[x.own], row = rows_dot[3 * x.k + RATE], self.row_of(x, AT_BEGIN)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
                 J, dp = (
@@ -149,14 +149,14 @@ class ObstacleCorners:
                     x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[0],
                 )
                 darms = np.cross(rows_dot[row], arms)
-                darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self._about(x, change))
+                darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self.about(x, change))
                 turned = rotations.turned(rotations.quaternion(turn), arms)
                 out[x.own] += np.cross(J @ rows_dot[row - AT_BEGIN + RATE], turned) + np.cross(omega, darms @ J.T)
         return out
 
     def velocity_vjp(self, parameters, rows, by_v, by_parameters, by_rows) -> None:
         for x in self.parts:
-            by, row = by_v[x.own], self._row(x, AT_BEGIN)
+            by, row = by_v[x.own], self.row_of(x, AT_BEGIN)
             by_rows[3 * x.k + RATE] += by.sum(0)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)

@@ -84,7 +84,7 @@ class SurfacePairs:
         self.farthest = runtime.array(self.kernels.fp, 1 + blocks + upper["number"])
         self.touched = runtime.array(ti.i32, n)
         self.fresh, self.age, self.builds = False, 0, 0
-        self._checked_rest = self._scratch = None
+        self.checked_rest = self._scratch = None
         self.has_friction = len(self.contacts.mu) > 0 if self.kinematic else term.has_friction
         self.friction = self.friction_kind(self) if self.friction_kind and self.has_friction else None
 
@@ -115,11 +115,11 @@ class SurfacePairs:
         if self.kinematic:
             self.contacts.load(self.a.values.parameters)
         checked = (self.a.values.rest, self.width)
-        if self._checked_rest is None or self._checked_rest[0] is not checked[0] or self._checked_rest[1] != checked[1]:
+        if self.checked_rest is None or self.checked_rest[0] is not checked[0] or self.checked_rest[1] != checked[1]:
             rest_state = runtime.array(self.kernels.vec4, 1, self.a.num_vertices)
             runtime.fill(rest_state, 0)
             self._check_rest(rest_state)
-            self._checked_rest = checked
+            self.checked_rest = checked
         self.build(u, 0)
         self.check_apart(u)
 
