@@ -13,6 +13,7 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
 from diffsim_ti.materials.calculus.tensor import sum_of
+from diffsim_ti.mesh.geometry import cross
 from diffsim_ti.runtime import assign, at, let, traced, variable
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
@@ -21,6 +22,7 @@ from diffsim_ti.terms.obstacles.surface_distance import ENERGY, FORCE, JVP, VJP,
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
 from diffsim_ti.terms.obstacles.turning import rotation_matrix
+from diffsim_ti.terms.pose import brought_back
 from diffsim_ti.terms.term import place
 
 MANY = 256  # edges and points that act by pairs, from which on a run has those near bodies alone
@@ -121,7 +123,33 @@ class MeshObstacle(Obstacle):
         out = super().settled(scene, density, initial_positions, initial_velocities)
         if "barrier_width" in self.left_to_scene:
             out._check_rounding()
+        sides = np.sort(scene.mesh.surface_triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+        out._edges_of_bodies = np.unique(sides, axis=0)
         return out
+
+    def check_start(self, positions, surface, offset=(0.0, 0.0, 0.0)):
+        super().check_start(positions, surface, offset)
+        made = brought_back(np.asarray(positions, np.float64), np.asarray(offset), self.about)
+        ways = (made - (self._base + self.values["mesh_position"]))[self._edges_of_bodies]
+        through = self._tree.first_through(ways)
+        if through is not None:
+            i, j = self._edges_of_bodies[through]
+            raise ValueError(
+                f"the body starts with a triangle of {self!r} in it, between its vertices {i} and {j}; move the body or "
+                "the obstacle"
+            )
+
+    def _refuse(self, gap, surface):
+        try:
+            super()._refuse(gap, surface)
+        except ValueError as error:
+            x, t = self._made.vertices - self._base, self._made.triangles[self._made.is_sided]
+            if np.einsum("ij,ij->", x[t[:, 0]], cross(x[t[:, 1]], x[t[:, 2]])) < 0:
+                raise ValueError(
+                    f"{error}; its triangles face inwards, so that it is a room: turn them round, triangles[:, ::-1], for a "
+                    "solid"
+                ) from None
+            raise
 
     def primitives_for(self, mesh, width):
         """Those of its edges and corners that faces of the body are wide enough to meet between their own corners."""
