@@ -76,12 +76,10 @@ class NearCorners:
         shifts = np.array([rows[3 * part.k + m] for rows, m in poses])
         if self.all.row_of(part, 0) is None:
             return low - shifts.max(0), high - shifts.min(0)
-        corners, c = (
-            np.stack(list(map(np.stack, product(*zip(low.T, high.T))))),
-            self.all.about(part, self.a.values.parameters),
-        )
+        c = self.all.about(part, self.a.values.parameters)
+        corners = np.stack([np.stack(x, -1) for x in product(*zip(low.T, high.T))])
         back = [rotations.conjugate(rotations.from_rodrigues(rows[self.all.row_of(part, m)])) for rows, m in poses]
-        seen = np.stack([c + rotations.turned(q, np.swapaxes(corners, 1, 2) - t - c) for q, t in zip(back, shifts)])
+        seen = np.stack([c + rotations.turned(q, corners - t - c) for q, t in zip(back, shifts)])
         wide = np.abs(seen - seen[0]).max()  # between poses, on arcs
         return seen.min((0, 1)) - wide, seen.max((0, 1)) + wide
 
