@@ -137,10 +137,10 @@ def test_a_sheet_is_felt_from_both_sides(sign):
     assert np.all(sign * (sides - 0.5 * sign * 0.048) > 0) and simulator.contact_resolution.smallest_gap > 0
 
 
-def test_what_is_not_nearest_is_not_passed_through_either(monkeypatch):
+def test_what_is_not_nearest_is_not_passed_through_either():
     """A fast vertex next to a point, with a sheet on its way, none of whose edges acts by pairs."""
-    monkeypatch.setattr(ds.MeshObstacle, "settled", ds.Sphere.settled)
-    parts = ds.MeshObstacle([*SHEET, [1.3, 0.24, 0.0]], SQUARE, points=[4], **BARRIER | dict(width=1e-3))
+    options = BARRIER | dict(width=1e-3, by_pairs=False)
+    parts = ds.MeshObstacle([*SHEET, [1.3, 0.24, 0.0]], SQUARE, points=[4], **options)
     with pytest.raises(ds.Crossing, match="vertex 0 gets .* m behind MeshObstacle"):
         fallen(parts, ds.SemiImplicitSolver, lift=0.3, velocity=(0, -400.0, 0), steps=2, substeps=4)
 
@@ -227,18 +227,62 @@ def test_a_crease_presses_by_both_of_its_sides():
         [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]],
         radius=0.01,
         shapeable=True,
+        friction=0.2,
+        friction_speed=0.1,
         **BARRIER | dict(width=0.1),
     )
     body = ds.TetrahedralMesh(x, body.tetrahedra, fix_orientation=True)
-    law, down = ds.StableNeoHookean(2e4, 0.3), dict(initial_velocities=(0, -1.0, 0))
+    law, down = ds.StableNeoHookean(2e4, 0.3), dict(initial_velocities=(0.1, -1.0, 0.3))
     scene = ds.Scene(body, law, 100.0, [ds.Gravity(), valley], precision="f64", **down)
     solver = ds.ImplicitEulerSolver(scene, dt=1e-2, tolerance=1e-10)
     simulator = ds.Simulator(solver)
     simulator.run(8)
     assert simulator.report.iterations <= 8 * 6
-    rollout = ds.Rollout(solver, 6, gradients=SHAPE)
+    rollout = ds.Rollout(solver, 6, gradients=[*SHAPE, "friction", "friction_speed"])
     report = ds.check_gradients(rollout, verbose=False)
     assert report.passed and ds.dot_product_test(rollout) < 1e-9, str(report)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_friction_in_a_groove_is_that_of_both_sides(turned):
+    """Two sides with 60 degrees between them hold a wedge of weight N by N / (2 sin 30) each, so that it slides along them
+    against mu N / sin 30. The bottom of the groove is out of reach: thick sides are nearer."""
+    mu, dt, width, radius = 0.2, 5e-3, 0.01, 0.02
+    sides = np.array([[x, abs(z), z * np.tan(np.pi / 6)] for x in (-1, 3) for z in (-1.0, 0.0, 1.0)])
+    path = (lambda t: (0, 0, 0, 0.3 * t, 0, 0)) if turned else None
+    groove = ds.MeshObstacle(
+        sides, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]], radius=radius, width=width, stiffness=1.5e3, friction=mu,
+        friction_speed=1e-3, path=path, name="groove",
+    )  # fmt: skip
+    low = 2 * (radius + 0.5 * width)
+    wedge = np.array([[0, low, 0], [0.2, low, 0], [0.1, low + 0.2, 0.1], [0.1, low + 0.2, -0.1]])
+    mesh = ds.TetrahedralMesh(wedge, [[0, 1, 2, 3]], fix_orientation=True)
+    terms = [ds.Gravity((6.0, -9.0, 0)), groove]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 3e3, terms, initial_velocities=(1.0, 0, 0), precision="f64")
+    parts = [ds.ContactForce("groove", part, name=part) for part in ("normal", "friction")]
+    frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=dt), 12, save_every=1, outputs=parts).forward()
+    normal, friction = frames["normal"][1:-1, 1], frames["friction"][2:, 0]
+    assert normal.min() > 5 and np.all(frames.velocities[:, :, 0] > 0.5)
+    np.testing.assert_allclose(-friction, mu * normal / np.sin(np.pi / 6), rtol=2e-3)  # it bounces, so not all along
+
+
+def test_what_starts_wrong_is_said_with_what_helps():
+    """A sheet through a body between its vertices, a solid whose triangles face inwards, indices that count from one."""
+    law, high = ds.StableNeoHookean(2e4, 0.3), ds.TetrahedralMesh.create_box(2, 0.2, origin=(-0.1, -0.07, -0.1))
+    scene = lambda obstacle: ds.Scene(high, law, 100.0, [ds.Gravity(), obstacle], precision="f64")  # noqa: E731
+    for path in (None, lambda t: (0, 0, 0, 0.01, 0, 0)):
+        with pytest.raises(
+            ValueError, match="starts with a triangle of MeshObstacle.* between its vertices .* move the body"
+        ):
+            scene(ds.MeshObstacle(SHEET, SQUARE, path=path, **BARRIER))
+        scene(ds.MeshObstacle(SHEET - [0, 0.1, 0], SQUARE, path=path, **BARRIER))
+        scene(ds.MeshObstacle(SHEET + [1.2, 0, 0], SQUARE, path=path, **BARRIER))
+    solid = CORNERS - [0, 0.4, 0]
+    with pytest.raises(ValueError, match=r"so that it is a room: turn them round, triangles\[:, ::-1\], for a solid"):
+        scene(ds.MeshObstacle(solid, TRIANGLES[:, ::-1], **BARRIER))
+    scene(ds.MeshObstacle(solid, TRIANGLES, **BARRIER))
+    with pytest.raises(ValueError, match="0 to 3, got 4; these count from 1: subtract 1"):
+        ds.MeshObstacle(SHEET, np.add(SQUARE, 1))
 
 
 def test_resolution_is_not_asked_for():

@@ -10,7 +10,9 @@ from impact_judge import Judge
 
 import diffsim_ti as ds
 from diffsim_ti import verify
+from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
+from diffsim_ti.terms.obstacles import mesh_obstacle
 from diffsim_ti.terms.obstacles.barrier import beta
 
 SIZE, WIDTH, PER_AREA, GAP = 0.1, 4e-3, 5e6, 1.5e-3
@@ -131,7 +133,7 @@ def test_gaps_are_exact(kind, solver):
 
 
 def test_what_is_far_away_changes_nothing():
-    """A hundred spikes far from the body: the same bits, by trees that do not hold them."""
+    """A hundred spikes far from the body: the same bits, by trees without them."""
     blade, sides = box_surface(1.0, -0.5)
     blade = blade * [0.01, 0.4, 0.8] - [0, 0.2 + GAP, 0]
     places = np.random.default_rng(0).uniform(-1, 1, (100, 3)) + [0, -3, 0]
@@ -145,9 +147,48 @@ def test_what_is_far_away_changes_nothing():
         simulator = ds.Simulator(ds.ImplicitEulerSolver(cube(obstacle), dt=1e-3))
         simulator.run(8)
         trees = simulator.workspace.pairs.list.trees
-        found.append((simulator.positions, trees[0].held, trees[2].held, trees[2].count))
-    (x, *held, count), (y, *also_held, many) = found
-    assert np.array_equal(x, y) and held == also_held and many == count + 600 and held[1] > 18
+        found.append((simulator.positions, trees[0].count, trees[2].count))
+    (x, *of_blade), (y, *of_many) = found
+    assert np.array_equal(x, y) and np.all(np.array(of_many) <= of_blade) and of_many[1] > 18
+
+
+def land(long: int, **options) -> ds.MeshObstacle:
+    """Rough, of 28 `long` triangles."""
+    x, z = np.meshgrid(-0.3 + 0.05 * np.arange(long + 1), np.linspace(-0.3, 0.4, 15), indexing="ij")
+    y = -0.03 + 0.02 * np.random.default_rng(3).uniform(size=x.shape)
+    first = (15 * np.arange(long)[:, None] + np.arange(14)).ravel()[:, None]
+    triangles = np.concatenate([first + [0, 1, 15], first + [1, 16, 15]])
+    vertices = np.stack([x, y, z], -1).reshape(-1, 3)
+    return ds.MeshObstacle(vertices, triangles, name="land", **BARRIER, **options)
+
+
+@pytest.mark.parametrize("solver, dt, steps", [(ds.ImplicitEulerSolver, 5e-3, 10), (ds.SemiImplicitSolver, 1e-3, 50)])
+def test_a_run_has_what_is_near_alone_and_finds_what_it_would_find_with_all(solver, dt, steps, monkeypatch):
+    """A cube goes over rough land that rises and turns: the same frames, and gradients, as with all of its edges."""
+    rise = lambda t: (0, 0.2 * t, 0, 0, 0.4 * t, 0)  # noqa: E731
+    options, rough = ({}, {}) if solver.explicit else (dict(tolerance=1e-10), dict(friction=0.2, friction_speed=0.05))
+    scene, found, counts = cube(land(80, path=rise, **rough), velocity=(4.0, -0.5, 0.1)), [], set()
+    take = NearCorners.take
+
+    def counted(self):
+        changed = take(self)
+        counts.add(self.corners.count)
+        return changed
+
+    monkeypatch.setattr(NearCorners, "take", counted)
+    for many in (256, 10**6):
+        monkeypatch.setattr(mesh_obstacle, "MANY", many)
+        rollout = ds.Rollout(solver(scene, dt=dt, **options), steps, gradients="all", save_every=1, checkpoint_every=3)
+        frames = rollout.forward()
+        seed = np.cos(np.arange(frames.positions.size)).reshape(frames.positions.shape)
+        found.append((frames.positions, rollout.vjp(frames, positions=seed)))
+    (x, of_near), (y, of_all) = found
+    assert len(counts) > 3 and max(counts) < 81 * 15 / 3
+    assert np.array_equal(x, y) and x[-1, :, 1].min() > -0.04
+    for name, gradient in of_all.items():
+        np.testing.assert_allclose(
+            of_near[name], gradient, rtol=1e-9, atol=1e-12 * np.abs(gradient).max(), err_msg=name
+        )
 
 
 @lru_cache

@@ -70,18 +70,16 @@ class ObstacleCollisions:
         """How far along a step, at most `most`, pairs stay apart while obstacles go from places by a drift, and what would
         meet then."""
         pairs = self.ws.pairs
-        share = pairs.safe_share(u, step, most, self._corners_drift(places, drift))
+        share = pairs.safe_share(u, step, most, self._pairs_go(places, drift))
         met = pairs.met if share < most else None
         return share, met and Met(*met, share)
 
-    def _corners_drift(self, places, drift) -> np.ndarray:
-        """How far corners of obstacles that act by pairs go; they are put to where they begin."""
-        obstacles, rows = self.ws.pairs.obstacles, np.zeros_like(self.rows)
-        rows[::3] = self.ws.arrays.poses.moved(places, drift, 1.0)
-        there = obstacles.displacements_at(rows)
-        rows[::3] = places
+    def _pairs_go(self, places, drift) -> np.ndarray:
+        """Put obstacles that act by pairs to where they begin: the rows to where they go."""
+        rows, to = np.zeros_like(self.rows), np.zeros_like(self.rows)
+        rows[::3], to[::3] = places, self.ws.arrays.poses.moved(places, drift, 1.0)
         self.ws.pairs.follow(rows, AT_STAGE)
-        return there - obstacles.displacements
+        return to
 
     def put(self, places: np.ndarray) -> None:
         """Take forces with obstacles elsewhere."""
@@ -102,7 +100,7 @@ class ObstacleCollisions:
         """Raise Tunnelling where surfaces, or a surface and an obstacle, meet beyond the middle of a step."""
         pairs, drift = self.ws.pairs, self.ws.arrays.poses.drift(self.rows[::3], self.at_end(j))
         if pairs:
-            along = dict(drift=self._corners_drift(self.rows[::3], drift)) if pairs.obstacles else {}
+            along = dict(to=self._pairs_go(self.rows[::3], drift)) if pairs.obstacles else {}
             pairs.check_end(u_star, u_next, **along)
         if self.detection.share(u_star, u_next - u_star, self.rows[::3], drift) == 1:
             return

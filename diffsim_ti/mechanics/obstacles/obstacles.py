@@ -278,10 +278,9 @@ class ObstaclePotential(ObstacleFunctions):
             self.add_to_area(g, i, self.drag(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
         w = self.on_area(g, i, w, scene)
         v, v_obstacle = self.velocity(i, u, pass_, plan), self.v_obstacle(g, k, i, scene, pass_)
-        by_lagged, by_v, by_v_obstacle, by = g.force.friction_force_vjp(
-            scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle, w
+        by_lagged, by_v, by_v_obstacle = g.force.friction_force_vjp(
+            scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle, w, adjoint.sums, i
         )
-        self.add_to_numbers(g, k, i, by, adjoint)
         by_u, by_t = self.lagged_vjp(g, k, i, by_lagged, by_v_obstacle, scene, pass_, adjoint)
         self.add_to_rest(i, by_u, adjoint)
         adjoint.lag[0, i] = adjoint.lag[0, i] + by_u

@@ -162,8 +162,7 @@ class BoxKernels:
 
 
 class BoxTree:
-    """The tree of one kind of primitives (corners: vertices of each, shape (count, 1, 2 or 3)), or of some of them: `held`
-    is how many it holds."""
+    """The tree of one kind of primitives (corners: vertices of each, shape (count, 1, 2 or 3))."""
 
     sort_every = 8  # refits, after which the leaves are put in order anew
 
@@ -171,7 +170,8 @@ class BoxTree:
         self.count, self.size = corners.shape
         self.launch, self._host = launch, corners
         self.kernels = kernels_of(BoxKernels, precision, parallel, self.size)
-        self._hold(self.count)
+        self.groups = -(-self.count // GROUP)
+        self.leaves = 1 << max(self.groups - 1, 1).bit_length()
         self.corners, self.order = runtime.upload(corners.ravel(), ti.i32), runtime.array(ti.i32, self.count)
         self.slacks = runtime.array(self.kernels.vector, self.count)
         # lowest and highest corners: of primitives as they follow each other, and of nodes
@@ -179,25 +179,16 @@ class BoxTree:
         self.boxes = runtime.array(self.kernels.vector, 4 * self.leaves)
         # of primitives leaf by leaf: lowest x of all in it, lowest y, z, highest x, y, z
         self.lanes = runtime.array(ti.types.vector(GROUP, self.kernels.fp), 6 * self.groups)
-        self.refits, self._those = 0, None
+        self.refits = 0
 
-    def _hold(self, count: int) -> None:
-        self.held, self.groups = count, -(-count // GROUP)
-        self.leaves = 1 << max(self.groups - 1, 1).bit_length()
-
-    def refit(self, scene: tuple, slot: int, reach: float, those: np.ndarray | None = None) -> None:
+    def refit(self, scene: tuple, slot: int, reach: float) -> None:
         """Put the boxes where primitives are; all within `reach` [m] + slacks of each other will overlap.
 
-        scene: (record of rest and u, record of place, body and slack); those: which primitives it is to hold, all without.
+        scene: (record of rest and u, record of place, body and slack).
         """
-        changed = those is not None and not np.array_equal(those, self._those)
-        if self.refits % self.sort_every == 0 or changed:
-            self._those, own = those, slice(None) if those is None else those
+        if self.refits % self.sort_every == 0:
             x = runtime.fetch(scene[0].rest) + runtime.fetch(scene[0].u, slot)
-            middles = x[self._host[own]].mean(1)
-            order = curve_order(middles) if len(middles) else np.zeros(0, int)
-            self._hold(len(order))
-            put(self.order, order if those is None else those[order])
+            put(self.order, curve_order(x[self._host].mean(1)))
         self.refits += 1
         self.launch(self.kernels.refit, scene=scene, tree=self)(slot=slot, reach=reach, **self._counts())
 
@@ -207,4 +198,4 @@ class BoxTree:
         if not runtime.runs_on_cpu():
             subtrees = max(1, self.leaves // SUBTREES)
             roots = max(1, subtrees // SUBTREES)
-        return dict(count=self.held, leaves=self.leaves, subtrees=subtrees, roots=roots)
+        return dict(count=self.count, leaves=self.leaves, subtrees=subtrees, roots=roots)

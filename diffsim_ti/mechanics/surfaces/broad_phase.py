@@ -12,7 +12,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.surfaces.box_tree import MARGIN, BoxTree
+from diffsim_ti.mechanics.surfaces.box_tree import BoxTree
 from diffsim_ti.mechanics.surfaces.broad_phase_kernels import Piercing, Search
 from diffsim_ti.mechanics.surfaces.buffers import Buffers, Launches
 from diffsim_ti.mechanics.surfaces.list_kernels import ListKernels
@@ -52,8 +52,6 @@ class CandidatePairs:
         self.buffers = Buffers(self.launch, parallel)
         acting = kinematic.acting if has else surface  # on triangles
         self.trees = tuple(BoxTree(c, precision, parallel, self.launch) for c in (acting[:, None], triangles, edges))
-        self._acting, self._edges = acting, edges
-        self._bodies = surface[: len(surface) - kinematic.corners.count] if has else surface
         self.surface = runtime.upload(surface, ti.i32) if has else self.trees[0].corners
         if has:
             self.area_t, self.area_e = (runtime.upload(x, self.fp) for x in kinematic.areas)
@@ -101,9 +99,8 @@ class CandidatePairs:
     def build(self, rest, u, slot: int, reach: float) -> None:
         """Find all pairs nearer than `reach` [m] and their slacks at rest + u[slot]."""
         reach, scene, (v, t, e) = float(reach), SimpleNamespace(rest=rest, u=u), self.trees
-        near = self._near(rest, u, slot, reach)
-        for tree, those in zip(self.trees, near):
-            tree.refit((scene, self), slot, reach, those)
+        for tree in self.trees:
+            tree.refit((scene, self), slot, reach)
         partner_t = self._find(VERTEX_TRIANGLE, v, t, self.row_t, scene, slot, reach)
         partner_e = self._find(EDGE_EDGE, e, e, self.row_e, scene, slot, reach)
         self.num_vt, self.num_ee = (int(runtime.fetch(row, -1)) for row in (self.row_t, self.row_e))
@@ -117,19 +114,6 @@ class CandidatePairs:
         self.buffers.scan(self.row, self.num_surface)
         self.launch(self.lists.fill, list=self)(**corners)
 
-    def _near(self, rest, u, slot: int, reach: float) -> tuple:
-        """Which vertices that act on triangles, which triangles and which edges trees are to hold: all but what obstacles
-        have far from bodies. None: all."""
-        if self.kinematic is None:
-            return None, None, None
-        x = runtime.fetch(rest).astype(np.float64) + runtime.fetch(u, slot)
-        bodies, slack = x[self._bodies], runtime.fetch(self.slack).astype(np.float64).max(0)
-        wide = MARGIN * (reach + 2 * slack.sum()) + 1e-5 * np.abs(bodies).max()
-        low, high = bodies.min(0) - wide, bodies.max(0) + wide
-        beyond = np.concatenate([x < low, x > high], 1) @ (1 << np.arange(6))  # on which sides, a bit for each
-        a, b = beyond[self._edges].T
-        return np.flatnonzero(beyond[self._acting] == 0), None, np.flatnonzero((a & b) == 0)
-
     def first_piercing(self, rest, u, slot: int) -> tuple[int, int] | None:
         """(edge, triangle) of the surface that pass through each other, after a `build` at the same place; or None."""
         _, t, e = self.trees
@@ -137,7 +121,7 @@ class CandidatePairs:
         runtime.fill(pierced, -1)
         records = dict(scene=SimpleNamespace(rest=rest, u=u), mine=e, theirs=t, out=SimpleNamespace(pierced=pierced))
         first = 0 if self.meet else self.own
-        self.piercing.find.bind(**records)(slot=slot, count=e.held, their_count=t.held, leaves=t.leaves, first=first)
+        self.piercing.find.bind(**records)(slot=slot, count=e.count, their_count=t.count, leaves=t.leaves, first=first)
         found = runtime.fetch(pierced)[: e.count]
         worst = int(np.argmax(found >= 0))
         return (worst, int(found[worst])) if found[worst] >= 0 else None

@@ -7,7 +7,6 @@ surfaces apart. Vertices of no near pair keep what they had, bit by bit.
 """
 
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
 from math import fsum
 from types import SimpleNamespace
 
@@ -18,7 +17,8 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.buffers import whole
-from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSolver
+from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part
+from diffsim_ti.mechanics.surfaces.contact_pass import ContactPass
 from diffsim_ti.mechanics.surfaces.near_set import NearSet
 from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
 from diffsim_ti.mechanics.surfaces.part_kernels import TAKEN
@@ -33,45 +33,18 @@ PASSES = 1.5, 15  # like this one, that a list made for it should hold for, at l
 SHORTEST = 2.0**-14  # share of a pass
 
 
+class FarFromAll(Exception):
+    """A list asks for corners of obstacles that are not there, `more` [m] than its longest reach away."""
+
+    def __init__(self, more: float):
+        super().__init__(more)
+        self.more = more
+
+
 def moment_of(at: Passes) -> Moment:
     """Obstacles at the end of a pass, and where it begins."""
     schedule = at.ws.solver.schedule
     return Moment(schedule, at.j, schedule.end(at.j), schedule.begin(at.j))
-
-
-@dataclass
-class ContactPass:
-    """What was done in a recorded pass: to which nodes, from where, and the state that the drift had led to."""
-
-    near: NearPairs
-    numbers: np.ndarray  # of the pairs in the list
-    nodes: np.ndarray  # places among those of the stage
-    points: np.ndarray  # vertices of the surface
-    pairs: np.ndarray  # corners, which are such vertices, (pairs, 4)
-    rest: tuple  # of pairs: plane and weights at rest, which coefficient of friction
-    start: np.ndarray  # of all nodes, where there are sets
-    u: np.ndarray | None = None
-    v: np.ndarray | None = None
-    parts: list[Part] = field(default_factory=list)
-    e: np.ndarray | None = None  # what displacements and velocities gained
-    b: np.ndarray | None = None
-
-    @property
-    def solver(self) -> PartSolver:
-        return PartSolver(self.near)
-
-    def of(self, chosen: np.ndarray, start, u, v) -> "ContactPass":
-        """Of some of the pairs, in a pass between these states of all nodes."""
-        near = replace(self.near, **{x: getattr(self.near, x)[chosen] for x in ("corners", "edges", "scale")})
-        plane, weights, own = self.rest
-        own = SimpleNamespace(**{name: x[chosen] for name, x in vars(own).items()})
-        rest = plane[chosen], weights[chosen], own
-        given = near, self.numbers[chosen], self.nodes, self.points, self.pairs[chosen], rest
-        return ContactPass(*given, start if self.near.sets else start[self.nodes], u, v)
-
-    def vectors(self, x: np.ndarray) -> np.ndarray:
-        """Those of its nodes, from vectors of all nodes, and zeros of what stands for numbers of sets."""
-        return np.concatenate([x[self.nodes], np.zeros((sum(len(y.at) - len(y.here) for y in self.near.sets), 3))])
 
 
 class PairContact(Stage):
@@ -142,28 +115,39 @@ class PairContact(Stage):
 
     @contextmanager
     def do(self, at: Passes):
-        pairs, inner, u = self.pairs, self.inner, at.history.u
-        self._follow(at, AT_BEGIN)
-        if at.launch is None:
-            pairs.ensure(u, at.slot)
-        fine = self._fine(u, at.slot)
-        inner.forces(*fine, self.scratch)
-        corners = self.obstacles.displacements if self.obstacles else None
+        self.prepare(at, at.history.u, at.slot, anew=at.launch is None)
         if not at.stride:
-            copy_slot(u, at.slot, self.begin, 0)  # which the drift replaces
+            copy_slot(at.history.u, at.slot, self.begin, 0)  # which the drift replaces
         yield
-        self._follow(at, AT_STAGE)
+        self.finish(at)
+
+    def prepare(self, at: Passes, u, slot: int, anew: bool) -> None:
+        """A pass begins at u[slot]; anew: what was before says nothing of the list."""
+        self.follow(at, AT_BEGIN)
+        fine = self._fine(u, slot)
+        if anew:
+            self.inner.ensure(*fine)
+        self.inner.forces(*fine, self.scratch)
+        self.corners = self.obstacles.displacements if self.obstacles else None
+
+    def finish(self, at: Passes) -> None:
+        """It ends."""
+        self.follow(at, AT_STAGE)
         if at.stride:
             self.kept[at.end] = None
         try:
-            self._act(at, corners)
+            self._act(at, self.corners)
         except Tunnelling as error:
             raise at.ws.dated(error, at.j, at.num_passes) from None
 
-    def _follow(self, at: Passes, m: int) -> None:
+    def begin_of(self, at: Passes) -> tuple:
+        """Array and slot of the displacements where a pass begins."""
+        return (at.history.u, at.slot) if at.stride else (self.begin, 0)
+
+    def follow(self, at: Passes, m: int) -> None:
         """Obstacles are where a pass begins (AT_BEGIN), or at its end."""
         if self.obstacles:
-            self.pairs.follow(self.a.poses.value(self.a.rows["path"], moment_of(at)), m)
+            self.obstacles.follow(self.a.poses.value(self.a.rows["path"], moment_of(at)), m)
 
     def _fine(self, u, slot: int) -> tuple:
         return (u, slot) if self.pairs is self.inner else (self.pairs.fine(u, slot), 0)
@@ -181,7 +165,7 @@ class PairContact(Stage):
         stale, lost, any_near = self._look(*self._fine(history.u, at.end))
         now, acts = at.now if stale or any_near else None, False
         if now and now.alpha > 0:
-            before = (history.u, at.slot) if at.stride else (self.begin, 0)
+            before = self.begin_of(at)
             start = self._all(self.rows.get(*before), corners)
             u, v = self.rows.get(history.u, at.end), self.rows.get(history.v, at.end)
             u = self._all(u, self.obstacles.displacements if self.obstacles else None)
@@ -193,11 +177,13 @@ class PairContact(Stage):
                 needed = np.maximum(needed, 1.1 * inner.travel(moved - runtime.fetch(inner.before)))
                 self.rows.put(history.u, at.end, u[own])
                 self.rows.put(history.v, at.end, v)
-                self._follow(at, AT_BEGIN)
-                begin = self._fine(*before)
+                self.follow(at, AT_BEGIN)
+                begin, more = self._fine(*before), 2 * float(needed.max())
+                if self.obstacles and not self.pairs.is_covered(runtime.fetch_row(*before), more=more):
+                    raise FarFromAll(more)
                 inner.build(*begin, wanted=self._passes(needed) * needed, needed=needed)
                 inner.forces(*begin, self.scratch)
-                self._follow(at, AT_STAGE)
+                self.follow(at, AT_STAGE)
                 _, lost, any_near = self._look(*self._fine(history.u, at.end))
             if any_near:
                 one, lost = self._contact(at, now, start, u, v, lost)
@@ -339,7 +325,7 @@ class PairContact(Stage):
     def _numbers(self, one: ContactPass, now, changes=None) -> SimpleNamespace:
         """What parts read; changes: of it, as imaginary parts that are tiny."""
         a, own, near = self.a, one.rest[2], one.near
-        nodes, numbers = self.nodes[one.nodes], a.values.parameters.astype(float)
+        nodes, numbers = self.nodes[one.nodes], np.asarray(a.values.parameters, float)
         rest, mass, inverse_mass, radius = a.values.rest - a.origin, a.values.mass, self.inverse, 0.0
         if self.obstacles:
             corners = self.obstacles.corners
@@ -349,11 +335,12 @@ class PairContact(Stage):
         inverse_mass = np.append(inverse_mass, np.zeros(len(mass) - len(inverse_mass)))
         start, end, h_alpha, D = one.start, one.u if near.sets else one.u[one.nodes], now.alpha, one.rest[0][:, 3]
         if changes is not None:
-            numbers, rest, mass = numbers + changes.parameters, rest + changes.rest, mass + changes.mass
+            rest, mass = rest + changes.rest, mass + changes.mass
             start, end, h_alpha = start + changes.start, end + changes.end, h_alpha + changes.alpha
             radius = radius + changes.radius[own.contact]
             D = D + np.einsum("pd,pk,pkd->p", one.rest[0][:, :3], one.rest[1], changes.fine_rest[one.pairs])
-        k, W = own.area * numbers[own.stiffness], numbers[own.width]
+        of = lambda rows: numbers[rows] if changes is None else numbers[rows] + 1e-30j * changes.parameters[rows]  # noqa: E731
+        k, W = own.area * of(own.stiffness), of(own.width)
         half = 0.5 * D / W
         share = np.where(half.real < 1, half, 1)
         inverse, sets = np.where(inverse_mass[nodes] > 0, 1 / np.where(mass[nodes] > 0, mass[nodes], 1), 0), []
@@ -362,9 +349,9 @@ class PairContact(Stage):
             sets = self._factors(one, self._places(one, start, end, mass, rest))
             start, end = one.vectors(start), one.vectors(end)
             inverse = np.append(inverse, np.zeros(len(start) - len(inverse)))
-        mu, with_friction = np.zeros(len(one.pairs), numbers.dtype), own.mu >= 0
-        mu[with_friction] = numbers[own.mu[with_friction]]
-        speed = np.where(with_friction, numbers[own.speed], 1.0)
+        mu, with_friction = np.zeros(len(one.pairs), W.dtype), own.mu >= 0
+        mu[with_friction] = of(own.mu[with_friction])
+        speed = np.where(with_friction, of(own.speed), 1.0)
         rest = rest[one.points] if self.matrix is None else self.matrix[one.points] @ rest
         wall = mass[self.a.mesh.surface_vertices].mean()
         return SimpleNamespace(
@@ -408,7 +395,7 @@ class PairContact(Stage):
         i, h = int(ways.argmax()), now.h
         where = inner.part("vertex", surface[i : i + 1])
         inner.fresh = False
-        copy_slot(*((at.history.u, at.slot) if at.stride else (self.begin, 0)), at.ws.state.u, 0)
+        copy_slot(*self.begin_of(at), at.ws.state.u, 0)
         error = Tunnelling(
             f"contact of width {inner.width:.3g} m does not keep surfaces apart that move by {ways[i]:.3g} m in a substep "
             f"of {h:.3g} s, {ways[i] / h:.3g} m/s at {where}: take substeps of {0.25 * h:.3g} s"
@@ -429,7 +416,7 @@ class PairContact(Stage):
     @contextmanager
     def tangent(self, at: Passes):
         one, run, now = self.kept.get(at.end), at.run, at.now
-        self._follow(at, AT_STAGE)
+        self.follow(at, AT_STAGE)
         before = self.rows.get(run.u, 0) if one else None
         with self._alone(at, one):
             yield
@@ -448,7 +435,7 @@ class PairContact(Stage):
         first, last = self._all(before, at_begin), self._all(after, at_end)
         at_nodes = (lambda x: x) if one.near.sets else (lambda x: x[one.nodes])
         dots = SimpleNamespace(
-            parameters=tiny * parameters, rest=tiny * rest, mass=tiny * mass, radius=tiny * radius,
+            parameters=parameters, rest=tiny * rest, mass=tiny * mass, radius=tiny * radius,
             start=tiny * at_nodes(first), end=tiny * at_nodes(last), alpha=tiny * rate * now.alpha_by_rate,
             fine_rest=tiny * (rest if self.matrix is None else self.matrix @ rest),
         )  # fmt: skip
@@ -479,7 +466,7 @@ class PairContact(Stage):
             yield
             return
         run.complete()
-        self._follow(at, AT_STAGE)
+        self.follow(at, AT_STAGE)
         p, q = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         of = self._numbers(one, now)
         of.seeds = self._seeds(run.impulses, at, one)

@@ -10,10 +10,11 @@ class CurvedLaggedFriction:
     """As LaggedFriction, of nodes."""
 
     def __init__(self, pairs):
-        self.pairs, self.inner, self.C = pairs, pairs.inner.friction, pairs.matrix
+        self.pairs, self.inner, self.C, self.began = pairs, pairs.inner.friction, pairs.matrix, None
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, presses: bool) -> None:
         """With obstacles where the pass begins; their corners have x = g - v / per_gamma, g where forces are taken."""
+        self.began = u, x, per_gamma
         self.given, there = 0.0, self.C @ x
         if self.pairs.obstacles:
             obstacles, first = self.pairs.obstacles, self.pairs.finer.mesh.first
@@ -42,9 +43,6 @@ class CurvedLaggedFriction:
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
         return abs(self.C).T @ self.inner.sizes(self._fine(u))
-
-    def clear_sums(self) -> None:
-        """The finer surface has them."""
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """Those of points by squares of what nodes have of them."""

@@ -11,10 +11,12 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.curved_friction import CurvedLaggedFriction
-from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleCorners, ObstacleMotion, SurfaceWithObstacles
+from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
+from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleMotion, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.runtime import Kernel, kernels_of, vector_type
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 A = ti.template()
 ROWS = dict(start="ints", index="ints", weight="scalars")
@@ -23,15 +25,14 @@ ROWS = dict(start="ints", index="ints", weight="scalars")
 def pairs_of(kind: type, arrays, parallel: bool):
     """Pairs of a kind (surface_pairs.py, implicit_pairs.py), of a finer surface where faces are curved and smooth, and with
     the corners of obstacles; None where a scene has none."""
-    mesh, term = arrays.mesh, arrays.self_contact
-    corners = ObstacleCorners(arrays) if any(x.primitives is not None for x in arrays.contacts) else None
-    if not (term or corners):
+    mesh, has_corners = arrays.mesh, any(x.primitives is not None for x in arrays.contacts)
+    if not (arrays.self_contact or has_corners):
         return None
     cuts = cuts_of(mesh, arrays.width_of_pairs, arrays.bend)
-    surface = CollisionSurface(mesh, cuts) if cuts else mesh
-    if corners:
-        surface = SurfaceWithObstacles(surface, surface_edges(surface), corners, term)
-    return kind(arrays, parallel) if surface is mesh else CurvedPairs(kind, arrays, parallel, surface)
+    body = CollisionSurface(mesh, cuts) if cuts else mesh
+    if body is mesh and not has_corners:
+        return kind(arrays, parallel)
+    return CurvedPairs(kind, arrays, parallel, body, NearCorners(arrays, body) if has_corners else None)
 
 
 @dataclass(frozen=True)
@@ -129,24 +130,65 @@ class CurvedPairs:
     """As SurfacePairs or ImplicitPairs, for arrays of the nodes. Numbers of vertices in messages that the mesh does not have
     are those of the collision surface.
 
-    obstacles: where corners of obstacles are (ObstacleMotion), None without.
+    obstacles: where corners of obstacles are (ObstacleMotion), None without. nearby: which there are; `inner`, and all
+    that belongs to it, is made anew where others are near.
     """
 
-    def __init__(self, kind: type, arrays, parallel: bool, surface: "CollisionSurface | SurfaceWithObstacles"):
-        self.a, self.finer, self.matrix = arrays, FinerArrays(arrays, surface), surface.matrix
-        self.obstacles = ObstacleMotion(surface, arrays) if isinstance(surface, SurfaceWithObstacles) else None
-        self.inner = kind(self.finer, parallel)
-        self.kernels = kernels_of(Transfer, arrays.precision, parallel, self.obstacles is not None)
-        fp, vector, n = arrays.fp, arrays.vector, arrays.num_vertices
+    def __init__(self, kind: type, arrays, parallel: bool, body, nearby: NearCorners | None):
+        self.a, self.nearby, self._kind, self._body = arrays, nearby, kind, (body, nearby and surface_edges(body))
+        self.kernels = kernels_of(Transfer, arrays.precision, parallel, nearby is not None)
+        self._began, self._sums = None, None  # what a pass began with, in Newton's method; adjoints of who went
+        self._hold()
+
+    def _hold(self) -> None:
+        """Have the corners that are near."""
+        arrays, parallel, (surface, edges) = self.a, self.kernels.parallel, self._body
+        if self.nearby:
+            surface = SurfaceWithObstacles(surface, edges, self.nearby.corners, arrays.self_contact)
+        self.finer, self.matrix = FinerArrays(arrays, surface), surface.matrix
+        self.obstacles = ObstacleMotion(surface, arrays) if self.nearby else None
+        self.inner = self._kind(self.finer, parallel)
+        fp, vector = arrays.fp, arrays.vector
         self.down, self.up = _rows(surface.matrix, fp), _rows(surface.matrix.T.tocsr(), fp)
         of_corners = surface.matrix.T.tocsr()[arrays.mesh.surface_vertices][:, surface.surface_vertices]
         self.to_corners, self.num_corners = _rows(of_corners.tocsr(), fp), len(arrays.mesh.surface_vertices)
         self._u, self._w, self._blocks = (runtime.array(vector, k, surface.num_vertices) for k in (1, 1, 3))
-        self._row, self._rest_dot = runtime.array(vector, 1, n), runtime.array(vector, surface.num_vertices)
-        self.step, self.next = runtime.array(vector, 1, n), runtime.array(vector, 1, n)
+        self._rest_dot = runtime.array(vector, surface.num_vertices)
         # cleared where arrays of the list are others
         self._launch, self.launch = self.inner.list.launch, self.inner.launch
         self.friction = CurvedLaggedFriction(self) if self.inner.friction else None
+
+    # ---- what is near ------------------------------------------------------------------------------------------------
+
+    def cover(self, *places: np.ndarray, to=None, anew: bool = False, more: float = 0.0) -> None:
+        """Have all corners that are within reach of bodies at displacements of the nodes, and between them, while obstacles
+        are where they are, or go to rows of poses; anew: and few others; more: than the reach [m]."""
+        if self.is_covered(*places, to=to, anew=anew, more=more) or not self.nearby.take():
+            return
+        gone, obstacles, friction = self.inner, self.obstacles, self.friction
+        if self._sums:
+            self._sums = self.collect()
+        self._hold()
+        self.inner.contacts.load(self.a.values.parameters)
+        self.inner.checked_rest = gone.checked_rest
+        if self._sums:
+            self._clear()
+        self.obstacles.by_rows = obstacles.by_rows
+        if self._began:
+            u, ahead, rows = self._began
+            self.obstacles.follow(rows, AT_BEGIN)
+            self.inner.begin(self.spread(u), self.matrix @ ahead)
+            if friction and friction.began:
+                self.friction.begin(*friction.began)
+        self.obstacles.follow(obstacles.rows, obstacles.m)
+
+    def is_covered(self, *places: np.ndarray, to=None, anew: bool = False, more: float = 0.0) -> bool:
+        """Whether they are there; which, where not, `nearby` knows then."""
+        if not (self.nearby and self.nearby.many):
+            return True
+        at, reach = self.obstacles, self.inner.longest_reach + more
+        poses = [(at.rows, m) for m in ((AT_BEGIN, AT_STAGE) if anew else (at.m,))]
+        return self.nearby.has(places, poses + ([] if to is None else [(to, AT_STAGE)]), reach, anew)
 
     # ---- between nodes and points ------------------------------------------------------------------------------------
 
@@ -159,6 +201,12 @@ class CurvedPairs:
     def _fine(self, *what):
         self.launch([self._refining(*what)])
         return what[2]
+
+    def _covered(self, u, slot: int = 0):
+        """Displacements of the finer surface, from those of a slot, with all that is near."""
+        if self.nearby:
+            self.cover(runtime.fetch_row(u, slot))
+        return self.fine(u, slot)
 
     def fine(self, u, slot: int):
         """Displacements of the finer surface, from those of a slot."""
@@ -221,19 +269,29 @@ class CurvedPairs:
         return self.inner.builds
 
     def load(self, u) -> None:
-        self.inner.load(self.fine(u, 0))
+        self._began = None
+        if self.nearby:
+            self.nearby.load()
+            self.inner.contacts.load(self.a.values.parameters)
+        fine = self._covered(u)
+        self.inner.load(fine)
 
     def check_apart(self, u) -> None:
-        self.inner.check_apart(self.fine(u, 0))
+        fine = self._covered(u)
+        self.inner.check_apart(fine)
 
     def forget(self, u) -> None:
-        self.inner.forget(self.fine(u, 0))
+        self._began = None
+        fine = self._covered(u)
+        self.inner.forget(fine)
 
     def ensure(self, u, slot: int) -> None:
-        self.inner.ensure(self.fine(u, slot), 0)
+        fine = self._covered(u, slot)
+        self.inner.ensure(fine, 0)
 
     def look(self, u) -> tuple[float, float]:
-        return self.inner.look(self.fine(u, 0))
+        fine = self._covered(u)
+        return self.inner.look(fine)
 
     def unbind(self) -> None:
         self.inner.unbind()
@@ -255,9 +313,11 @@ class CurvedPairs:
         self._gather(out)
 
     def clear_sums(self) -> None:
+        self._sums = 0.0, 0.0
+        self._clear()
+
+    def _clear(self) -> None:
         self.inner.clear_sums()
-        if self.friction:
-            self.friction.clear_sums()
         if self.obstacles:
             self.obstacles.clear()
 
@@ -267,17 +327,22 @@ class CurvedPairs:
         self._add_corners()
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
-        numbers, rest = self.inner.collect()
-        return numbers + self.obstacles.by_parameters if self.obstacles else numbers, self.matrix.T @ rest
+        (numbers, rest), (of_gone, rest_of_gone) = self.inner.collect(), self._sums or (0.0, 0.0)
+        numbers = numbers + self.obstacles.by_parameters if self.obstacles else numbers
+        return numbers + of_gone, self.matrix.T @ rest + rest_of_gone
 
     # ---- in Newton's method ------------------------------------------------------------------------------------------
 
-    def begin(self, u: np.ndarray, ahead: np.ndarray | None = None) -> None:
-        runtime.fill(self.next, u[None])
-        self.inner.begin(self.spread(u), None if ahead is None else self.matrix @ ahead)
+    def begin(self, u: np.ndarray, ahead: np.ndarray) -> None:
+        self._began = None
+        self.cover(u, u + ahead, anew=True)
+        self.inner.begin(self.spread(u), self.matrix @ ahead)
+        if self.nearby:
+            self._began = u.copy(), ahead.copy(), self.obstacles.rows.copy()
 
     def place(self, u, on_way: bool = False) -> None:
-        self.inner.place(self.fine(u, 0), on_way)
+        fine = self.fine(u, 0) if on_way else self._covered(u)
+        self.inner.place(fine, on_way)
         self._gather(self.a.corner)
 
     def energies(self) -> np.ndarray:
@@ -294,12 +359,16 @@ class CurvedPairs:
         at = SimpleNamespace(source=self._blocks, target=out)
         self._launch(self.kernels.add_blocks, rows=self.up, at=at)(count=self.a.num_vertices)
 
-    def _step(self, step: np.ndarray, drift) -> np.ndarray:
-        return self.spread(step, 0.0 if drift is None else drift)
+    def _step(self, step: np.ndarray, to) -> np.ndarray:
+        return self.spread(
+            step, 0.0 if to is None else self.obstacles.displacements_at(to) - self.obstacles.displacements
+        )
 
-    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, drift=None, placed: bool = False) -> float:
-        """drift: displacements of corners of obstacles meanwhile; None: they stand still."""
-        return self.inner.safe_share(self.spread(u), self._step(step, drift), most, placed)
+    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, to=None, placed: bool = False) -> float:
+        """to: rows of poses to where obstacles go meanwhile; None: they stand still."""
+        inner = self.inner
+        self.cover(u, u + most * step, to=to)
+        return self.inner.safe_share(self.spread(u), self._step(step, to), most, placed and self.inner is inner)
 
     @property
     def met(self) -> tuple[tuple[int, ...], int | None] | None:
@@ -312,11 +381,13 @@ class CurvedPairs:
         obstacle = surface.corners.parts[numbers.max() - 1].k if numbers.any() else None
         return tuple(int(i) for i in dict.fromkeys(nodes.tolist())), obstacle
 
-    def is_collision_free(self, u: np.ndarray, step: np.ndarray, drift=None) -> bool:
-        return self.inner.is_collision_free(self.spread(u), self._step(step, drift))
+    def is_collision_free(self, u: np.ndarray, step: np.ndarray, to=None) -> bool:
+        self.cover(u, u + step, to=to)
+        return self.inner.is_collision_free(self.spread(u), self._step(step, to))
 
-    def check_end(self, u: np.ndarray, u_next: np.ndarray, drift=None) -> None:
-        self.inner.check_end(self.spread(u), self.spread(u) + self._step(u_next - u, drift))
+    def check_end(self, u: np.ndarray, u_next: np.ndarray, to=None) -> None:
+        self.cover(u, u_next, to=to)
+        self.inner.check_end(self.spread(u), self.spread(u) + self._step(u_next - u, to))
 
 
 def _rows(matrix, fp) -> SimpleNamespace:

@@ -20,23 +20,25 @@ from diffsim_ti.common import rotations
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE, TAU
+from diffsim_ti.terms.obstacles.primitives import Primitives
 
 
 class ObstacleCorners:
     """Of the obstacles of a scene that act by pairs. Rows of poses are those of state/obstacle_poses.py; parameters those of
-    the scene, as loaded."""
+    the scene, as loaded. some: of some obstacles, by number, what alone they are to have of their primitives."""
 
-    def __init__(self, arrays):
+    def __init__(self, arrays, some: dict[int, Primitives] | None = None):
         self.a, self.parts, end = arrays, [], 0
         for k, ((force, first, _), term) in enumerate(zip(arrays.obstacles, arrays.contacts)):
             if term.primitives is not None:
                 given = np.concatenate([np.ravel(x.value) for x in term.described if x.value is not None])
                 given = given - term.shift(np.zeros(3))
                 shape = np.r_[: force.count, force.size : force.size + term.num_extra]  # its numbers, from its first
-                corners, _ = term.primitives.at(given[shape])
+                primitives = (some or {}).get(k, term.primitives)
+                corners, _ = primitives.at(given[shape])
                 own = slice(end, end := end + len(corners))
                 part = dict(k=k, force=force, first=first, term=term, own=own, as_given=corners, shape=first + shape)
-                self.parts.append(SimpleNamespace(**part))
+                self.parts.append(SimpleNamespace(**part, primitives=primitives))
         self.count = end
 
     def _numbers(self, part, parameters: np.ndarray) -> np.ndarray:
@@ -44,35 +46,35 @@ class ObstacleCorners:
 
     def made(self, parameters: np.ndarray) -> np.ndarray:
         """Where corners are as obstacles were made, shape (count, 3) [m]."""
-        return np.concatenate([x.term.primitives.at(self._numbers(x, parameters))[0] for x in self.parts])
+        return np.concatenate([x.primitives.at(self._numbers(x, parameters))[0] for x in self.parts])
 
     def radii(self, parameters: np.ndarray) -> np.ndarray:
-        return np.array([x.term.primitives.at(self._numbers(x, parameters))[1] for x in self.parts])
+        return np.array([x.primitives.at(self._numbers(x, parameters))[1] for x in self.parts])
 
     # ---- poses -------------------------------------------------------------------------------------------------------
 
-    def _row(self, part, m: int) -> int | None:
+    def row_of(self, part, m: int) -> int | None:
         """The row of rotations, None of an obstacle that does not turn."""
         place = self.a.poses.place_of.get(part.k)
         return None if place is None else 3 * place + m
 
-    def _about(self, part, parameters: np.ndarray) -> np.ndarray:
+    def about(self, part, parameters: np.ndarray) -> np.ndarray:
         at = part.first + part.force.index.about
         return parameters[at : at + 3]
 
     def _arms(self, part, parameters, rows, m: int, p=None, c=None) -> np.ndarray:
         """R (p - c) of an obstacle that turns."""
-        p = part.term.primitives.at(self._numbers(part, parameters))[0] if p is None else p
-        c = self._about(part, parameters) if c is None else c
-        return rotations.turned(rotations.from_rodrigues(rows[self._row(part, m)]), p - c)
+        p = part.primitives.at(self._numbers(part, parameters))[0] if p is None else p
+        c = self.about(part, parameters) if c is None else c
+        return rotations.turned(rotations.from_rodrigues(rows[self.row_of(part, m)]), p - c)
 
     def at(self, parameters: np.ndarray, rows: np.ndarray, m: int = AT_STAGE) -> np.ndarray:
         """Where corners are at the rows number m of poses."""
         out = []
         for x in self.parts:
-            p, _ = x.term.primitives.at(self._numbers(x, parameters))
-            if self._row(x, m) is not None:
-                p = self._about(x, parameters) + self._arms(x, parameters, rows, m, p)
+            p, _ = x.primitives.at(self._numbers(x, parameters))
+            if self.row_of(x, m) is not None:
+                p = self.about(x, parameters) + self._arms(x, parameters, rows, m, p)
             out.append(p + rows[3 * x.k + m])
         return np.concatenate(out)
 
@@ -80,10 +82,10 @@ class ObstacleCorners:
         """Its change for those of the parameters and of the rows (rotations: theta)."""
         out = []
         for x in self.parts:
-            dp, _ = x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))
-            row = self._row(x, m)
+            dp, _ = x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))
+            row = self.row_of(x, m)
             if row is not None:
-                dc, arms = self._about(x, change), self._arms(x, parameters, rows, m)
+                dc, arms = self.about(x, change), self._arms(x, parameters, rows, m)
                 dp = dc + np.cross(rows_dot[row], arms) + self._arms(x, parameters, rows, m, dp, dc)
             out.append(dp + rows_dot[3 * x.k + m])
         return np.concatenate(out)
@@ -91,7 +93,7 @@ class ObstacleCorners:
     def at_vjp(self, parameters, rows, by_x, by_parameters, by_rows, m: int = AT_STAGE) -> None:
         """Adds the adjoints of the parameters and of the rows for that of where corners are."""
         for x in self.parts:
-            by, row = by_x[x.own], self._row(x, m)
+            by, row = by_x[x.own], self.row_of(x, m)
             by_rows[3 * x.k + m] += by.sum(0)
             if row is not None:
                 by_rows[row] += np.cross(self._arms(x, parameters, rows, m), by).sum(0)
@@ -100,13 +102,13 @@ class ObstacleCorners:
 
     def _unturned(self, part, by, rows, m, by_parameters, by_c) -> np.ndarray:
         """R^T by, less which by_c is the adjoint of the point c."""
-        by = rotations.turned(rotations.conjugate(rotations.from_rodrigues(rows[self._row(part, m)])), by)
+        by = rotations.turned(rotations.conjugate(rotations.from_rodrigues(rows[self.row_of(part, m)])), by)
         at = part.first + part.force.index.about
         by_parameters[at : at + 3] += by_c - by.sum(0)
         return by
 
     def _add_shape(self, part, parameters, by, by_parameters, by_radius: float = 0.0) -> None:
-        by_parameters[part.shape] += part.term.primitives.vjp(parameters[part.shape], by, by_radius)
+        by_parameters[part.shape] += part.primitives.vjp(parameters[part.shape], by, by_radius)
 
     def add_radii(self, parameters, by_radii: np.ndarray, by_parameters: np.ndarray) -> None:
         """Adds the adjoints of the parameters by those of the radii."""
@@ -115,14 +117,14 @@ class ObstacleCorners:
 
     def radii_jvp(self, parameters, change) -> np.ndarray:
         return np.array(
-            [x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[1] for x in self.parts]
+            [x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[1] for x in self.parts]
         )
 
     # ---- velocities, on the chord of a time tau from where the pass begins (mechanics/obstacles/turned.py) --------------
 
     def _chord(self, part, rows) -> tuple[np.ndarray, np.ndarray]:
         """(angular velocity, the turn of the chord)"""
-        row = self._row(part, 0)
+        row = self.row_of(part, 0)
         return rows[row + RATE], rows[row + TAU, 0] * rows[row + RATE]
 
     def velocity(self, parameters, rows) -> np.ndarray:
@@ -130,7 +132,7 @@ class ObstacleCorners:
         out = np.zeros((self.count, 3))
         for x in self.parts:
             out[x.own] = rows[3 * x.k + RATE]
-            if self._row(x, 0) is not None:
+            if self.row_of(x, 0) is not None:
                 omega, turn = self._chord(x, rows)
                 arms = self._arms(x, parameters, rows, AT_BEGIN)
                 out[x.own] += np.cross(omega, arms @ rotations.left_jacobian(turn).T)
@@ -139,22 +141,22 @@ class ObstacleCorners:
     def velocity_jvp(self, parameters, change, rows, rows_dot) -> np.ndarray:
         out = np.zeros((self.count, 3))
         for x in self.parts:
-            out[x.own], row = rows_dot[3 * x.k + RATE], self._row(x, AT_BEGIN)
+            out[x.own], row = rows_dot[3 * x.k + RATE], self.row_of(x, AT_BEGIN)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
                 J, dp = (
                     rotations.left_jacobian(turn),
-                    x.term.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[0],
+                    x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[0],
                 )
                 darms = np.cross(rows_dot[row], arms)
-                darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self._about(x, change))
+                darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self.about(x, change))
                 turned = rotations.turned(rotations.quaternion(turn), arms)
                 out[x.own] += np.cross(J @ rows_dot[row - AT_BEGIN + RATE], turned) + np.cross(omega, darms @ J.T)
         return out
 
     def velocity_vjp(self, parameters, rows, by_v, by_parameters, by_rows) -> None:
         for x in self.parts:
-            by, row = by_v[x.own], self._row(x, AT_BEGIN)
+            by, row = by_v[x.own], self.row_of(x, AT_BEGIN)
             by_rows[3 * x.k + RATE] += by.sum(0)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
@@ -181,7 +183,7 @@ class SurfaceWithObstacles:
         self.body, self.corners, self.surface_triangles = body, corners, body.surface_triangles
         self.surface_vertices = np.concatenate([body.surface_vertices, np.arange(n, self.num_vertices)])
         self.elements, self.tetrahedron_sets, self.vertex_sets = body.elements, body.tetrahedron_sets, body.vertex_sets
-        begin = [(n + x.own.start, x.term.primitives) for x in corners.parts]
+        begin = [(n + x.own.start, x.primitives) for x in corners.parts]
         self.edges = np.concatenate([edges, *(at + part.edges for at, part in begin)])
         points = np.concatenate([at + part.points for at, part in begin])
         self.own_edges, self.meeting_edges = len(edges), len(edges) if self_contact else 0

@@ -84,7 +84,7 @@ class SurfacePairs:
         self.farthest = runtime.array(self.kernels.fp, 1 + blocks + upper["number"])
         self.touched = runtime.array(ti.i32, n)
         self.fresh, self.age, self.builds = False, 0, 0
-        self._checked_rest = self._scratch = None
+        self.checked_rest = self._scratch = None
         self.has_friction = len(self.contacts.mu) > 0 if self.kinematic else term.has_friction
         self.friction = self.friction_kind(self) if self.friction_kind and self.has_friction else None
 
@@ -102,17 +102,24 @@ class SurfacePairs:
             return self.width
         return float(self.contacts.widths[0 if self.term else 1 :].min())
 
+    @property
+    def longest_reach(self) -> float:
+        """How far from bodies a list may have what is of obstacles [m], unless more is needed."""
+        least = self.least_slack * self.width
+        slacks = (max(least, 0.5 * (x * self.list.typical - self.width)) for x in self.largest_reach)
+        return self.width + 2 * (sum(slacks) + max(float(self.contacts.reach.max()) - self.width, 0.0))
+
     def load(self, u) -> None:
         """New values, the start at u: raise ValueError if the width is too large."""
         self.fresh = False
         if self.kinematic:
             self.contacts.load(self.a.values.parameters)
         checked = (self.a.values.rest, self.width)
-        if self._checked_rest is None or self._checked_rest[0] is not checked[0] or self._checked_rest[1] != checked[1]:
+        if self.checked_rest is None or self.checked_rest[0] is not checked[0] or self.checked_rest[1] != checked[1]:
             rest_state = runtime.array(self.kernels.vec4, 1, self.a.num_vertices)
             runtime.fill(rest_state, 0)
             self._check_rest(rest_state)
-            self._checked_rest = checked
+            self.checked_rest = checked
         self.build(u, 0)
 
     def _check_rest(self, u) -> None:
@@ -153,7 +160,7 @@ class SurfacePairs:
         self.age = 0
         self.build(u, 0)
 
-    obstacles = None  # whose corners are vertices of the surface: of pairs with vertices that no node gives
+    obstacles = nearby = None  # of pairs with vertices that no node gives (curved_pairs.py)
 
     def follow(self, rows: np.ndarray, m: int) -> None:
         """Obstacles are where rows of poses say."""

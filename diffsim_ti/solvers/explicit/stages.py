@@ -8,6 +8,7 @@ from diffsim_ti.mechanics.constraints import HeldRelations
 from diffsim_ti.mechanics.reduced.projected_sets import ProjectedAdjoint, ProjectedSets, ProjectedTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
+from diffsim_ti.mechanics.surfaces.nearby_contact import NearbyContact
 
 # stages whose tangents and adjoints have buffers: what makes these of them for a run
 BUFFERED = dict(
@@ -54,9 +55,17 @@ class KickDrift(Stage):
 
 def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
-    pairs = PairContact(ws.pairs, ws.solver.contact_damping, ws.scene.reduced.bodies) if ws.pairs else None
-    every = pairs, ws.volumes, ws.relations, ws.chambers, ws.projected, KickDrift()
+    contact = _contact_of(ws.pairs, ws.solver.contact_damping, ws.scene.reduced.bodies)
+    every = contact, ws.volumes, ws.relations, ws.chambers, ws.projected, KickDrift()
     return [stage for stage in every if stage]
+
+
+def _contact_of(pairs, damping: float, bodies) -> Stage | None:
+    """That of pairs."""
+    make = lambda: PairContact(pairs, damping, bodies)  # noqa: E731
+    if not pairs:
+        return None
+    return NearbyContact(make) if pairs.nearby and pairs.nearby.many else make()
 
 
 def with_buffers(way: str, stages: list[Stage], run) -> list:

@@ -127,7 +127,8 @@ class DeviceCG:
         kept, pairs = self._iterations.get((more, convex)), self.potential.pairs
         if kept is None or pairs:
             products = self.potential.multiplying(convex)
-            numbers, bound = [own for *_, own in products], (len(products), pairs and pairs.list.buffers.renewals)
+            numbers = [own for *_, own in products]
+            bound = len(products), pairs and (pairs.list, pairs.list.buffers.renewals)
             if kept is None or kept[2] != bound:
                 kept = self._iterations[more, convex] = self._iteration(more, convex, products), numbers, bound
             for own, now in zip(kept[1], numbers):

@@ -1,6 +1,6 @@
 """Triangles, segments and points as an obstacle, by the exact distance to what is nearest of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,8 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
 from diffsim_ti.materials.calculus.tensor import sum_of
-from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.mesh.geometry import cross
+from diffsim_ti.runtime import assign, at, let, traced, variable
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
 from diffsim_ti.terms.obstacles.primitives import Primitives
@@ -21,7 +22,10 @@ from diffsim_ti.terms.obstacles.surface_distance import ENERGY, FORCE, JVP, VJP,
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
 from diffsim_ti.terms.obstacles.turning import rotation_matrix
+from diffsim_ti.terms.pose import brought_back
 from diffsim_ti.terms.term import place
+
+MANY = 256  # edges and points that act by pairs, from which on a run has those near bodies alone
 
 
 class MeshObstacle(Obstacle):
@@ -41,10 +45,11 @@ class MeshObstacle(Obstacle):
     those of every `Obstacle`, whose other arguments it takes. Implicit steps sum the barrier over all that is nearer than
     its width, what triangles share once: in a crease, where two faces are equally near, both press, and force and energy
     have no kink. Over flat parts, and convex ones that are thicker than the width and have no edges sharper than 90 degrees,
-    it is the barrier of the distance; of thinner ones the far side presses, too. Explicit steps, friction and gaps go by
-    what is nearest. So friction in a crease is at most mu times what the nearest part presses with, and the energy of
-    contact that explicit runs report counts all parts. Where what is nearest goes from a face to an edge or a corner the
-    contact's stiffness jumps.
+    it is the barrier of the distance; of thinner ones the far side presses, too. Friction is that of each part by its own
+    normal force, so that a body which two sides of a groove with an angle 2 a between them hold slides along it against
+    mu N / sin(a). Explicit steps, their friction and gaps go by what is nearest, and the energy of contact that explicit
+    runs report counts all parts. Where what is nearest goes from a face to an edge or a corner the contact's stiffness
+    jumps.
     Raises ValueError for vertices or indices that do not fit.
     Li, Kaufman, Jiang 2023, Convergent Incremental Potential Contact, arXiv:2307.15908.
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
@@ -118,7 +123,33 @@ class MeshObstacle(Obstacle):
         out = super().settled(scene, density, initial_positions, initial_velocities)
         if "barrier_width" in self.left_to_scene:
             out._check_rounding()
+        sides = np.sort(scene.mesh.surface_triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+        out._edges_of_bodies = np.unique(sides, axis=0)
         return out
+
+    def check_start(self, positions, surface, offset=(0.0, 0.0, 0.0)):
+        super().check_start(positions, surface, offset)
+        made = brought_back(np.asarray(positions, np.float64), np.asarray(offset), self.about)
+        ways = (made - (self._base + self.values["mesh_position"]))[self._edges_of_bodies]
+        through = self._tree.first_through(ways)
+        if through is not None:
+            i, j = self._edges_of_bodies[through]
+            raise ValueError(
+                f"the body starts with a triangle of {self!r} in it, between its vertices {i} and {j}; move the body or "
+                "the obstacle"
+            )
+
+    def _refuse(self, gap, surface):
+        try:
+            super()._refuse(gap, surface)
+        except ValueError as error:
+            x, t = self._made.vertices - self._base, self._made.triangles[self._made.is_sided]
+            if np.einsum("ij,ij->", x[t[:, 0]], cross(x[t[:, 1]], x[t[:, 2]])) < 0:
+                raise ValueError(
+                    f"{error}; its triangles face inwards, so that it is a room: turn them round, triangles[:, ::-1], for a "
+                    "solid"
+                ) from None
+            raise
 
     def primitives_for(self, mesh, width):
         """Those of its edges and corners that faces of the body are wide enough to meet between their own corners."""
@@ -151,6 +182,15 @@ class MeshPrimitives(Primitives):
     def of(cls, points: np.ndarray, edges: np.ndarray, vertices: np.ndarray) -> "MeshPrimitives":
         own = np.union1d(edges, points)
         return cls(np.searchsorted(own, points), np.searchsorted(own, edges), own, vertices[own])
+
+    @property
+    def many(self):
+        return len(self.points) + len(self.edges) > MANY
+
+    def of_some(self, points: np.ndarray, edges: np.ndarray) -> "MeshPrimitives":
+        """These points and edges alone, by their places among all."""
+        out = self.of(self.points[points], self.edges[edges], self.vertices)
+        return replace(out, own=self.own[out.own])
 
     def at(self, p):
         vertices = p[4:].reshape(-1, 3)[self.own] if len(p) > 4 else self.vertices
@@ -186,11 +226,13 @@ class MeshForce(ObstacleForce):
         return SurfaceDistance(self.precision, self.table, self.sided)
 
     @traced
-    def distance_and_normal(self, g, p, X, u):
+    def distance_and_normal(self, g, p, X, u, seen=None):
+        """seen: of what of the surface, as `SurfaceDistance.seen` has it; without, of what is nearest."""
         local = [(x - c) + y for x, c, y in zip(X, p, u)]
-        point = let(ti.types.vector(3, self.fp)(*(k.value for k in local)))
-        begin = self.begin(g.parameters, g.first)
-        found, rows, s, t, *bent = (let(x) for x in self.nearest.look(point, begin, g.parameters))
+        if seen is None:
+            point = let(ti.types.vector(3, self.fp)(*(k.value for k in local)))
+            seen = self.nearest.look(point, self.begin(g.parameters, g.first), g.parameters)
+        found, rows, s, t, *bent = (let(x) for x in seen)
         n = [at(found, 1 + k) for k in range(3)]
         H = [[at(found, 4 + k) for k in row] for row in ((0, 1, 2), (1, 3, 4), (2, 4, 5))]
         by_d = [(x, lambda k=k: n[k]) for k, x in enumerate(local)]
@@ -256,6 +298,76 @@ class MeshForce(ObstacleForce):
         k = at(parameters, first + self.index.stiffness)
         own = ti.types.vector(3, self.fp)(*self.turned(X, [k * at(w, a) for a in range(3)], True))
         let(self.over_parts(VJP, parameters, first, X, u, let(own), parameters, sums, i))
+
+    # friction of implicit passes, by the normal force of each part, as both sides of a crease rub
+
+    @ti.func
+    def each_part(self, act: A, parameters: A, first, X, u):
+        """Call `act` with what `SurfaceDistance.seen` has of each part that presses, and its share."""
+        x, begin = self.place(parameters, first, X, u), self.begin(parameters, first)
+        reach, one = parameters[first + 3] + self.width(parameters, first), ti.cast(1, self.fp)
+        j, feature, s, t, inside = self.nearest.first_part(x, begin, parameters)
+        k, share, square, more = 6, one, one, True
+        while more:
+            if not inside:
+                j, k, feature, s, t, square, share = self.nearest.next_part(j, k, x, reach, begin, parameters)
+            more = j >= 0 and not inside
+            if j >= 0:
+                found, rows, s_of, t_of, g, h = self.nearest.seen(x, j, feature, s, t, begin, parameters)
+                if found[0] < 0 and not inside:
+                    found = 0 - found
+                act(found, rows, s_of, t_of, g, h, share)
+
+    @traced
+    def _sum_of_parts(self, of_one, count, parameters, first, felt):
+        """Sums over parts of the numbers that of_one(where the part is `felt`, its share) gives."""
+        total = [variable(ti.cast(0, self.fp)) for _ in range(count)]
+
+        @traced
+        def add(*seen):
+            there = *felt, lambda g, p, X, u: self.distance_and_normal(g, p[: self.count], X, u, seen[:-1])
+            for x, more in zip(total, of_one(there, seen[-1])):
+                assign(x, x + more)
+
+        self.each_part(add, parameters, first, *felt)
+        return total
+
+    @traced
+    def _sum_of_forces(self, one, parameters, first, felt, *more):
+        def of_one(there, share):
+            f = one(parameters, first, there, *more)
+            return [share * at(f, d) for d in range(3)]
+
+        return self.vector_of(self._sum_of_parts(of_one, 3, parameters, first, felt))
+
+    @traced
+    def dissipation(self, parameters, first, felt, v, v_obstacle):
+        one = super().dissipation
+        of_one = lambda there, share: [share * one(parameters, first, there, v, v_obstacle)]  # noqa: E731
+        return self._sum_of_parts(of_one, 1, parameters, first, felt)[0]
+
+    @traced
+    def friction_force(self, *given):
+        return self._sum_of_forces(super().friction_force, *given)
+
+    @traced
+    def friction_product(self, *given):
+        return self._sum_of_forces(super().friction_product, *given)
+
+    @traced
+    def friction_force_jvp(self, *given):
+        return self._sum_of_forces(super().friction_force_jvp, *given)
+
+    @traced
+    def friction_force_vjp(self, parameters, first, felt, v, v_obstacle, w, sums, i):
+        one, count = super().friction_force_vjp, 6 if self.turns else 3
+
+        def of_one(there, share):
+            own = self.vector_of([share * at(w, d) for d in range(3)])
+            by_place, *others = one(parameters, first, there, v, v_obstacle, own, sums, i)
+            return [at(by, d) for by, k in zip((by_place, *others), (count, 3, 3)) for d in range(k)]
+
+        return self.parted(self._sum_of_parts(of_one, count + 6, parameters, first, felt), count)
 
     @ti.func
     def reached(self, parameters: ti.template(), first, X, u, move, d, approach):

@@ -271,7 +271,7 @@ class Obstacle(Term):
     def _refuse(self, gap: np.ndarray, surface: np.ndarray) -> None:
         inside = np.flatnonzero(gap <= 0)
         deepest = inside[np.argsort(gap[inside], kind="stable")][:5]
-        named = ", ".join(f"vertex {surface[k]} by {-gap[k]:.3g} m" for k in deepest)
+        named = ", ".join(f"vertex {surface[k]} by {0.0 - gap[k]:.3g} m" for k in deepest)
         raise ValueError(
             f"the body starts on or in {self!r}: {named} ({len(inside)} vertices); move the body or the obstacle"
         )

@@ -155,9 +155,7 @@ class ObstacleForce(VertexForce):
         g, p, _, d, n = self.record(parameters, first, X, u)
         leaves = [*p[: self.count], *p[self.size :]]
         adjoints = g.reverse([(x, let(at(adjoint, k))) for k, x in enumerate([*n, d])], leaves)
-        for k, (leaf, by) in enumerate(zip(leaves, adjoints)):
-            row = getattr(leaf, "row", first + k)
-            assign(at(sums, row, i), at(sums, row, i) + by)
+        self.add_numbers(first, leaves, adjoints, sums, i)
 
     @ti.func
     def width(self, parameters: ti.template(), first):
@@ -295,7 +293,7 @@ class ObstacleForce(VertexForce):
         return (*self.parted(adjoints, len(moved)), adjoints[len(moved) + 6], by)
 
     # ---- friction as a force of implicit passes, at the velocity v; felt: (X, u), the place where N and n are those of the
-    # barrier ------------------------------------------------------------------------------------------------------------
+    # barrier, and where they are not those of `distance_and_normal`, what `record` takes them from -------------------------
 
     @traced
     def _record_friction_force(self, parameters, first, felt, v, v_obstacle):
@@ -338,12 +336,20 @@ class ObstacleForce(VertexForce):
         return self.vector_of(g.forward(dots, f))
 
     @traced
-    def friction_force_vjp(self, parameters, first, felt, v, v_obstacle, w):
-        """(adjoints of u, v and the obstacle's velocity as vectors, and of the obstacle's numbers, a tuple) for the
-        adjoint w of the force."""
+    def friction_force_vjp(self, parameters, first, felt, v, v_obstacle, w, sums, i):
+        """Adjoints of u, v and the obstacle's velocity as vectors for the adjoint w of the force; adds to sums[.., i] those
+        of the obstacle's numbers."""
         g, p, moved, speed, obstacle, f = self._with_friction(parameters, first, felt, v, v_obstacle)
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *obstacle, *p])
-        return (*self.parted(adjoints, len(moved)), (*adjoints[len(moved) + 6 :], *self.rows_of(p)))
+        self.add_numbers(first, p, adjoints[len(moved) + 6 :], sums, i)
+        return self.parted(adjoints, len(moved))
+
+    @traced
+    def add_numbers(self, first, leaves, adjoints, sums, i):
+        """Add to sums[.., i] the adjoints of the obstacle's numbers, from the first on, and of corners where they stand."""
+        for k, (leaf, by) in enumerate(zip(leaves, adjoints)):
+            row = getattr(leaf, "row", first + k)
+            assign(at(sums, row, i), at(sums, row, i) + by)
 
     @traced
     def parted(self, adjoints, count):

@@ -21,6 +21,7 @@ class Primitives:
     edges: np.ndarray
 
     whole = False  # whether they are all of the obstacle, so that nothing of it acts by its distance alone
+    many = False  # whether they are so many that a run has those near bodies alone, by `of_some`
 
     def at(self, p: np.ndarray) -> tuple[np.ndarray, float]:
         raise NotImplementedError

@@ -216,57 +216,77 @@ class SurfaceDistance:
         return (feature == 0 and away.dot(n) < 0) or (feature > 0 and self.sign(m, feature, away, parameters) < 0)
 
     @ti.func
+    def first_part(self, x, begin, parameters: A):
+        """(primitive, feature, s, t, whether it is alone): what is nearest to a place that has got inside; else -1, behind
+        which `next_part` goes on."""
+        j, feature, s, t, inside = -1, 0, ti.cast(0, self.fp), ti.cast(0, self.fp), False
+        if ti.static(self.sided):
+            j, feature, s, t = self.find(x, begin, parameters)
+            inside = self.has_inside(j, parameters) and self.is_inside(x, j, feature, s, t, begin, parameters)
+            if not inside:
+                j = -1
+        return j, feature, s, t, inside
+
+    @ti.func
+    def next_part(self, j, k, x, reach, begin, parameters: A):
+        """(primitive, number of its part, feature, s, t, squared distance, SurfaceMesh.shares) of what comes behind part k
+        of primitive j within reach of x and counts; primitive -1: nothing."""
+        zero, found = ti.cast(0, self.fp), False
+        feature, s, t, share, square = 0, zero, zero, zero, zero
+        while not found:
+            k += 1
+            if j < 0 or k == 7:
+                j, k = self.following(j, x, reach, parameters), 0
+            found = j < 0
+            if not found:
+                share = parameters[self.table + self.number(2, parameters) + self.stride * j + 3 + k]
+                if k == 0 or share != 0:
+                    feature, s, t, square = self.part(j, k, x, begin, parameters)
+                    found = share != 0 and square < reach * reach
+                    if k == 0 and not square < reach * reach:
+                        k = 6  # no part of it is nearer
+        return j, k, feature, s, t, square, share
+
+    @ti.func
     def over_parts(self, what: A, x, w, radius, width, begin, parameters: A, dot: A, sums: A, i):
         """The sum over all that is within reach, with SurfaceMesh.shares, or at a place that has got inside what is nearest
         alone; what: ENERGY; FORCE, `pushed`; JVP, the change of f for changes `dot` of all parameters, by corners; VJP adds
         to sums[.., i] for the adjoint w of f."""
         total, reach, zero, one = ti.Vector.zero(self.fp, 16), radius + width, ti.cast(0, self.fp), ti.cast(1, self.fp)
-        j, feature, s, t, share, square, inside = -1, 0, zero, zero, one, zero, False
-        if ti.static(self.sided):
-            j, feature, s, t = self.find(x, begin, parameters)
-            inside = self.has_inside(j, parameters) and self.is_inside(x, j, feature, s, t, begin, parameters)
-        if not inside:
-            j = self.following(-1, x, reach, parameters)
-        while j >= 0:
-            k = 0
-            while k < 7:
-                if not inside:
-                    share = parameters[self.table + self.number(2, parameters) + self.stride * j + 3 + k]
-                if k == 0 or share != 0:
-                    feature, s, t, square = self.part(j, k, x, begin, parameters)
-                if (inside or square < reach * reach) and share != 0:
-                    if ti.static(what == ENERGY):
-                        y = ((zero - ti.sqrt(square) if inside else ti.sqrt(square)) - radius) / width
-                        total[0] += share * width * width * barrier.value(y, self.fp)
+        j, feature, s, t, inside = self.first_part(x, begin, parameters)
+        k, share, square, more = 6, one, zero, True
+        while more:
+            if not inside:
+                j, k, feature, s, t, square, share = self.next_part(j, k, x, reach, begin, parameters)
+            more = j >= 0 and not inside
+            if j >= 0:
+                if ti.static(what == ENERGY):
+                    d = ti.sqrt(square)
+                    if inside:
+                        d = self.seen(x, j, feature, s, t, begin, parameters)[0][0]
+                    total[0] += share * width * width * barrier.value((d - radius) / width, self.fp)
+                else:
+                    by, rows, s_of, t_of, g, h = self.pushed(
+                        x, j, feature, s, t, share, inside, radius, width, begin, parameters
+                    )
+                    if ti.static(what == FORCE):
+                        total += by
                     else:
-                        more, rows, s_of, t_of, g, h = self.pushed(
-                            x, j, feature, s, t, share, inside, radius, width, begin, parameters
-                        )
-                        if ti.static(what == FORCE):
-                            total += more
-                        else:
-                            f, turn = self.vec3(more[1], more[2], more[3]), 0 - g - h
-                            for c in ti.static(range(3)):
-                                weight = (one - s_of - t_of, s_of, t_of)[c]
-                                if ti.static(c > 0):
-                                    turn = (g, h)[c - 1]
-                                if ti.static(what == JVP):
-                                    dy = self.vector(rows[c], dot)
-                                    change = self.symmetric(more, dy)
-                                    for a in ti.static(range(3)):
-                                        total[1 + a] += 0 - weight * change[a] - turn[a] * f.dot(dy)
-                                else:
-                                    Hw = self.symmetric(more, w)
-                                    for a in ti.static(range(3)):
-                                        by = 0 - weight * Hw[a] - f[a] * turn.dot(w)
-                                        sums[rows[c] + a, i] = sums[rows[c] + a, i] + by
-                k += 1
-                if inside or (k == 1 and not square < reach * reach):
-                    k = 7  # no part of it is nearer
-            if inside:
-                j = -1
-            else:
-                j = self.following(j, x, reach, parameters)
+                        f, turn = self.vec3(by[1], by[2], by[3]), 0 - g - h
+                        for c in ti.static(range(3)):
+                            weight = (one - s_of - t_of, s_of, t_of)[c]
+                            if ti.static(c > 0):
+                                turn = (g, h)[c - 1]
+                            if ti.static(what == JVP):
+                                dy = self.vector(rows[c], dot)
+                                change = self.symmetric(by, dy)
+                                for a in ti.static(range(3)):
+                                    total[1 + a] += 0 - weight * change[a] - turn[a] * f.dot(dy)
+                            else:
+                                Hw = self.symmetric(by, w)
+                                for a in ti.static(range(3)):
+                                    by_corner = 0 - weight * Hw[a] - f[a] * turn.dot(w)
+                                    sums[rows[c] + a, i] = sums[rows[c] + a, i] + by_corner
         return total
 
     @ti.func

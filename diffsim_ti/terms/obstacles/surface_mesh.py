@@ -29,8 +29,11 @@ class SurfaceMesh:
     def checked(cls, owner: str, vertices, triangles, segments, points) -> "SurfaceMesh":
         """Of what a user gives; where nothing names vertices, all of them are points. Raises ValueError."""
         vertices = numbers(f"{owner}: vertices", vertices)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices) or not np.all(np.isfinite(vertices)):
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
             raise ValueError(f"{owner}: vertices must be finite, of shape (k, 3), got {shown(vertices)}")
+        if not np.all(np.isfinite(vertices)):
+            k = int(np.flatnonzero(~np.isfinite(vertices).all(1))[0])
+            raise ValueError(f"{owner}: vertices must be finite, of shape (k, 3), got {vertices[k]} of vertex {k}")
         if triangles is None and segments is None and points is None:
             points = np.arange(len(vertices))
         parts = dict(triangles=triangles, segments=segments, points=points)
@@ -44,6 +47,7 @@ class SurfaceMesh:
                 outside = part.min() if part.min() < 0 else part.max()
                 raise ValueError(
                     f"{owner}: {name} must name vertices by index, 0 to {len(vertices) - 1}, got {outside}"
+                    + "; these count from 1: subtract 1" * bool(part.min() == 1 and outside == len(vertices))
                 )
             parts[name] = part
         if not any(len(part) for part in parts.values()):

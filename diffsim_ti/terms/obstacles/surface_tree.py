@@ -150,6 +150,30 @@ class SurfaceTree:
             who, at, square = who[near], at[near], square[near]
         return best
 
+    def first_through(self, ways: np.ndarray) -> int | None:
+        """Number of the first of straight ways, shape (k, 2, 3), that leads through a triangle; None where none does."""
+        low, high, who, at = ways.min(1), ways.max(1), np.arange(len(ways)), np.ones(len(ways), np.int64)
+        while True:
+            box = self.boxes[at]
+            meets = ((box[:, :3] <= high[who]) & (box[:, 3:] >= low[who])).all(1)
+            who, at = who[meets], at[meets]
+            if not at.size or at[0] >= self.leaves:
+                break
+            who, at = np.repeat(who, 2), (2 * at[:, None] + [0, 1]).ravel()
+        m = np.minimum((at - self.leaves)[:, None] * GROUP + np.arange(GROUP), self.count - 1).ravel()
+        who, dot = np.repeat(who, GROUP), lambda a, b: np.einsum("ij,ij->i", a, b)
+        (p, q), (a, b, c) = np.moveaxis(ways[who], 1, 0), np.moveaxis(self.x[self.corners[m]], 1, 0)
+        normal = cross(b - a, c - a)
+        before, after = dot(p - a, normal), dot(q - a, normal)
+        y = (
+            p
+            - a
+            + np.divide(before, before - after, out=np.zeros_like(before), where=before != after)[:, None] * (q - p)
+        )
+        s, t = dot(cross(y, c - a), normal), dot(cross(b - a, y), normal)
+        through = (before * after < 0) & (s >= 0) & (t >= 0) & (s + t <= dot(normal, normal))
+        return int(who[through].min()) if through.any() else None
+
     def _squares(self, places, who, nodes) -> np.ndarray:
         box, x = self.boxes[nodes], places[who]
         gap = np.maximum(np.maximum(box[:, :3] - x, x - box[:, 3:]), 0)
