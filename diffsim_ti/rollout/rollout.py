@@ -341,7 +341,7 @@ class Rollout(metaclass=Public):
 
         The run's states are put on the finer mesh. Forces that are out of balance there, times the adjoint of the number,
         are its error to first order, and say the share of each tetrahedron; where that is more than a fifth of how far the
-        number moved, or less than a fourth of what the shares are by size, or it is not linear in places, or parts are in
+        number moved, or less than an eighth of what the shares are by size, or it is not linear in places, or parts are in
         contact, the finer mesh is solved. So it is for explicit steps and for chambers that hold their volume, where shares
         are by volume alone. Steps of half the length say what steps cost.
         Raises ValueError for what a finer mesh cannot have.
