@@ -9,12 +9,14 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from example_files import example
 
 import diffsim_ti as ds
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.study import PROBLEMS, Problem, chart, charts, pareto_front, problem, problems, recommend
 from diffsim_ti.study.alternatives import stiff_sets
 from diffsim_ti.study.elements import ElementTrials, halved_grid
+from diffsim_ti.study.quantity import Quantity
 from diffsim_ti.study.work_precision import Point, choose_substeps, make_rollout, reference, run
 
 EXPLICIT = [kind for kind in SOLVERS if kind.explicit]
@@ -258,7 +260,14 @@ def test_advice_names_patches_where_tetrahedra_lock(bulk_modulus, says):
 
 
 @pytest.mark.parametrize(
-    "wrong, says", [(dict(duration=0.0), "duration"), (dict(tolerance=2.0), "tolerance"), (dict(memory=-1.0), "memory")]
+    "wrong, says",
+    [
+        (dict(duration=-1.0), "or 0 for an equilibrium"),
+        (dict(weights=1.0), "pass output="),
+        (dict(output="end"), "output must be an output"),
+        (dict(tolerance=2.0), "tolerance"),
+        (dict(memory=-1.0), "memory"),
+    ],
 )
 def test_advice_refuses_what_is_no_question(wrong, says):
     scene, duration, tolerance = limited_displacement("drop")
@@ -302,6 +311,20 @@ def test_advice_compares_elements_of_the_mesh():
         names.append(advice.element)
         assert "elements: " in str(advice) and "linear error" in str(advice)
     assert all(name.startswith("quadratic") for name in names)
+
+
+def test_advice_on_a_number_is_by_its_error_bar_where_it_has_one():
+    """A thick plate's equilibrium: the bar of ten nodes against the closed form."""
+    rollout, _, down, exact = example("benchmarks/error_bars").thick_plate(2, 2)
+    scene, middle = rollout.scene, ds.MaterialPoints([[5.0, 5.0, 0.5]], name="middle")
+    (trial,) = ElementTrials(scene, 0.0, 1, 60.0, None, Quantity(middle, down))._by_bars({"quadratic": scene})
+    y = rollout.forward()["middle"][:, 0, 2]
+    assert trial.bar and trial.error == pytest.approx(abs((y[-1] - exact) / (exact - y[0])), rel=0.1)
+    each = ElementTrials(scene, 0.0, 1, 60.0, None, Quantity(ds.Stress(at="vertices"), np.ones((3, 3))))
+    assert not each._by_bars({"quadratic": scene}) and "runs of the finest elements were" in each.notes[0]
+    advice = recommend(scene, 0.0, 0.4, gradients=False, output=middle, weights=down, elements=False)
+    assert advice.solver is ds.StaticSolver and advice.error < 1e-6 and "of the change of middle" in str(advice)
+    assert advice.rollout(scene, outputs=middle).forward()["middle"][-1, 0, 2] == pytest.approx(y[-1], rel=1e-6)
 
 
 def test_ten_nodes_are_tried_on_half_the_cells():

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from diffsim_ti.rollout import Frames, Rollout
 
 LARGE = 0.2  # of the number's change: beyond it an estimate to first order gives way to the solution that it is about
+CANCELS = 8.0  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
+FELT = 1e-6  # of the number's change: what is less is left over by solvers
+LEAST = 0.7  # of the true error: what estimates were on problems with known answers (examples/benchmarks/error_bars.py)
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
 PER_VERTEX = ("positions", "velocities", "displacements")  # outputs that count vertices, of which a finer mesh has more
 
@@ -35,7 +38,8 @@ class Accuracy(metaclass=Public):
         from that of the first frame.
     mesh: what the mesh costs; the number of elements of ten nodes, or of halved edges, is taken for the truth.
     step: what steps of this length cost (zero of equilibria). solver: what the solver's tolerance leaves.
-    rounding: what rounding may cost: of float32 the distance from float64, of float64 a bound without sign.
+    rounding: what rounding may cost: of float32 the distance from float64, of float64 a bound without sign; of explicit
+        steps as if each rounded the number.
     shares: of `mesh` by tetrahedron; their sum is `mesh`. `save_picture(path, mesh, positions, accuracy.shares)` shows them.
     by: "adjoint", to first order from residuals and adjoint on the finer mesh; "solution", of that mesh.
     cost: seconds of the run itself and of the finer mesh; unknowns of both.
@@ -63,8 +67,9 @@ class Accuracy(metaclass=Public):
 
     @property
     def bar(self) -> float:
-        """Size of the error: that of `error` and rounding."""
-        return abs(self.error) + abs(self.rounding)
+        """How far the truth may be from the value: |mesh + step| / 0.7 + |solver| + |rounding|, for estimates were at least
+        0.7 times the error wherever this was known."""
+        return abs(self.mesh + self.step) / LEAST + abs(self.solver) + abs(self.rounding)
 
     @property
     def corrected(self) -> float:
@@ -73,14 +78,14 @@ class Accuracy(metaclass=Public):
 
     @property
     def relative(self) -> float:
-        """The bar over the size of the number's change."""
-        return self.bar / max(self.size, np.finfo(float).tiny)
+        """Size of the error, with rounding, over that of the number's change."""
+        return (abs(self.error) + abs(self.rounding)) / max(self.size, np.finfo(float).tiny)
 
     def __str__(self) -> str:
         cost = self.cost
         lines = [
-            f"{self.output}: {self.value:.6g}, off by {self.error:+.2g} ({self.relative:.2g} of its change); corrected "
-            f"{self.corrected:.6g}",
+            f"{self.output}: {self.value:.6g}, bar {self.bar:.2g}, off by {self.error:+.2g} ({self.relative:.2g} of its "
+            f"change); corrected {self.corrected:.6g}",
             f"  mesh {self.mesh:+.2g} by the {self.by} on {cost['finer unknowns']} unknowns in {cost['finer']:.2g} s (the "
             f"run: {cost['unknowns']} in {cost['run']:.2g} s)",
             f"  step {self.step:+.2g}, solver {self.solver:+.2g}, rounding {self.rounding:.2g}",
@@ -163,15 +168,6 @@ def estimated(
     rollout: "Rollout", number: Number, finer: Callable | None, values: dict, given: list | None = None
 ) -> tuple[Accuracy, Replay]:
     """(the accuracy of a number, the run that it is of, in float64); given: displacements of each pass to begin with."""
-    if rollout.solver.explicit:
-        raise ValueError(
-            f"accuracy is of equilibria and implicit steps, not of {rollout.solver!r}: take StaticSolver or BDF2Solver"
-        )
-    if rollout.scene.has_multipliers or rollout.scene.reduced:
-        raise ValueError(
-            "accuracy does not support what is held exactly (volumes, relations), and vertices that move by few numbers or "
-            "are tied: compare runs on two meshes instead"
-        )
     begin = time.perf_counter()
     value, own, frames = _run(rollout, number, values, given)
     seconds, begin = time.perf_counter() - begin, time.perf_counter()
@@ -223,40 +219,49 @@ def on_finer_mesh(rollout: "Rollout", finer: Callable, values: dict, **solver) -
 
 def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer: Callable) -> tuple:
     """(error of the mesh, of the solver's tolerance, shares of the first by tetrahedron, how it was found, other numbers)"""
-    tolerance = max(0.01 * own.rollout.solver.tolerance, 1e-12)  # so that its own is not felt
-    fine, there, P, parents = on_finer_mesh(own.rollout, finer, values, tolerance=tolerance)
+    scene, solver, tight = own.rollout.scene, own.rollout.solver, {}
+    if not solver.explicit:
+        tight = dict(tolerance=max(0.01 * solver.tolerance, 1e-12))  # so that its own is not felt
+    fine, there, P, parents = on_finer_mesh(own.rollout, finer, values, **tight)
     value, seed = number.of(frames)
-    own.rollout.vjp(frames, **{number.output: seed})
+    n, mesh, eps = scene.mesh.num_vertices, fine.scene.mesh, np.finfo(float).eps
     replay = Replay(fine, [P @ u for u in own.each("places")])
-    carried_value, linear = value, number.linear
-    try:
-        at = fine.forward(**there)
-        carried_value, seed = number.of(at)
-        fine.vjp(at, **{number.output: seed})
-    except FloatingPointError:  # no state of the finer mesh, such as one in an obstacle, or beyond a limit point
-        replay.residuals, linear = {}, False
-    placed = bool(replay.residuals)
-    n, mesh, eps = own.rollout.scene.mesh.num_vertices, fine.scene.mesh, np.finfo(float).eps
-    nodal, of_solver, rounding = np.zeros(mesh.num_vertices), own.estimate(), eps * abs(value)
-    of_own = (own.each(kind) for kind in ("residuals", "weights", "sizes"))
-    for R, z, R_own, z_own, sizes in zip(replay.each("residuals"), replay.each("weights"), *of_own):
-        nodal += (R * (z - P @ z_own)).sum(1)
-        nodal[:n] += ((P.T @ R - R_own) * z_own).sum(1)
-        rounding += eps * float((np.reshape(sizes, (n, -1)) * np.abs(z_own)).sum())
+    nodal, rounding, carried_value, linear = np.zeros(mesh.num_vertices), eps * abs(value), value, number.linear
+    unplaced = ""
+    if solver.explicit or scene.holds_volumes:  # of whose equations `Replay` has no residual, or only a part
+        unplaced = "explicit steps and held volumes have no residual by vertices on the finer mesh"
+        rounding, linear, of_solver = rounding * own.rollout.sweep.num_passes, False, 0.0
+        if tight:
+            of_solver = number.of(own.rollout.on(solver.for_scene(scene, **tight)).forward(**values))[0] - value
+    else:
+        own.rollout.vjp(frames, **{number.output: seed})
+        try:
+            at = fine.forward(**there)
+            carried_value, seed = number.of(at)
+            fine.vjp(at, **{number.output: seed})
+        except FloatingPointError:  # no state of the finer mesh, such as one in an obstacle, or beyond a limit point
+            replay.residuals, linear = {}, False
+            unplaced = "states of the run are none of the finer mesh, or have no adjoint there"
+        of_solver, of_own = own.estimate(), (own.each(kind) for kind in ("residuals", "weights", "sizes"))
+        for R, z, R_own, z_own, sizes in zip(replay.each("residuals"), replay.each("weights"), *of_own):
+            nodal += (R * (z - P @ z_own)).sum(1)
+            nodal[:n] += ((P.T @ R - R_own) * z_own).sum(1)
+            rounding += eps * float((np.reshape(sizes, (n, -1)) * np.abs(z_own)).sum())
     total = value - carried_value - nodal.sum() - of_solver
     by, exact = "adjoint", value - total
-    contact = bool(own.rollout.scene.obstacles or own.rollout.scene.term(SelfContact))
+    contact = bool(scene.obstacles or scene.term(SelfContact))
     size = abs(exact - number.start(frames)) or abs(exact)
-    if contact or not linear or not abs(total) <= LARGE * size:
+    shares = _by_element(mesh, -nodal, parents, scene.mesh.num_tetrahedra)
+    sizes = np.abs(shares) if shares.any() else scene.mesh.volumes
+    cancels = CANCELS * abs(total) < np.abs(shares).sum() > FELT * size  # terms of second order may be as large
+    if contact or cancels or not linear or not abs(total) <= LARGE * size:
         by = "solution"
         replay.solves = True
         exact = number.of(fine.forward(**there))[0]
         total = value - exact
     error = total + of_solver
-    shares = _by_element(mesh, -nodal, parents, own.rollout.scene.mesh.num_tetrahedra)
-    sizes = np.abs(shares) if shares.any() else own.rollout.scene.mesh.volumes
     shares = shares + (error - shares.sum()) * sizes / sizes.sum()  # what is of no place, and not of first order
-    known = dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact, placed=placed)
+    known = dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact, unplaced=unplaced)
     return error, -of_solver, shares, by, known
 
 
@@ -286,17 +291,15 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
     """What may make an estimate of the mesh's error wrong, in words."""
     notes, sizes = [], np.sort(np.abs(found.shares))[::-1]
     few = max(1, int(FEW * len(sizes)))
-    matters = abs(found.mesh) > 1e-6 * found.size
+    matters = abs(found.mesh) > FELT * found.size
     if matters and len(sizes) >= 1 / FEW and sizes[:few].sum() > MOST * sizes.sum():
         notes.append(
             f"{few} of {len(sizes)} tetrahedra have more than half of the error: near what is singular, such as corners "
             "that point inwards and ends of supports, errors fall slowly, and this one may be larger than estimated: refine "
             "there, as ds.refine does"
         )
-    if not exact["placed"]:
-        notes.append(
-            "states of the run are none of the finer mesh, or have no adjoint there: shares are by volume alone"
-        )
+    if exact["unplaced"]:
+        notes.append(f"{exact['unplaced']}: shares are by volume alone")
     if exact["contact"]:
         notes.append("parts in contact: the estimate is of the finer mesh's own contacts, and jumps where these change")
     locks = scene.mesh.order == 1 and scene.volume == "tetrahedra"

@@ -10,7 +10,7 @@ import numpy as np
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs import SmoothMaximum, Strain, Stress
 from diffsim_ti.scene import Scene
-from diffsim_ti.terms import ExternalForce, MultiPointConstraint, Obstacle
+from diffsim_ti.terms import ExternalForce, MultiPointConstraint, Obstacle, Tie
 from diffsim_ti.terms.pose import Pose
 
 if TYPE_CHECKING:
@@ -42,6 +42,8 @@ def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) 
     given, base, terms = dict(scene.arguments), scene.mesh, []
     for k, term in enumerate(given["terms"]):
         surface, own = None if isinstance(term, Obstacle) else getattr(term, "surface", None), copy(term)
+        if isinstance(term, Tie) and not (is_named(term.a) and is_named(term.b)):
+            raise ValueError(f"{term!r} is of faces by their indices: name them as sets, by mesh.with_surface_set")
         if isinstance(term, ExternalForce | MultiPointConstraint):
             own.vertices, terms = term.indices(scene.mesh), [*terms, own]
             continue
@@ -64,6 +66,8 @@ def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) 
     for name in ("initial_positions", "initial_velocities"):
         if np.ndim(given[name]) == 2:
             given[name] = interpolation(mesh) @ np.asarray(given[name], np.float64)
+    if given["reduced"]:
+        given["reduced"] = {name: _basis(kind, interpolation(mesh)) for name, kind in given["reduced"].items()}
     if given["motion"] is not None:
         given["motion"] = _motion(scene, mesh, given["fixed"])
     if mesh.order > scene.mesh.order:
@@ -72,6 +76,14 @@ def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) 
         given["density"] = mesh.refinement.spread(given["density"])
         given["material"] = scene.material.spread(mesh.refinement)
     return Scene(**given | dict(mesh=mesh, terms=terms))
+
+
+def _basis(kind, P):
+    """What a set moves by, bases also at what lies between their vertices."""
+    if isinstance(kind, str):
+        return kind
+    kind = np.asarray(kind, np.float64)
+    return P @ kind if kind.ndim == 2 else np.stack([P @ field for field in kind])
 
 
 def interpolation(fine: TetrahedralMesh):

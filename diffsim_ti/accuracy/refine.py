@@ -48,7 +48,8 @@ class Refined(metaclass=Public):
 
     def __str__(self) -> str:
         rows = [
-            f"{unknowns:>9} unknowns: {a.value:.7g}, bar {a.bar:.2g} ({a.relative:.2g})" for unknowns, a in self.history
+            f"{unknowns:>9} unknowns: {a.value:.7g}, error {a.error:.2g} ({a.relative:.2g})"
+            for unknowns, a in self.history
         ]
         return "\n".join(rows + ([] if self.reached else ["the tolerance was not reached"]))
 
@@ -65,11 +66,11 @@ def refine(
     values: dict | None = None,
     ten_nodes: bool = True,
 ) -> Refined:
-    """Refine the mesh of a run where a number's error comes from, until its bar is below a tolerance.
+    """Refine the mesh of a run where a number's error comes from, until this is below a tolerance.
 
     problem: a Rollout of equilibria or implicit steps. output, weights: the number, as in `Rollout.accuracy`.
-    tolerance: of the bar over the number's change since the first frame. rounds: of refinement at most.
-    most: unknowns of the finer mesh that says the error, beyond which no round begins.
+    tolerance: of the estimated error over the number's change since the first frame, `Accuracy.relative`.
+    rounds: of refinement at most. most: unknowns of the finer mesh that says the error, beyond which no round begins.
     onto: as in `TetrahedralMesh.refined`. values: of inputs, as in `Rollout.forward`.
     ten_nodes: whether the first round of a linear mesh gives its tetrahedra ten nodes and cuts none, which brings most for
         each unknown: the error falls by a higher power of the length of edges. With `onto` all meshes stay linear, for the

@@ -161,13 +161,14 @@ def check_time_it_takes(run: ForwardRun, duration: float) -> None:
         )
 
 
-def accuracy_of(run: ForwardRun, frames: int, path: str) -> str:
-    """What the height of the centre of mass at the end of a run is off by; the shares of its tetrahedra are drawn."""
+def accuracy_of(run: ForwardRun, frames: int, path: str | None) -> str:
+    """What the height of the centre of mass at the end of a run is off by; the shares of its tetrahedra are drawn there."""
     from diffsim_ti.picture import save_picture
 
     solver = run.simulator.solver.for_scene(run.scene)
     found = Rollout(solver, frames * run.parts, outputs=CenterOfMass()).accuracy("center_of_mass", (0.0, 1.0, 0.0))
-    save_picture(path, run.scene.mesh, run.simulator.positions, found.shares, "share of the error [m]")
+    if path:
+        save_picture(path, run.scene.mesh, run.simulator.positions, found.shares, "share of the error [m]")
     return str(found)
 
 

@@ -169,7 +169,11 @@ def _joined(mesh, element: np.ndarray, L: np.ndarray):
         whole = inside[mesh.elements].all(1)
         faces = mesh.surface_faces[inside[mesh.surface_faces].all(1)][:, :3]
         faces = np.concatenate([faces, mesh.tetrahedra[whole][:, FACES].reshape(-1, 3)])
-        pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+        pairs = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        if mesh.order == 2:  # edges of lines, too: their middles are members
+            ends = mesh.tetrahedra[:, MID_EDGES]
+            pairs = np.concatenate([pairs, ends[inside[ends].all(2) & inside[mesh.elements[:, 4:]]]])
+        pairs = np.sort(pairs, 1)
         out = whole[element]
         out = np.where(count == 2, np.isin(ids[:, -2:] @ [n, 1], pairs @ [n, 1]), out)
         return np.where(count == 3, places_of_triangles(ids[:, -3:], faces) >= 0, out)

@@ -341,9 +341,10 @@ class Rollout(metaclass=Public):
 
         The run's states are put on the finer mesh. Forces that are out of balance there, times the adjoint of the number,
         are its error to first order, and say the share of each tetrahedron; where that is more than a fifth of how far the
-        number moved, or it is not linear in places, or parts are in contact, the finer mesh is solved. Steps of half the
-        length say what steps cost.
-        Raises ValueError for explicit solvers, and for what a finer mesh cannot have.
+        number moved, or less than an eighth of what the shares are by size, or it is not linear in places, or parts are in
+        contact, the finer mesh is solved. So it is for explicit steps and for chambers that hold their volume, where shares
+        are by volume alone. Steps of half the length say what steps cost.
+        Raises ValueError for what a finer mesh cannot have.
         Becker, Rannacher 2001, doi:10.1017/S0962492901000010.
 
         >>> import diffsim_ti as ds

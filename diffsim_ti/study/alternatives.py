@@ -53,8 +53,8 @@ def alternatives(trials, best) -> tuple[list[Alternative], list[str]]:
             continue
         own, other = [], []
         for _ in range(3):
-            other.append(trials.time(base, trials.reference))
-            own.append(trials.time(rollout, trials.reference))
+            other.append(trials.time(base))
+            own.append(trials.time(rollout))
         steps = int(np.ceil((rollout.sweep.num_passes - rollout.solver.explicit) * longer))  # explicit: one pass more
         times = min(own) / min(other)
         found.append(Alternative(how, steps, error, best.seconds * times, times, search * longer))
@@ -129,19 +129,19 @@ def _affine_run(trials, scene, option) -> Rollout:
 def _adaptive(trials, best, scene, share):
     """A run over steps that are found by looking."""
     solver = best.solver(scene, dt=trials.span / trials.frames, **_unchecked(best))
-    size = np.linalg.norm(trials.reference, axis=-1).max()
+    moved = Rollout(solver, trials.frames, save_every=1).forward().displacements
+    size = np.linalg.norm(moved - moved[0], axis=-1).max()
     tolerance = float(f"{share * trials.tolerance * size * trials.span / trials.duration:.2g}")
     begin = time.perf_counter()
     steps = adaptive_steps(solver, trials.frames, tolerance)
     search = time.perf_counter() - begin
     how = f"adaptive_steps(solver, steps={trials.frames}, tolerance={tolerance:g})"
-    return how, Rollout(solver, steps, save_every=1, memory=trials.memory), search
+    return how, trials.quantity.rollout(solver, steps, memory=trials.memory), search
 
 
 def _error(trials, rollout: Rollout) -> float:
     """Of a run, carried on to the whole duration."""
-    moved = rollout.forward().displacements.astype(np.float64)
-    return trials.error(moved - moved[0]) * trials.duration / trials.span
+    return trials.error(trials.quantity.of(rollout, rollout.forward())) * trials.duration / trials.span
 
 
 def _unchecked(best) -> dict:

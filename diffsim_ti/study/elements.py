@@ -11,8 +11,9 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.grid import PATTERNS, box
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers import VelocityVerletSolver
+from diffsim_ti.solvers import BDF2Solver, StaticSolver, VelocityVerletSolver
 from diffsim_ti.study.problem import ELEMENTS
+from diffsim_ti.study.quantity import MOTION, Quantity
 
 
 def halved_grid(mesh: TetrahedralMesh) -> TetrahedralMesh | None:
@@ -74,19 +75,27 @@ def on_coarser(scene: Scene, mesh: TetrahedralMesh) -> Scene:
     return Scene(**given | dict(mesh=nodes, volume="tetrahedra"))
 
 
+STEP, MOST_SUBSTEPS = (
+    0.1,
+    64,
+)  # of a number's change: what steps may make wrong where its error by the mesh is asked for
+
+
 @dataclass
 class ElementTrial:
     """A kind of element (ELEMENTS) on a scene's own mesh, or a coarser one: the largest distance of its motion from that of
-    finer elements at the scene's vertices over the largest displacement (NaN: not known), and the wall time [s] of the run.
+    finer elements at the scene's vertices over the largest displacement, or the error of a number over its change (NaN: not
+    known), and the wall time [s] of the run. bar: whether it is that of the number's error bar.
     """
 
     element: str
     error: float
     seconds: float
+    bar: bool = False
 
     def __str__(self) -> str:
         error = "error not known" if np.isnan(self.error) else f"error {self.error:.2g}"
-        return f"{self.element} {error} in {self.seconds:.2g} s"
+        return f"{self.element} {error}{' by its bar' if self.bar else ''} in {self.seconds:.2g} s"
 
 
 def own_element(scene: Scene) -> str:
@@ -96,20 +105,40 @@ def own_element(scene: Scene) -> str:
     return next(name for name, own in ELEMENTS.items() if own == how)
 
 
+def advised(trials: list[ElementTrial], tolerance: float, scene: Scene) -> str:
+    """The cheapest kind that keeps to the tolerance, or the one that is nearest; the scene's own if none was tried."""
+    known = [trial for trial in trials if np.isfinite(trial.error)]
+    good = [trial for trial in known if trial.error <= tolerance]
+    if good:
+        return min(good, key=lambda trial: trial.seconds).element
+    if any(np.isnan(trial.error) for trial in trials):
+        return "quadratic"
+    return min(known, key=lambda trial: trial.error).element if known else own_element(scene)
+
+
 def _with_volume(scene: Scene, how: dict) -> Scene:
     return scene.replace(volume=how.get("volume", "tetrahedra"))
 
 
 class ElementTrials:
-    """Runs of a scene by kinds of elements over `duration` [s], for at most about `budget` [s] of wall time.
+    """Runs of a scene by kinds of elements over `duration` [s], 0 of an equilibrium, for at most about `budget` [s] of wall
+    time.
 
     coarser: another mesh for those of ten nodes; None: a grid of half the cells, where the scene's mesh is a grid.
+    quantity: what errors are of. Those of a number are its error bars, in equilibria and steps of BDF2, if all of these can
+    be trusted; else runs of all kinds are compared with one of the finest elements, as those of motion are.
     """
 
     def __init__(
-        self, scene: Scene, duration: float, frames: int, budget: float, coarser: TetrahedralMesh | None = None
+        self,
+        scene: Scene,
+        duration: float,
+        frames: int,
+        budget: float,
+        coarser: TetrahedralMesh | None = None,
+        quantity: Quantity = MOTION,
     ):
-        self.coarser = coarser or halved_grid(scene.mesh)
+        self.coarser, self.quantity = coarser or halved_grid(scene.mesh), quantity
         self.scene, self.duration, self.frames, self.budget = scene.replace(precision="f64"), duration, frames, budget
         self.notes: list[str] = []
 
@@ -126,9 +155,11 @@ class ElementTrials:
             self.notes.append(f"ten-node tetrahedra were not tried: {error}")
             return []
         coarser = self.on_coarser_mesh()
+        if self.quantity.output is not None and (found := self._by_bars(scenes | coarser)):
+            return found
         for name, made in (scenes | coarser).items():
             motions[name], seconds[name] = self._motion(made)
-        for name, made in coarser.items():  # as the scene's own vertices see it
+        for name, made in coarser.items() if self.quantity.output is None else ():  # as the scene's own vertices see it
             at = made.mesh.locate(scene.mesh.vertices, nearest=True).matrix
             motions[name] = np.stack([at @ u for u in motions[name]])
         finest, error_of_finest = self._finest(seconds["quadratic"])
@@ -141,6 +172,40 @@ class ElementTrials:
             unknown = name.startswith("quadratic") and name not in coarser and not error_of_finest
             found.append(ElementTrial(name, np.nan if unknown else float(apart), seconds[name]))
         return sorted(found, key=lambda trial: trial.seconds)
+
+    def _by_bars(self, scenes: dict[str, Scene]) -> list[ElementTrial]:
+        """The same by error bars; none, and a note that says why, where one is not to be trusted."""
+        found, substeps = [], 1
+        for name, made in scenes.items():
+            seconds = self._timed(self._implicit(made, substeps))[1]
+            error, doubts = np.nan, ()
+            if (
+                made.mesh.order == 1 or 40 * seconds <= self.budget
+            ):  # of ten nodes the finer mesh has eight times as many
+                try:
+                    bar = self.quantity.accuracy(self._implicit(made, substeps))
+                    while not abs(bar.step) <= STEP * bar.size and substeps < MOST_SUBSTEPS:
+                        substeps *= 2
+                        bar = self.quantity.accuracy(self._implicit(made, substeps))
+                    error = abs(bar.mesh) / bar.size
+                    doubts = (
+                        bar.notes if error < 0.5 else ()
+                    )  # others are out of the question, whatever they are exactly
+                except (ValueError, FloatingPointError) as problem:
+                    doubts = (str(problem),)
+            if doubts:
+                self.notes.append(
+                    f"error bars of {self.quantity.output.name} were not used, runs of the finest elements were: {name}: "
+                    f"{'; '.join(doubts)}"
+                )
+                return []
+            found.append(ElementTrial(name, float(error), seconds, True))
+        return sorted(found, key=lambda trial: trial.seconds)
+
+    def _implicit(self, scene: Scene, substeps: int) -> Rollout:
+        if not self.duration:
+            return self.quantity.rollout(StaticSolver(scene), 1)
+        return self.quantity.rollout(BDF2Solver(scene, dt=self.duration / self.frames, substeps=substeps), self.frames)
 
     def on_coarser_mesh(self) -> dict[str, Scene]:
         """Scenes of ten-node tetrahedra on the coarser mesh, by name."""
@@ -165,9 +230,11 @@ class ElementTrials:
             return None, False
 
     def _motion(self, scene: Scene) -> tuple[np.ndarray, float]:
-        frame = self.duration / self.frames
-        rollout = Rollout(VelocityVerletSolver(scene, dt=frame), self.frames, save_every=1)
+        solver = VelocityVerletSolver(scene, dt=self.duration / self.frames) if self.duration else StaticSolver(scene)
+        return self._timed(self.quantity.rollout(solver, self.frames))
+
+    def _timed(self, rollout: Rollout) -> tuple[np.ndarray, float]:
         rollout.forward()  # compiles
         begin = time.perf_counter()
-        moved = rollout.forward().displacements
-        return moved - moved[0], time.perf_counter() - begin
+        frames = rollout.forward()
+        return self.quantity.of(rollout, frames), time.perf_counter() - begin

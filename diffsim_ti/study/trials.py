@@ -3,23 +3,28 @@
 import copy
 import time
 import warnings
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
+from diffsim_ti.common.checked import instance
 from diffsim_ti.common.public import public
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.outputs import Output
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.rollout.rollout import RolloutOptions
 from diffsim_ti.scene import Scene
 from diffsim_ti.scene.scene import LOCKING_RATIO
-from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
+from diffsim_ti.solvers import SOLVERS, BDF2Solver, StaticSolver, VelocityVerletSolver, stable_dt
 from diffsim_ti.study.alternatives import Alternative, alternatives
-from diffsim_ti.study.elements import ElementTrial, ElementTrials, own_element
+from diffsim_ti.study.elements import ElementTrial, ElementTrials, advised
 from diffsim_ti.study.executors import each
 from diffsim_ti.study.problem import Problem, distance
+from diffsim_ti.study.quantity import Quantity
 from diffsim_ti.terms import Drag
 
 
@@ -31,7 +36,7 @@ class Option:
     precision: str
     substep: float  # [s]
     steps: int  # of the whole duration
-    error: float = np.nan  # over the whole duration, relative to the largest displacement
+    error: float = np.nan  # over the whole duration, relative to `Quantity.scale`
     seconds: float = np.nan  # wall time of the whole duration, with its gradient if asked for
     substeps: int = 0  # per frame of the trial
 
@@ -43,7 +48,8 @@ class Option:
 @dataclass(repr=False)
 class Recommendation:
     """What to use: `solver`, `dt` [s], `steps`, `precision`, `memory` [MB] for the checkpoints, `element`; what to expect
-    of it: `seconds` of wall time, `megabytes` kept for gradients, `error` relative to the largest displacement.
+    of it: `seconds` of wall time, `megabytes` kept for gradients, `error` relative to the largest displacement, or to
+    how far the number changes.
 
     `reasons`: three lines; `left_out`: what the scene does without, and why. `rollout(scene)` makes it, of the scene as it
     is. `elements`: what its mesh makes wrong by each kind of element; `element`: the cheapest that keeps to the tolerance.
@@ -63,6 +69,7 @@ class Recommendation:
     tried: list[Option] = field(repr=False, default_factory=list)
     elements: list[ElementTrial] = field(repr=False, default_factory=list)
     alternatives: list[Alternative] = field(repr=False, default_factory=list)
+    scale: str = "the largest displacement"  # what errors are relative to
 
     solver = property(lambda self: self.option.solver)
     precision = property(lambda self: self.option.precision)
@@ -72,15 +79,19 @@ class Recommendation:
 
     def rollout(self, scene: Scene, frames: int = 1, **options: Unpack[RolloutOptions]) -> Rollout:
         """The recommended run of the scene, `frames` times saved; options are Rollout's."""
+        if not self.duration:
+            scene = scene.replace(precision=self.precision)
+            return Rollout(StaticSolver(scene), frames, save_every=1, memory=self.memory, **options)
         substeps = -(-self.steps // frames)
         solver = self.solver(scene.replace(precision=self.precision), dt=self.duration / frames, substeps=substeps)
         return Rollout(solver, frames, save_every=1, memory=self.memory, **options)
 
     def __str__(self) -> str:
-        how = f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}"
+        how = f"dt={self.dt:.4g}), {self.steps} steps" if self.duration else f"load_steps={self.steps})"
+        how = f"{self.solver.__name__}(scene, {how}, precision {self.precision}"
         kept = f"{self.megabytes:.3g} MB" if self.gradients else "no states"
         lines = [f"{how}, element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else "")]
-        error = f"error {self.error:.2g} of the largest displacement"
+        error = f"error {self.error:.2g} of {self.scale}"
         lines.append(f"expect: {self.seconds:.3g} s of wall time, {kept} kept, {error}")
         lines += [f"- {line}" for line in self.reasons]
         lines += [f"- elements: {'; '.join(map(str, self.elements))}, of the mesh alone"] if self.elements else []
@@ -106,9 +117,10 @@ class Trials:
         gradients: bool,
         budget: float,
         frames: int,
+        quantity: Quantity,
     ):
         self.scene, self.duration, self.tolerance, self.frames = scene, duration, tolerance, frames
-        self.memory, self.gradients, self.budget = memory, gradients, budget
+        self.memory, self.gradients, self.budget, self.quantity = memory, gradients, budget, quantity
         self.stable = stable_dt(scene).dt
         self.tried: list[Option] = []
         self.notes: list[str] = []
@@ -135,7 +147,7 @@ class Trials:
         if not self._converge(VelocityVerletSolver, max(1, int(np.ceil(k * part)))):
             raise FloatingPointError(
                 f"the motion does not converge: with ever more steps in {self.span:.3g} s the last halving still changed it "
-                f"by {self.own_error:.1g} of the largest displacement; shorten the duration"
+                f"by {self.own_error:.1g} of {self.quantity.scale}; shorten the duration"
             )
 
     def _converge(self, kind, k: int, limit: float = np.inf) -> bool:
@@ -174,27 +186,22 @@ class Trials:
         """Of the scene in that precision, or of another one."""
         frames, span, scene = frames or self.frames, span or self.span, scene or self.scene.replace(precision=precision)
         solver = kind(scene, dt=span / frames, substeps=substeps, **how)
-        return Rollout(solver, frames, save_every=1, memory=self.memory)
+        return self.quantity.rollout(solver, frames, memory=self.memory)
 
     def _motion(self, kind, precision, substeps, timed: bool = False):
-        """(displacements from the start at the frames, wall time [s], `timed`, with the gradient if one is wanted)."""
+        """(what errors are of, wall time [s], `timed`, with the gradient if one is wanted)."""
         rollout = self.rollout(kind, precision, substeps)
-        frames = rollout.forward()
-        moved = frames.displacements.astype(np.float64) - frames.displacements[0]
+        moved = self.quantity.of(rollout, rollout.forward())
         if not timed:
             return moved, np.nan
-        self.time(rollout, moved)  # compiles
-        seconds = self.time(rollout, moved)
+        self.time(rollout)  # compiles
+        seconds = self.time(rollout)
         self.spent += 3 * seconds
         return moved, seconds
 
-    def time(self, rollout, adjoint) -> float:
+    def time(self, rollout) -> float:
         """Wall time of a run [s], with its gradient if one is wanted."""
-        start = time.perf_counter()
-        frames = rollout.forward()
-        if self.gradients:
-            rollout.vjp(frames, adjoint)
-        return time.perf_counter() - start
+        return self.quantity.time(rollout, self.gradients)
 
     def error(self, moved) -> float:
         return distance(self.problem, moved, self.reference)
@@ -209,7 +216,7 @@ class Trials:
         for _ in range(rounds):
             for k, (option, rollout) in enumerate(zip(near, rollouts)):
                 if not times[k] or option.seconds / longer < 0.02 * self.budget:
-                    times[k].append(self.time(rollout, self.reference))
+                    times[k].append(self.time(rollout))
         for option, seconds in zip(near, times):
             option.seconds = longer * min(seconds[1:] or seconds)
 
@@ -295,7 +302,8 @@ class Trials:
 
     def compare_elements(self) -> None:
         """Try the kinds of elements over the span of the reference."""
-        compared = ElementTrials(self.scene, self.span, self.frames, 0.5 * self.budget, self.coarser)
+        asked = self.span, self.frames, 0.5 * self.budget, self.coarser, self.quantity
+        compared = ElementTrials(self.scene, *asked)
         try:
             self.elements = compared.run()
         except FloatingPointError as error:
@@ -323,19 +331,10 @@ class Trials:
         solver = best.solver(self.scene.replace(precision=best.precision), dt=self.duration / self.frames, substeps=k)
         plan = Rollout(solver, self.frames, memory=self.memory)
         asked, megabytes = (self.duration, self.gradients, self.memory), plan.memory if self.gradients else 0.0
-        said = self._element(), self._reasons(best, plan), self._left_out(best)
+        said = advised(self.elements, self.tolerance, self.scene), self._reasons(best, plan), self._left_out(best)
         error = max(best.error, self.own_error)
-        return Recommendation(best, *asked, megabytes, error, *said, self.tried, self.elements, others)
-
-    def _element(self) -> str:
-        """The cheapest kind that keeps to the tolerance, or the one that is nearest; the scene's own if none was tried."""
-        known = [trial for trial in self.elements if np.isfinite(trial.error)]
-        good = [trial for trial in known if trial.error <= self.tolerance]
-        if good:
-            return min(good, key=lambda trial: trial.seconds).element
-        if any(np.isnan(trial.error) for trial in self.elements):
-            return "quadratic"
-        return min(known, key=lambda trial: trial.error).element if known else own_element(self.scene)
+        more = self.tried, self.elements, others, self.quantity.scale
+        return Recommendation(best, *asked, megabytes, error, *said, *more)
 
     def _reasons(self, best, plan) -> list[str]:
         others = {}
@@ -399,6 +398,35 @@ def _apart(trials: Trials, kinds: list, first: int) -> tuple[list, list, list]:
     return own.tried, own.notes, own.elements
 
 
+def _of_equilibrium(trials: ElementTrials, tolerance: float, memory: float | None, gradients: bool, elements: bool):
+    """The cheapest precision and element of an equilibrium; trials: of its elements."""
+    quantity, exact, tried = trials.quantity, None, []
+    for precision, how in (("f64", dict(tolerance=1e-12)), ("f64", {}), ("f32", {})):
+        rollout = quantity.rollout(StaticSolver(trials.scene.replace(precision=precision), **how), 1, memory=memory)
+        value = quantity.of(rollout, rollout.forward())
+        if exact is None:
+            exact, size = value, max(float(np.linalg.norm(value, axis=-1).max()), np.finfo(float).tiny)
+            continue
+        quantity.time(rollout, gradients)  # compiles
+        seconds, error = quantity.time(rollout, gradients), float(np.linalg.norm(value - exact, axis=-1).max()) / size
+        tried.append(Option(StaticSolver, precision, 1.0, 1, error, seconds))
+    best = min((o for o in tried if o.error <= SAFETY * tolerance), key=lambda o: o.seconds, default=None)
+    if best is None:
+        raise FloatingPointError(
+            f"an equilibrium in float64 is off by {tried[0].error:.2g} for the solver's tolerance, and a tolerance of "
+            f"{tolerance:g} is asked for; loosen it"
+        )
+    compared = trials.run() if elements else []
+    megabytes = rollout.memory if gradients else 0.0
+    others = ", ".join(
+        f"{o.precision} {o.seconds:.2g} s with an error of {o.error:.2g}" for o in tried if o is not best
+    )
+    reasons = [f"accuracy: error {best.error:.2g} against a run in float64 to a tolerance of 1e-12", f"time: {others}"]
+    said = advised(compared, tolerance, trials.scene), reasons, trials.notes or ["nothing"]
+    asked = 0.0, gradients, memory, megabytes, best.error
+    return Recommendation(best, *asked, *said, tried, compared, scale=quantity.scale)
+
+
 @public
 def recommend(
     scene: Scene,
@@ -411,31 +439,44 @@ def recommend(
     elements: bool = True,
     coarser: TetrahedralMesh | None = None,
     executor: Executor | None = None,
+    output: Output | None = None,
+    weights: ArrayLike | Callable | None = None,
 ) -> Recommendation:
-    """The cheapest way to run `scene` for `duration` [s] with a relative error of motion below `tolerance`.
+    """The cheapest way to run `scene` for `duration` [s], 0 of its equilibrium, with a relative error below `tolerance`.
 
     The error meant is that of steps and precision on the scene's own mesh: the largest distance of any vertex at any of
-    `frames` times over the largest displacement from the start. memory [MB]: most that gradients may keep.
+    `frames` times over the largest displacement from the start. With an `output` it is that of a number, over how far this
+    changes: weights are as of `Rollout.accuracy`. memory [MB]: most that gradients may keep.
     gradients: whether runs will be differentiated, which is then timed as well.
     budget [s]: wall time of the trials, compiling apart; if the reference of the whole duration would take more, trials
     cover a first part and errors grow with time from there.
     elements: whether linear tetrahedra, patches and ten nodes are compared too, by what the mesh itself makes wrong; the
-    advice's `element` is the cheapest that keeps to the tolerance. coarser: a linear mesh of the body with the same
+    advice's `element` is the cheapest that keeps to the tolerance. That of a number is what `Rollout.accuracy` says of it in
+    equilibria and steps of BDF2; where that has doubts, which `left_out` names, and of motions, runs of all kinds are
+    compared with one of the finest elements. coarser: a linear mesh of the body with the same
     named sets, to try ten nodes on; None: half the cells of a mesh that `create_box` made.
     executor: any `concurrent.futures.Executor`, which takes a solver at a time, each with the budget, and the elements;
     those near the best are timed again here.
 
     Raises ValueError for a duration or tolerance that is no such thing, FloatingPointError if nothing meets the tolerance.
     """
-    if not (duration > 0 and np.isfinite(duration)):
-        raise ValueError(f"duration must be > 0 [s], got {duration:g}")
+    if not (duration >= 0 and np.isfinite(duration)):
+        raise ValueError(f"duration must be > 0 [s], or 0 for an equilibrium, got {duration:g}")
+    if output is None and weights is not None:
+        raise ValueError("weights are of a number of an output: pass output=, such as MaterialPoints([[0, 0, 0]])")
+    if output is not None:
+        instance("recommend", "output", output, Output, "an output, such as MaterialPoints([[0, 0, 0]])")
+    quantity = Quantity(output, weights)
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance:g}")
     if memory is not None and not memory > 0:
         raise ValueError(f"memory must be > 0 [MB], got {memory:g}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of trials with coarse steps, whose errors are measured
-        trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
+        if not duration:
+            trials = ElementTrials(scene, 0.0, 1, 0.5 * budget, coarser, quantity)
+            return _of_equilibrium(trials, tolerance, memory, gradients, elements)
+        trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames, quantity)
         trials.coarser = coarser
         trials.run(elements, executor)
     return trials.advice()
