@@ -228,7 +228,7 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     replay = Replay(fine, [P @ u for u in own.each("places")])
     nodal, rounding, carried_value, linear = np.zeros(mesh.num_vertices), eps * abs(value), value, number.linear
     unplaced = ""
-    if solver.explicit or scene.holds_volumes:  # of whose equations `Replay` has no residual, or only a part
+    if solver.explicit or scene.has_multipliers:  # of whose equations `Replay` has no residual, or only a part
         unplaced = "explicit steps and held volumes have no residual by vertices on the finer mesh"
         rounding, linear, of_solver = rounding * own.rollout.sweep.num_passes, False, 0.0
         if tight:
