@@ -338,6 +338,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("outputs/contact_slip.py", "a robot moves the obstacle"): "test_robots.py",
     ("mechanics/robots.py", "far from the origin in float32"): "test_robots.py",
     ("mechanics/robots.py", "leave out reduced= and Tie"): "test_robots.py",
+    ("mechanics/robots.py", 'leave out contact="force"'): "test_robots.py",
     ("terms/robots/urdf.py", "has dry friction"): "test_robots.py",
     ("rollout/adaptive_steps.py", "errors of robots' joints"): "test_robots.py",
     ("monitor/guard.py", "has gained {} J"): "test_energy_watch.py",

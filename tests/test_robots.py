@@ -1,4 +1,4 @@
-"""Robots of URDF files in implicit steps: joints against closed forms, both ways of contact, and every gradient."""
+"""Robots of URDF files: joints against closed forms, both ways of contact, and every gradient."""
 
 import sys
 
@@ -179,8 +179,9 @@ def test_a_run_that_stops_keeps_its_joints_and_has_no_gradient(wheel):
     assert found["joint_positions"][0, -1, 0] == pytest.approx(0.02)
 
 
-def test_adjoints_of_joints_are_cut_clipped_and_reported(wheel):
-    run = dict(steps=2, save_every=1, outputs=[ds.JointPositions()])
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.VelocityVerletSolver])
+def test_adjoints_of_joints_are_cut_clipped_and_reported(wheel, kind):
+    wheel, run = kind(wheel.scene, dt=1e-2), dict(steps=2, save_every=1, outputs=[ds.JointPositions()])
     seed = dict(joint_positions=[[0], [0], [3.0]])
     for options in (dict(health=True), dict(clip=0.5), dict(truncate=1)):
         rollout = ds.Rollout(wheel, **run, **options)
@@ -223,8 +224,8 @@ def test_links_stand_where_they_are_when_a_run_goes_on():
 
 def test_other_solvers_refuse_and_say_which_takes_robots(monkeypatch):
     scene = scene_of(ds.Robot.from_urdf(ARM, links=()), fixed="ymin")
-    for solver in (ds.SemiImplicitSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver):
-        with pytest.raises(ValueError, match="take ImplicitEulerSolver"):
+    for solver in (ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver):
+        with pytest.raises(ValueError, match="take ImplicitEulerSolver, SemiImplicitSolver or VelocityVerletSolver"):
             solver(scene)
     monkeypatch.setitem(sys.modules, "pinocchio", None)
     with pytest.raises(ImportError, match=r'pip install "diffsim-ti\[robots\]"'):
@@ -239,8 +240,11 @@ def test_advice_works_when_it_is_followed(pressing):
     assert ds.ContactSlip("arm_tip", what="share").settled(pressing).what == "share"
     with pytest.raises(ValueError, match="leave it out"):
         ds.ImplicitEulerSolver(pressing.replace(terms=[*pressing.terms_of(ds.Robot), ds.RotatingFrame([0, 0, 3.0])]))
-    with pytest.raises(ValueError, match="take no robots"):
-        ds.stable_dt(pressing)
+    with pytest.raises(ValueError, match='leave out contact="force"'):
+        ds.SemiImplicitSolver(pressing, contact="force")
+    with pytest.raises(ValueError, match="leave out viscous_stages"):
+        ds.SemiImplicitSolver(pressing.replace(material=ds.KelvinVoigt(SOFT, 1e-3)), viscous_stages=2)
+    ds.SemiImplicitSolver(pressing, dt=0.5 * ds.stable_dt(pressing))
     with pytest.raises(ValueError, match="the solver substeps="):
         ds.adaptive_steps(ds.ImplicitEulerSolver(pressing, dt=5e-3), 2, 1e-3)
     ds.Rollout(ds.ImplicitEulerSolver(pressing, dt=5e-3, substeps=2), 2)
@@ -252,7 +256,8 @@ def test_advice_works_when_it_is_followed(pressing):
     ds.ImplicitEulerSolver(pressing.replace(**far, precision="f64"))
 
 
-def test_a_pendulum_swings_as_its_equation_says():
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.VelocityVerletSolver])
+def test_a_pendulum_swings_as_its_equation_says(kind):
     """Against scipy at 1e-10; backward Euler with what is frozen at the start of each step is of first order."""
     from scipy.integrate import solve_ivp
 
@@ -267,15 +272,17 @@ def test_a_pendulum_swings_as_its_equation_says():
     scene, errors = scene_of(robot, terms=[ds.Gravity()], fixed="ymin"), []
     for steps in (10, 20):
         outputs = [ds.JointPositions("robot"), ds.JointVelocities("robot")]
-        rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=0.2 / steps), steps, outputs=outputs)
+        substeps = 20 if kind.explicit else 1
+        rollout = ds.Rollout(kind(scene, dt=0.2 / steps, substeps=substeps), steps, outputs=outputs)
         frames = rollout.forward()
         errors.append(np.array([frames[name][-1, 0] for name in ("joint_positions", "joint_velocities")]) - exact)
     assert np.abs(errors[1]).max() < 0.04
     assert np.linalg.norm(errors[0]) / np.linalg.norm(errors[1]) == pytest.approx(2, abs=0.1)
 
 
-def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses():
-    """A sliding ball flies at a body that floats; p of both is kept to the tolerance of the solves."""
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses(kind):
+    """A sliding ball flies at a body that floats; p of both is kept to the tolerance of the solves, or to round-off."""
     text = urdf(
         link("a"),
         link("b", 1.0, 0.0, shape='<sphere radius="0.02"/>'),
@@ -283,14 +290,15 @@ def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses():
     )
     robot = ds.Robot.from_urdf(text, velocities=[1.0], width=2e-3, stiffness_per_area=3e7, friction=0.3)
     scene = scene_of(robot)
-    solver = ds.ImplicitEulerSolver(scene, dt=4e-3, tolerance=1e-9)
+    solver = kind(scene, dt=4e-3, **({} if kind.explicit else dict(tolerance=1e-9)))
     rollout = ds.Rollout(solver, 6, save_every=6, outputs=[ds.JointVelocities("robot")])
     body, m = 500.0 * 0.06**3, scene.mass_matrix().diagonal()[::3]
     for ratio in (1e-3, 1.0, 1e3):
         frames = rollout.forward(**{"robot.masses": [ratio * body]})
         gained = float(m @ frames.velocities[-1, :, 0])
         lost = ratio * body * (1.0 - frames["joint_velocities"][-1, 0])
-        assert lost > 0.1 * body * min(ratio, 1.0) and gained == pytest.approx(lost, rel=1e-6)
+        exact = 1e-12 * max(ratio, 1.0) if kind.explicit else 1e-6
+        assert lost > 0.1 * body * min(ratio, 1.0) and gained == pytest.approx(lost, rel=exact)
 
 
 @pytest.fixture(scope="module")
@@ -315,10 +323,11 @@ def pressing():
     return scene_of(robot, mesh, [ds.Gravity()], fixed="ymin")
 
 
-def test_every_gradient_goes_through_body_and_joints(pressing):
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver, ds.VelocityVerletSolver])
+def test_every_gradient_goes_through_body_and_joints(pressing, kind):
     steps, rng = 3, np.random.default_rng(1)
     outputs = [ds.JointPositions("arm"), ds.JointVelocities("arm"), ds.ContactForce("arm_tip")]
-    solver = ds.ImplicitEulerSolver(pressing, dt=5e-3, tolerance=1e-12)
+    solver = kind(pressing, dt=5e-3, **({} if kind.explicit else dict(tolerance=1e-12)))
     rollout = ds.Rollout(solver, steps, save_every=1, gradients="all", outputs=outputs)
     given = {"arm.torques": rng.normal(size=(steps, 2))}
     frames = rollout.forward(**given)
@@ -369,8 +378,9 @@ def test_what_links_do_to_vertices_they_feel_in_the_same_step(pressing):
     assert frames["n"][-1].sum(0)[1] < -1 and np.abs(own).max() < 1e-9
 
 
-def test_steps_that_are_given_torques_are_those_of_a_run(pressing):
-    solver, torques = ds.ImplicitEulerSolver(pressing, dt=5e-3), np.random.default_rng(2).normal(size=(2, 2))
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_steps_that_are_given_torques_are_those_of_a_run(pressing, kind):
+    solver, torques = kind(pressing, dt=5e-3), np.random.default_rng(2).normal(size=(2, 2))
     simulator = ds.Simulator(solver)
     for row in torques:
         simulator.step(**{"arm.torques": row})

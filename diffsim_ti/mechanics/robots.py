@@ -9,9 +9,9 @@ from diffsim_ti.terms.whole_body import RotatingFrame
 
 
 class Robots(Interaction):
-    """Their joints are unknowns of implicit steps (joints/joints.py), which no other solver has."""
+    """Their joints are unknowns of backward Euler steps (joints/joints.py), and of explicit ones (joints/explicit.py)."""
 
-    name, kinds, works, on_host = "robots", (Robot,), "robots", False
+    name, kinds, works, on_host, in_kernels = "robots", (Robot,), "robots", False, False
     derived = dict(joints="vectors2")
 
     def __init__(self, scene, terms):
@@ -33,9 +33,13 @@ class Robots(Interaction):
     def check_solver(self, solver) -> None:
         if not solver.moves_robots:
             raise ValueError(
-                f"{type(solver).__name__}: robots are unknowns of backward Euler steps alone: take ImplicitEulerSolver; "
-                "recommend and stable_dt take no robots"
+                f"{type(solver).__name__}: robots move in backward Euler and explicit steps: take ImplicitEulerSolver, "
+                "SemiImplicitSolver or VelocityVerletSolver; recommend takes no robots"
             )
+        if solver.explicit and solver.contact == "force" and any(term.companions for term in self.terms):
+            raise ValueError('links of robots act in a stage of explicit steps: leave out contact="force"')
+        if solver.explicit and len(solver.kicks.kicks) > 1:
+            raise ValueError("robots take one kick in each substep: leave out viscous_stages, and take more substeps")
         if self.scene.term(RotatingFrame):
             raise ValueError("a RotatingFrame does not act on robots: leave it out")
         if self.scene.reduced:

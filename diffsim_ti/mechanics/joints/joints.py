@@ -66,7 +66,7 @@ class Joints:
                 carried = np.zeros(self.count, bool)
                 carried[own] = robot.model.carries(joint)
                 self.links.append((names.index(name), carried))
-        self.shares = Shares(workspace) if self.links else None
+        self.shares = Shares(workspace) if self.links and self.p else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
         self.loose = max(1e-6, 1e3 * self.eps)  # of their forces, what rounding of the vertices' places may leave
         self._known, self._zero, self._held, self._placed, self._anchor = None, None, None, None, None
@@ -99,6 +99,12 @@ class Joints:
             for m in moments:
                 rows[3 * k + m] = t
                 rows[3 * self.a.poses.place_of[k] + m] = rotations.rodrigues(turn)
+
+    def put_moving(self, rows: np.ndarray, q: np.ndarray, v: np.ndarray) -> None:
+        """The same with velocities."""
+        self.put(rows, q)
+        self.poses_n, self.S_n = self.kinematics(q)
+        self._put_rates(rows, v)
 
     def _put_rates(self, rows: np.ndarray, rate: np.ndarray) -> None:
         for (k, carried), (_, t) in zip(self.links, self.poses_n):

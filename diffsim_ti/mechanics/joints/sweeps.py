@@ -101,10 +101,11 @@ class JointTangent(JointSweep):
         """A frame has the change of the present state."""
         self.frames.append(np.stack([self.dq, self.dv], 1))
 
-    def force(self, shares: np.ndarray, held: np.ndarray, du: np.ndarray) -> np.ndarray:
+    def force(self, shares=None, held=None, du=None) -> np.ndarray:
         """Change of -dPhi/dq, body and joints staying where the pass ends, but for its fixed vertices.
 
-        shares: change of what obstacles do to vertices; held: change of places; du: of those where the pass begins.
+        shares: change of what obstacles do to vertices, None: without contact; held: change of places; du: of those where
+        the pass begins.
         """
         J, moved_numbers, out = self.joints, self.tangent, np.zeros(self.joints.count)
         _, _, dk, dc, dm = J.robots.numbers(moved_numbers.parameters)
@@ -119,6 +120,8 @@ class JointTangent(JointSweep):
         out += J.M @ (self.dq / J.h**2 + self.dv / J.h) + J.c * self.dq / J.h
         out += J.k * dtargets - dk * (J.q - J.targets) - dc * (J.q - J.q_n) / J.h
         out += rows[schedule.load_row(rows, J.j)][:, 2]
+        if shares is None:
+            return out
         x, x_n = J.places(J.p.held_at)
         dx, dx_n = held + moved_numbers.rest, du + moved_numbers.rest
         for (k, *_), (vertices, carried, f, drag, bent) in zip(J.links, self._of_friction()):

@@ -4,14 +4,23 @@ from contextlib import nullcontext
 
 from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import VolumeConstraintAdjoint, VolumeConstraintTangent
 from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
+from diffsim_ti.mechanics.joints.explicit import JointStage, JointStageAdjoint, JointStageTangent
 from diffsim_ti.mechanics.reduced.projected_sets import ProjectedAdjoint, ProjectedSets, ProjectedTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 
 # stages whose tangents and adjoints have buffers: what makes these of them for a run
 BUFFERED = dict(
-    tangent={VolumeConstraints: VolumeConstraintTangent, ProjectedSets: ProjectedTangent},
-    adjoint={VolumeConstraints: VolumeConstraintAdjoint, ProjectedSets: ProjectedAdjoint},
+    tangent={
+        VolumeConstraints: VolumeConstraintTangent,
+        ProjectedSets: ProjectedTangent,
+        JointStage: JointStageTangent,
+    },
+    adjoint={
+        VolumeConstraints: VolumeConstraintAdjoint,
+        ProjectedSets: ProjectedAdjoint,
+        JointStage: JointStageAdjoint,
+    },
 )
 
 
@@ -46,7 +55,7 @@ class KickDrift(Stage):
 def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
     pairs = PairContact(ws.pairs, ws.solver.contact_damping, ws.scene.reduced.bodies) if ws.pairs else None
-    every = pairs, ws.volumes, ws.chambers, ws.projected, KickDrift()
+    every = pairs, ws.volumes, ws.chambers, ws.projected, ws.joint_stage, KickDrift()
     return [stage for stage in every if stage]
 
 

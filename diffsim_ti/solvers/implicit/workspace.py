@@ -32,7 +32,6 @@ from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.solvers.implicit.prescribed import PrescribedInPasses
 from diffsim_ti.state.history import History
-from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms import Growth
 
@@ -49,7 +48,6 @@ class TwoStepHistory(History):
 class ImplicitWorkspace(PrescribedInPasses):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
-    joints: Joints | None = None  # of robots
     pairs_kind, potential_kind, newton_kind = ImplicitPairs, Potential, Newton
     collisions_kind, preconditioners_kind = ObstacleCollisions, Preconditioners
     enough = 20  # rounds with which a solution that was not found is found by load stepping
@@ -70,7 +68,8 @@ class ImplicitWorkspace(PrescribedInPasses):
             self.potential = self.potential_kind(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
             self.joints = self.potential.joints = Joints(self) if self.scene.interaction(Robots) else None
-            self._start_joints()
+            self.start_joints()
+            self.place_obstacles(0)
             self.strains = FrozenStrains(self) if self.potential.held is not None else None
         a = self.arrays
         self._mass = self.mass_of(derived)
@@ -121,15 +120,9 @@ class ImplicitWorkspace(PrescribedInPasses):
     def restart(self) -> None:
         super().restart()
         self.multipliers = {}
-        self._start_joints()
         self._restart()
         if self.energy_watch:
             self.energy_watch.clear()
-
-    def _start_joints(self) -> None:
-        if self.joints:
-            self.state.joints[0] = self.joints.start()
-            self.place_obstacles(0)
 
     def forget(self) -> None:
         """The state was set from outside: there is none before it."""
@@ -162,22 +155,6 @@ class ImplicitWorkspace(PrescribedInPasses):
         copy_slot(source.before.u, s, target.before.u, min(t, target.before.num_slots - 1))
         copy_slot(source.before.v, s, target.before.v, min(t, target.before.num_slots - 1))
         target.fresh[t] = source.fresh[s]
-
-    def make_frames(self, count: int) -> None:
-        super().make_frames(count)
-        self.joint_frames = [None] * count  # positions and velocities of joints, a column each
-
-    def save_frame(self, frame: int) -> None:
-        super().save_frame(frame)
-        if self.joints:
-            self.joint_frames[frame] = np.stack(self.state.joints[0], 1)
-
-    def place_obstacles(self, now: int) -> None:
-        super().place_obstacles(now)
-        if self.joints:
-            rows = runtime.fetch(self.arrays.offsets)[:, :3].astype(np.float64)
-            self.joints.put(rows, self.state.joints[0][0], (AT_STAGE, AT_BEGIN))
-            runtime.fill(self.arrays.offsets, rows)
 
     # ---- a pass -----------------------------------------------------------------------------------------------------
 

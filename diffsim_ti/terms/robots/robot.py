@@ -1,4 +1,4 @@
-"""Articulated robots, whose joints are unknowns of implicit steps together with the body."""
+"""Articulated robots, whose joints are unknowns of steps together with the body."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,7 +34,7 @@ class LinkContact(TypedDict, total=False):
 
 
 class Robot(GivenOverTime, Term):
-    """A tree of rigid links and joints, on a base that stands, with the joint positions q as unknowns of implicit steps.
+    """A tree of rigid links and joints, on a base that stands, with the joint positions q as unknowns of steps.
 
     `Robot.from_urdf(path)` makes one of the model, inputs, targets and name that it finds. A backward Euler step of length h
     from (x_n, q_n, v_n) is a stationary point, found by descent, of one incremental potential of body and joints,
@@ -46,6 +46,8 @@ class Robot(GivenOverTime, Term):
     M(q_n), the bias b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and arms and normal forces of friction, as
     of every obstacle, are those where the step begins: they change by O(h) within it, which keeps the first order of
     backward Euler. Action is reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
+    In explicit steps joints take substeps of backward Euler, which drives do not limit, and links are obstacles of the
+    contact stage: what vertices do to them turns joints in the same substep, by J M^-1 J^T. Fixed vertices do nothing there.
     Links touch the body alone: not one another, the ground, or other obstacles. No vertex can be fixed to a link; where the
     joints' motion is given, `Pose` moves a clamp as a link moves. `Simulator.set_state` leaves the joints where they are.
     `compute_energy` and the guard of the energy are those of the body.
