@@ -229,42 +229,40 @@ class JointStage(Stage):
         return by_q, by_m
 
 
-class JointStageTangent(JointTangent):
-    """Its tangent along a run."""
-
-    in_kicks = False
+class JointStageTangent(Stage):
+    """Its tangent along a run; `joints`: changes of them."""
 
     def __init__(self, stage: JointStage, run):
-        super().__init__(run.ws, run.tangent)
-        self.stage = stage
+        self.stage, self.joints = stage, JointTangent(run.ws, run.tangent)
 
     @contextmanager
     def tangent(self, at: Passes):
-        stage, J, ws, run = self.stage, self.joints, self.ws, at.run
+        stage, own, run = self.stage, self.joints, at.run
+        J, ws = own.joints, own.ws
         if ws.solver.schedule.shown(at.j, at.save_every) >= 0:
-            self.note()
+            own.note()
         if not at.now.alpha > 0:
             yield
             return
         touches, h = stage.reopen(at), at.now.h
         du_n = runtime.fetch_row(run.u, 0)
         if stage.own.size:
-            runtime.fill(run.offsets, self.rows_jvp(self.dq, self.dq))
+            runtime.fill(run.offsets, own.rows_jvp(own.dq, own.dq))
             runtime.clear([run.impulses.impulse])
         yield
-        dF = stage.slope() @ self.dq / h - h * self.force()  # for w as it is
+        dF = stage.slope() @ own.dq / h - h * own.force()  # for w as it is
         if touches:
             near, answers, z = stage.near, stage.answers(), stage.rebound()
             given = runtime.fetch(run.impulses.impulse).astype(np.float64)
             wrenches = stage.wrenches_of(given[:, near])
-            dx = (du_n + self.tangent.rest)[near]
+            dx = (du_n + own.tangent.rest)[near]
             wrenches[..., 3:] += np.cross(dx, stage.given[stage.own]).sum(1).reshape(-1, 2, 3)
-            felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), self.dq)
+            felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
             dw = -np.linalg.solve(stage.slope() + stage.weighed(answers), dF + stage.weighed(felt))
             felt = felt[0] + answers[0] @ dw
-            _, _, dk, dc, dm = J.robots.numbers(self.tangent.parameters)
+            _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
             by_q, by_m = stage.mass_derivatives(z)
-            dA = by_q @ self.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
+            dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
             dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * felt - dA)
             u, v = runtime.fetch(run.u), runtime.fetch(run.v)
             for b, du_b, dv_b, given_b in stage.moves:
@@ -278,7 +276,7 @@ class JointStageTangent(JointTangent):
             dw = dv = -np.linalg.solve(stage.slope(), dF)
         if stage.own.size:
             run.impulses.note_pass(at.numbers["counted"])
-        self.dq, self.dv = self.dq + h * dw, dv
+        own.dq, own.dv = own.dq + h * dw, dv
 
 
 class JointStageAdjoint(JointAdjoint):

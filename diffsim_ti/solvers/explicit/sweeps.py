@@ -195,7 +195,7 @@ class ExplicitTangent:
             runtime.fill(self.z, 0)
         self.rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
         self.stages = with_buffers("tangent", workspace.stages, self)
-        self.joints = next((stage for stage in self.stages if isinstance(stage, JointStageTangent)), None)
+        self.joints = next((stage.joints for stage in self.stages if isinstance(stage, JointStageTangent)), None)
         self.offsets = runtime.array(a.vector, a.poses.size)  # changes of where robots move obstacles
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
