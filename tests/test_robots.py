@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.common import rotations
 
 MASS = (
     '<inertial><origin xyz="{at} 0 0"/><mass value="{m}"/>'
@@ -163,7 +164,7 @@ def test_a_prescribed_joint_hides_no_light_one(precision, kind, force, h, inerti
 def wheel():
     """A link that turns far from the body."""
     text = urdf(link("a"), link("b", 1.0, shape='<sphere radius="0.01"/>'), joint("j", "revolute", "a", "b", "0 5 0"))
-    robot = ds.Robot.from_urdf(text, width=1e-3, stiffness_per_area=1e7)
+    robot = ds.Robot.from_urdf(text, width=1e-3, stiffness_per_area=1e7, limits=False)
     return ds.ImplicitEulerSolver(scene_of(robot, fixed="ymin"), dt=1e-2)
 
 
@@ -215,8 +216,8 @@ def test_links_stand_where_they_are_when_a_run_goes_on():
     for one in (first, second):
         one.step()
     np.testing.assert_array_equal(first.positions, second.positions)
-    with pytest.raises(ValueError, match=r"joint_states: expected finite numbers, float64 of shape \(1, 2\)"):
-        second.resume(kept | dict(joint_states=np.zeros((3, 2))))
+    with pytest.raises(ValueError, match=r"joint_states: expected finite numbers, float64 of shape \(1, 3\)"):
+        second.resume(kept | dict(joint_states=np.zeros((3, 3))))
     run = ForwardRun(scene, ds.ImplicitEulerSolver, 0.04, dt=1e-2)
     run.advance()
     assert run.seen.crossed == 0 and run.seen.gap > 0
@@ -451,3 +452,163 @@ def test_two_robots_and_a_ball_in_any_order_have_the_same_run_and_exact_gradient
         sides.append(sum(float((seeds[k] * there[k]).sum()) for k in seeds))
     whole = sum(float((gradients[name] * change[name]).sum()) for name in change)
     assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(whole, rel=1e-5)
+
+
+# ---- bodies that links hold ------------------------------------------------------------------------------------------
+
+CONTACT = dict(friction=0.4, friction_speed=0.05, width=4e-3, stiffness_per_area=3e7)
+Q = np.array([0.3, -1.0])
+
+
+def held_by_arm(mesh, terms=(), limits=True, **options):
+    """A block on the tip of the arm."""
+    text = ARM.replace('upper="3"', 'upper="0.3005"', 1) if limits else ARM
+    given = dict(positions=Q, velocities=[1.0, -0.5], drive_stiffness=2.0, torques=[5.0, 0.1], links=())
+    arm = ds.Robot.from_urdf(text, "arm", attached=dict(tip="xmin"), **given | options)
+    return ds.Scene(mesh, SOFT, 500.0, [arm, *terms], precision="f64")
+
+
+def differs(rollout, frames, seeds, gradients, change):
+    """Central difference of a loss along a change of all inputs, and what gradients say of it."""
+    sides = []
+    for e in (1e-5, -1e-5):
+        there = rollout.forward(**{name: x + e * change[name] for name, x in frames.inputs.items()})
+        sides.append(sum(float((seeds[k] * there[k]).sum()) for k in seeds))
+    return (sides[0] - sides[1]) / 2e-5, sum(float((gradients[name] * change[name]).sum()) for name in change)
+
+
+def test_every_gradient_goes_through_vertices_that_links_hold():
+    """A block on an arm whose shoulder meets its limit; a link touches it where it is held, a ball elsewhere."""
+    tip = ds.Robot.from_urdf(ARM).poses(Q)["robot_tip"][:3]
+    mesh = moved(tip - [0.0, 0.03, 0.03])
+    text = urdf(
+        link("foot"),
+        link("b", 0.3, 0.0, shape='<sphere radius="0.02"/>'),
+        joint("j", "prismatic", "foot", "b", "0 0 0", "0 1 0"),
+    )
+    above = [*(tip + [0.004, 0.0526, 0.003]), 0, 0, 0]
+    slide = ds.Robot.from_urdf(text, "slide", above, targets=lambda t: [-0.2 * t], prescribed=["j"], **CONTACT)
+    ball = ds.Sphere(tip + [0.063, -0.0521, -0.004], 0.02, name="ball", by_pairs=False, **CONTACT)
+    scene = held_by_arm(mesh, [slide, ball, ds.Gravity()])
+    outputs = [
+        f(robot) for f in (ds.JointPositions, ds.JointVelocities, ds.JointEfforts, ds.LinkEnergy) for robot in ("arm",)
+    ]
+    outputs += [ds.LinkMotion("tip", "arm"), ds.JointEfforts("slide", "pushed"), ds.ElasticEnergy()]
+    outputs += [ds.Reaction("xmin"), ds.Reaction("xmin", "moment", about=tip)]
+    outputs += [ds.ContactForce("ball"), ds.ContactForce("slide_b", name="on_slide", per_vertex=True)]
+    steps, rng = 3, np.random.default_rng(1)
+    solver = ds.ImplicitEulerSolver(scene, dt=5e-3, tolerance=1e-12)
+    rollout = ds.Rollout(solver, steps, save_every=1, gradients="all", outputs=outputs)
+    frames = rollout.forward()
+    held = mesh.vertex_indices("xmin")
+    assert np.abs(frames["on_slide"][-1, held]).max() > 0.05 and np.abs(frames["contact_force"][-1]).max() > 0.05
+    assert 0.3005 < frames["joint_positions"][-1, 0] < 0.3006
+    x, (t, turn) = frames.positions[-1, held], np.split(frames["link_motion"][-1, :7], [3])
+    x0, (t0, turn0) = mesh.vertices[held], np.split(frames["link_motion"][0, :7], [3])
+    local = rotations.turned(rotations.conjugate(turn0), x0 - t0)
+    np.testing.assert_allclose(t + rotations.turned(turn, local), x, atol=1e-14)
+    seeds = {
+        name: rng.normal(size=frames[name].shape) for name in ("positions", "velocities", *(y.name for y in outputs))
+    }
+    gradients, change = rollout.vjp(frames, **seeds), {}
+    for name, value in frames.inputs.items():
+        size = 1e-3 if name.endswith("positions") else max(0.1 * float(np.abs(value).max()), 1e-3)
+        change[name] = size * rng.normal(size=value.shape)
+    own = [name for name in change if name.startswith("arm.") or name.endswith("_positions")]
+    for names in (*([name] for name in own), change.keys() - set(own)):
+        tangents = rollout.tangents(frames, **{name: change[name] for name in names})
+        pushed = sum(float((seeds[k] * tangents[k]).sum()) for k in seeds)
+        pulled = sum(float((gradients[name] * change[name]).sum()) for name in names)
+        assert pushed == pytest.approx(pulled, rel=1e-9), names
+    difference, whole = differs(rollout, frames, seeds, gradients, change)
+    assert difference == pytest.approx(whole, rel=1e-5)
+
+
+BOB = ds.TetrahedralMesh.create_box((3, 3, 3), 0.06, origin=(0.2, -0.03, -0.03))
+ROD = urdf(
+    link("a"),
+    link("rod", 0.2, 0.1),
+    joint(
+        "j",
+        "revolute",
+        "a",
+        "rod",
+        "0 0 0",
+        more='<limit lower="-3" upper="3" effort="9" velocity="9"/><dynamics damping="0.02"/>',
+    ),
+)
+
+
+def swing(E: float, steps: int):
+    """A rod with a block at its end falls from where it is level, for 0.2 s, with a torque: (angle, energy that is lost)."""
+    robot = ds.Robot.from_urdf(ROD, attached=dict(rod="xmin"), torques=[0.1], links=())
+    scene = ds.Scene(BOB, ds.StableNeoHookean(E, 0.3), 500.0, [robot, ds.Gravity()], precision="f64")
+    outputs = [ds.JointPositions(), ds.JointEfforts(), ds.LinkEnergy(), ds.KineticEnergy(), ds.ElasticEnergy()]
+    rollout = ds.Rollout(
+        ds.ImplicitEulerSolver(scene, dt=0.2 / steps),
+        steps,
+        save_every=1,
+        outputs=[*outputs, ds.WorkOfLoads(weight=True)],
+    )
+    f = rollout.forward()
+    worked = f["work"][-1] + float((f["joint_efforts"][1:] * np.diff(f["joint_positions"], axis=0)).sum())
+    stored = f["link_energy"].sum(1) + f["kinetic_energy"] + f["elastic_energy"]
+    return f["joint_positions"][-1, 0], worked - (stored[-1] - stored[0]), scene
+
+
+def test_a_pendulum_with_a_stiff_bob_is_a_rigid_one_and_its_energy_is_balanced():
+    """Against scipy at 1e-10: both errors halve with the step, and what is left of them by extrapolation is small."""
+    from scipy.integrate import solve_ivp
+
+    (coarse, lost, scene), (fine, lost_less, _) = swing(1e7, 20), swing(1e7, 40)
+    m, x = scene.mass_matrix().diagonal()[::3], BOB.vertices
+    inertia, arm = 0.2 * 0.1**2 + 1e-3 + m @ (x[:, :2] ** 2).sum(1), 0.2 * 0.1 + m @ x[:, 0]
+    equation = lambda t, y: (y[1], (0.1 - 9.81 * arm * np.cos(y[0]) - 0.02 * y[1]) / inertia)  # noqa: E731
+    exact = solve_ivp(equation, (0, 0.2), (0.0, 0.0), rtol=1e-10, atol=1e-10).y[0, -1]
+    assert (coarse - exact) / (fine - exact) == pytest.approx(2, abs=0.1)
+    assert 2 * fine - coarse == pytest.approx(exact, abs=1e-3)
+    assert lost > 0 and lost / lost_less == pytest.approx(2, abs=0.1)
+
+
+def test_a_joint_stops_at_its_limit_and_says_what_that_takes():
+    text = urdf(link("a"), link("b", 2.0), joint("j", "prismatic", "a", "b", "0 0 0", "0 1 0"))
+    robot = ds.Robot.from_urdf(text.replace('lower="-3"', 'lower="-0.01"'), links=())
+    outputs = [ds.JointPositions(), ds.JointVelocities(), ds.JointEfforts()]
+    solver = ds.ImplicitEulerSolver(scene_of(robot, terms=[ds.Gravity()], fixed="ymin"), dt=5e-3)
+    rollout = ds.Rollout(solver, 30, save_every=10, outputs=outputs)
+    frames = rollout.forward()
+    assert frames["joint_positions"][-1, 0] == pytest.approx(-0.01, abs=1e-6)
+    assert abs(frames["joint_velocities"][-1, 0]) < 1e-9 and frames["joint_efforts"][-1, 0] == pytest.approx(2 * 9.81)
+    free = ds.Robot.from_urdf(text.replace('lower="-3"', 'lower="-0.01"'), links=(), limits=False)
+    solver = ds.ImplicitEulerSolver(solver.scene.replace(terms=[free, ds.Gravity()]), dt=5e-3)
+    frames = ds.Rollout(solver, 30, outputs=outputs).forward()
+    assert frames["joint_positions"][-1, 0] < -0.1 and not frames["joint_efforts"].any()
+
+
+def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works():
+    for change in (('lower="-3"', 'lower="3"'), ('upper="3"', 'upper="0.2"')):
+        text, given = ARM.replace(*change, 1), dict(positions=Q, links=())
+        with pytest.raises(ValueError, match="limits=False"):
+            ds.Robot.from_urdf(text, **given)
+        assert not np.isfinite(ds.Robot.from_urdf(text, limits=False, **given).limits).any()
+    narrow = ds.Robot.from_urdf(ARM.replace('upper="3"', 'upper="0.4"', 1), links=())
+    with pytest.raises(ValueError, match="starts at 0.5, beyond its limits -3 and 0.4"):
+        ds.Rollout(ds.ImplicitEulerSolver(scene_of(narrow), dt=1e-3), 1).forward(**{"robot.positions": [0.5, 0.0]})
+    with pytest.raises(ValueError, match="attached: no link 'hand'; the file has base"):
+        ds.Robot.from_urdf(ARM, attached=dict(hand="xmin"))
+    arm = ds.Robot.from_urdf(ARM, attached=dict(tip="xmin"), links=())
+    for options, message, less in (
+        (dict(fixed="ymin"), "name sets that share no vertices", dict(fixed="xmax")),
+        (dict(terms=[ds.SelfContact()]), "leave these out", dict()),
+        (
+            dict(terms=[ds.Sphere((0, 1, 0), 0.1, by_pairs=True, **CONTACT)]),
+            "by_pairs=False",
+            dict(terms=[ds.Sphere((0, 1, 0), 0.1, by_pairs=False, **CONTACT)]),
+        ),
+        (dict(terms=[ds.Pressure(10.0, "ymax")]), "which .* has not: leave out", dict()),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **options), dt=1e-3))
+        ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **less), dt=1e-3))
+    with pytest.raises(ValueError, match="LinkMotion: no link 'hand'; there are base"):
+        ds.LinkMotion("hand").settled(scene_of(arm))

@@ -173,7 +173,7 @@ class Workspace:
     def make_frames(self, count: int) -> None:
         """Room for `count` saved states."""
         self.frames = FrameArrays.of(self.arrays, count, self.arrays.num_vertices)
-        self.joint_frames = [None] * count  # positions and velocities of joints, a column each
+        self.joint_frames = [None] * count  # positions, velocities and efforts of joints, a column each
         self._launches.clear()
 
     def balance(self):
@@ -229,7 +229,7 @@ class Workspace:
         begin = schedule.begin(j)
         rows = arrays.poses.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
         if led:
-            self.joints.put_moving(rows, *self.state.joints[0])
+            self.joints.put_moving(rows, *self.state.joints[0][:2])
         position = arrays.values.rest[vertex] + runtime.fetch(self.state.u)[0, vertex]
         return arrays.poses.velocity_at(k, rows, position, self.watch.contacts[k].about)
 

@@ -96,7 +96,8 @@ class JointStage(Stage):
                 copy_slot(source, 1, target, at.end)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
-        history.joints[at.end], self.met[at.end] = (J.q, J.w - self.rebound()), (J.w, touches)
+        history.joints[at.end] = J.q, J.w - self.rebound(), sum(J._efforts())
+        self.met[at.end] = J.w, touches
 
     def look(self) -> bool:
         """Note what links have done to vertices, and say whether that is anything."""
@@ -176,7 +177,9 @@ class JointStage(Stage):
 
     def slope(self, meets: bool = False) -> np.ndarray:
         """Derivative of the equation by w, or of its part without contact."""
-        return self.inertia + self.weighed(self.answers()) if meets else self.inertia
+        J = self.joints
+        own = J.M + J.h**2 * np.diag(J.yielding)
+        return own + self.weighed(self.answers()) if meets else own
 
     def rebound(self) -> np.ndarray:
         """(1 - b) A^-1 J^T P"""
@@ -276,7 +279,8 @@ class JointStageTangent(Stage):
             dw = dv = -np.linalg.solve(stage.slope(), dF)
         if stage.own.size:
             run.impulses.note_pass(at.numbers["counted"])
-        own.dq, own.dv = own.dq + h * dw, dv
+        own.step(own.dq + h * dw)
+        own.dv = dv
 
 
 class JointStageAdjoint(JointAdjoint):
@@ -291,7 +295,7 @@ class JointStageAdjoint(JointAdjoint):
     def seed_frames(self, seeds):
         super().seed_frames(seeds)
         if not self.ws.solver.last_frame_is_state:  # its last pass shows the last frame
-            self.by_q, self.by_v = np.zeros((2, self.joints.count))
+            self.clear()
         a = self.ws.arrays
         self.by_rest, self.by_gravity = np.zeros((a.num_vertices, 3)), np.zeros(3)
         self.by_steps = SimpleNamespace(joints=np.zeros_like(a.rows["joints"]))
@@ -307,7 +311,7 @@ class JointStageAdjoint(JointAdjoint):
             return
         touches, h, rows = stage.reopen(at), at.now.h, np.zeros_like(stage.rows)
         seeds = run.impulses.of_frame(at.numbers["counted"]) if stage.own.size else 0.0
-        by_w, K = h * self.by_q + self.by_v, stage.slope()
+        by_w, K = h * (self.by_q - J.yielding * self.by_effort) + self.by_v, stage.slope()
         if touches:
             run.complete()
             near, answers, z = stage.near, stage.answers(), stage.rebound()
@@ -356,7 +360,7 @@ class JointStageAdjoint(JointAdjoint):
 
     def collect(self, out) -> None:
         """Add what was summed up."""
-        super().collect(out.parameters)
+        super().collect(out)
         at = self.ws.arrays.features().gravity
         if at >= 0:
             out.parameters[at : at + 3] += self.by_gravity

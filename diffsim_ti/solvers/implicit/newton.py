@@ -257,13 +257,17 @@ class Newton:
         """The Hessian of Phi where the potential stands."""
         return Operator(self.potential, self.mass, self.free, self.others)
 
-    def _residual(self, u):
+    def balance(self, u, mass, inertial, loads):
+        """(-dPhi/du of a problem where the potential stands, of all vertices [N]; sizes of the forces that meet at each)."""
         f, sizes = self.potential.forces()
-        inertia = self.mass * (u - self.inertial)
         if self.others:
             f, sizes = f + self.others.forces(u), sizes + self.others.sizes(u)
+        return f + loads - mass * (u - inertial), sizes
+
+    def _residual(self, u):
+        R, sizes = self.balance(u, self.mass, self.inertial, self.loads)
+        inertia = self.mass * (u - self.inertial)
         size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.moves).sum())
-        R = f + self.loads - inertia
         self.rigid.feel(R)
         return R * self.free, size
 
@@ -287,7 +291,8 @@ class Newton:
             direction, R = self._direction_of(u, R, forcing)
         if friction:
             self.turning = friction.turns(u, u + direction)
-        return cleaned(linear_of(self.free), direction), R
+        direction, joints = cleaned(linear_of(self.free), direction), self.potential.joints
+        return joints.extended(direction) if joints else direction, R
 
     def _direction_of(self, u, R, forcing):
         A = self.operator()
@@ -405,7 +410,7 @@ class Newton:
         if device:
             device.stand(self, u)
             return device.rise
-        self.potential.place(u)
+        u = self.potential.place(u)
         E, _, J0 = self.potential.energy()
 
         def rise(there: np.ndarray) -> float:

@@ -74,6 +74,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         a = self.arrays
         self._mass = self.mass_of(derived)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
+        if self.joints:
+            self.free[self.joints.at] = 0.0
         self.rigid = self.potential.rigid = RigidSets(self.scene.reduced, derived.rest)
         if self.scene.reduced:
             self.free = FreeBodies(
@@ -86,6 +88,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         self.hosts.restrict(projectors_of(self.free), derived.rest)
         self.potential.hosts, others = self.hosts.with_energy, self.hosts.without_energy
+        if self.joints:
+            self.joints.check_forces(others)
         self.volumes = self.volume_constraints(eps)
         self.multipliers = {}  # the pressures [Pa] that each pass ended with
         self.preconditioner, self.noted = self.preconditioners_kind(self), Noted(self)
@@ -230,6 +234,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         x, y = self.inertial(stage, u, v, before)
         place, speed = self.prescribed(j, self.arrays.values)
         problem = self.problem(j, stage, x, y)
+        if self.joints:
+            self.joints.problem = problem
         self.rigid.begin(u, stage.c0)
         starts = [] if stage.static else [problem[1], x + stage.gamma * y]
         held = (
@@ -248,7 +254,7 @@ class ImplicitWorkspace(PrescribedInPasses):
             raise self.collisions.explained(error, u) from None
         self.u_star = u_star
         if self.joints:
-            self.potential.place(u_star)
+            u_star = self.u_star = self.potential.place(u_star)
             self.joints.end()
         self.keep_multipliers(j)
         v_star = (u_star - x) / stage.gamma
