@@ -64,7 +64,8 @@ class ExplicitAdjoint:
         # of paths: the adjoint by each vertex in the steps that a launch goes through, and the sums of that
         out["path_adjoint"] = 2 * moving * self._most_steps(workspace), n if moving else 1
         out["path"] = a.path.shape[0], moving * self.num_parts
-        out["offsets"] = (a.poses.size, n) if has.led else (1, 1)
+        if has.led:
+            out["offsets"] = a.poses.size, n
         for x in a.interactions:
             out |= x.adjoints(a.values, has.shape)
         return out
@@ -196,7 +197,7 @@ class ExplicitTangent:
         self.rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
         self.stages = with_buffers("tangent", workspace.stages, self)
         self.joints = next((stage.joints for stage in self.stages if isinstance(stage, JointStageTangent)), None)
-        self.offsets = runtime.array(a.vector, a.poses.size)  # changes of where robots move obstacles
+        self.offsets = runtime.array(a.vector, a.poses.size) if self.features.led else None  # where robots move obstacles
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
