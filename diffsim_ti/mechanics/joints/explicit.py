@@ -35,6 +35,21 @@ class ExplicitJoints(Joints):
     def acceleration(self):
         return (self.w - self.v_n) / self.h
 
+    def go(self, w: np.ndarray, rows: np.ndarray) -> None:
+        """Stand there, with the velocities of links in rows of obstacles."""
+        self.w, self.q = w, self.q_n + self.h * w
+        self.put_rates(rows, w)
+
+    def put_rates(self, rows: np.ndarray, w: np.ndarray) -> None:
+        self._put_rates(rows, w)
+
+    def own_forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(-dPhi/dq, sizes of what it adds up, what digits of places leave)"""
+        return *self._own_forces(), self._rounding()
+
+    def effort(self) -> np.ndarray:
+        return sum(self._efforts())
+
 
 class JointStage(Stage):
     """The stage. `met`: (w, whether links touched) of each recorded pass, by its slot."""
@@ -66,9 +81,7 @@ class JointStage(Stage):
 
     def go(self, w: np.ndarray) -> None:
         """Links move with w in the pass; nothing is noted of it."""
-        J = self.joints
-        J.w, J.q = w, J.q_n + J.h * w
-        J._put_rates(self.rows, w)
+        self.joints.go(w, self.rows)
         if self.own.size:
             runtime.fill(self.ws.arrays.offsets, self.rows)
             runtime.clear([self.ws.impulses.impulse])
@@ -96,7 +109,7 @@ class JointStage(Stage):
                 copy_slot(source, 1, target, at.end)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
-        history.joints[at.end] = J.q, J.w - self.rebound(), sum(J._efforts())
+        history.joints[at.end] = J.q, J.w - self.rebound(), J.effort()
         self.met[at.end] = J.w, touches
 
     def look(self) -> bool:
@@ -140,11 +153,11 @@ class JointStage(Stage):
     def left(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(what is left of that equation, sizes of what it adds up, what digits of places leave)"""
         J = self.joints
-        own, size = J._own_forces()
+        own, size, noise = J.own_forces()
         x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
         sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
-        return self.weighed(self.felt(self.wrenches)) - J.h * own, J.h * size + met, J.h * J._rounding()
+        return self.weighed(self.felt(self.wrenches)) - J.h * own, J.h * size + met, J.h * noise
 
     def find(self, meets: bool = False) -> None:
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
@@ -194,7 +207,7 @@ class JointStage(Stage):
         self.moves = []
         for b in np.flatnonzero(self.carried[touched].any(0)):
             rows = np.zeros_like(self.rows)
-            J._put_rates(rows, np.eye(J.count)[b])
+            J.put_rates(rows, np.eye(J.count)[b])
             runtime.fill(change.offsets, rows)
             runtime.clear([change.u, change.v, change.impulse])
             self.launch("press_jvp", rate_dot=0.0)

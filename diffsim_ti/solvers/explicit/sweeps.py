@@ -197,7 +197,9 @@ class ExplicitTangent:
         self.rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
         self.stages = with_buffers("tangent", workspace.stages, self)
         self.joints = next((stage.joints for stage in self.stages if isinstance(stage, JointStageTangent)), None)
-        self.offsets = runtime.array(a.vector, a.poses.size) if self.features.led else None  # where robots move obstacles
+        self.offsets = (
+            runtime.array(a.vector, a.poses.size) if self.features.led else None
+        )  # where robots move obstacles
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
