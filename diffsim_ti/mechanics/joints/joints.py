@@ -81,7 +81,7 @@ class Joints:
     def _take_held(self) -> None:
         """at: vertices that links hold; grips: of each link the places among them, the joint that carries it, -1 of the
         base, and the joints that move it; holding: the last of each vertex, shape (k, joints, 1)."""
-        self.at, self.grips, self.holding, self.felt = np.zeros(0, np.int64), [], np.zeros((0, self.count, 1)), 0.0
+        self.at, self.grips, self.holding = np.zeros(0, np.int64), [], np.zeros((0, self.count, 1))
         self.pull, self.J_a = np.zeros((0, 3)), np.zeros((0, self.count, 3))  # R_a and J
         for robot, own in zip(self.robots.terms, self.slices):
             for joint, vertices in robot.holds:
@@ -176,7 +176,7 @@ class Joints:
         self.torques = given[schedule.load_row(given, j)][:, 2]
         self.k = np.where(self.robots.prescribed, STIFF * self.robots.typical / self.h**2, self.k)
         self.c = self.c + self.robots.damping
-        self.q, self._held, self._placed, self._anchor = self.q_n.copy(), None, None, None
+        self.q, self._held, self._placed, self._anchor, self.felt = self.q_n.copy(), None, None, None, 0.0
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
         self._put_rates(rows, np.zeros(self.count))
 
