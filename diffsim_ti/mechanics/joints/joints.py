@@ -75,7 +75,7 @@ class Joints:
         self.shares = Shares(workspace) if self.links else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
         self.loose = max(1e-6, 1e3 * self.eps)  # of their forces, what rounding of the vertices' places may leave
-        self._known, self._zero, self._held, self._placed, self._anchor = None, None, None, None, None
+        self._known, self._zero, self._held, self._placed, self._back, self._anchor = [None] * 6
         self.q, self.left, self.now = None, 0.0, self.start()
 
     def _take_held(self) -> None:
@@ -177,6 +177,7 @@ class Joints:
         self.k = np.where(self.robots.prescribed, STIFF * self.robots.typical / self.h**2, self.k)
         self.c = self.c + self.robots.damping
         self.q, self._held, self._placed, self._anchor, self.felt = self.q_n.copy(), None, None, None, 0.0
+        self._back = None
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
         self._put_rates(rows, np.zeros(self.count))
 
@@ -187,12 +188,12 @@ class Joints:
     @contextmanager
     def still(self):
         """Stand where they are while the body is placed elsewhere."""
-        kept = self._held
+        kept, found = self._held, self._placed
         self.hold(self.q)
         try:
             yield
         finally:
-            self._held, self._placed = kept, None
+            self._held, self._placed, self._back = kept, None, np.zeros(0) if found is None else found
 
     def check_forces(self, others) -> None:
         """Raise ValueError for forces on the body that are not symmetric, beside vertices that links hold."""
@@ -322,9 +323,13 @@ class Joints:
         if self._placed is not None and np.array_equal(own, self._placed):
             self._carry(u)
             return
-        self._placed = own
+        self._placed, back, self._back = own, self._back, None
         if self._held is not None:
             self._stand(self._held, u)
+            return
+        if back is not None:  # `still` is over
+            self._placed = own if np.array_equal(own, back) else None
+            self._stand(self.q, u)
             return
         R, size = self._stand(self._predicted(u), u)
         best, stalled = np.inf, 0
