@@ -579,7 +579,7 @@ def test_a_joint_stops_at_its_limit_and_says_what_that_takes():
     assert moves["joint_efforts"][-1, 0] == pytest.approx(1.0)
 
 
-def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works():
+def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works(monkeypatch):
     for change in (('lower="-3"', 'lower="3"'), ('upper="3"', 'upper="0.2"')):
         text, given = ARM.replace(*change, 1), dict(positions=Q, links=())
         with pytest.raises(ValueError, match="limits=False"):
@@ -604,5 +604,8 @@ def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advic
         with pytest.raises(ValueError, match=message):
             ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **options), dt=1e-3))
         ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **less), dt=1e-3))
+    monkeypatch.setattr(ds.SemiImplicitSolver, "moves_robots", True)
+    with pytest.raises(ValueError, match="attached= of a robot is for backward Euler steps alone: take Impl"):
+        ds.SemiImplicitSolver(scene_of(arm), dt=1e-5)
     with pytest.raises(ValueError, match="LinkMotion: no link 'hand'; there are base"):
         ds.LinkMotion("hand").settled(scene_of(arm))
