@@ -496,7 +496,7 @@ def test_every_gradient_goes_through_vertices_that_links_hold():
     outputs += [ds.LinkMotion("tip", "arm"), ds.JointEfforts("slide", "pushed"), ds.ElasticEnergy()]
     outputs += [ds.Reaction("xmin"), ds.Reaction("xmin", "moment", about=tip)]
     outputs += [ds.ContactForce("ball"), ds.ContactForce("slide_b", name="on_slide", per_vertex=True)]
-    steps, rng = 3, np.random.default_rng(1)
+    steps, rng = 2, np.random.default_rng(1)
     solver = ds.ImplicitEulerSolver(scene, dt=5e-3, tolerance=1e-12)
     rollout = ds.Rollout(solver, steps, save_every=1, gradients="all", outputs=outputs)
     frames = rollout.forward()
@@ -581,11 +581,15 @@ def test_a_joint_stops_at_its_limit_and_says_what_that_takes():
     assert abs(frames["joint_velocities"][-1, 0]) < 1e-9 and frames["joint_efforts"][-1, 0] == pytest.approx(2 * 9.81)
     free = ds.Robot.from_urdf(text.replace('lower="-3"', 'lower="-0.01"'), links=(), limits=False)
     solver = ds.ImplicitEulerSolver(solver.scene.replace(terms=[free, ds.Gravity()]), dt=5e-3)
-    frames = ds.Rollout(solver, 30, outputs=outputs).forward()
+    rollout = ds.Rollout(solver, 30, outputs=outputs)
+    frames = rollout.forward()
     assert frames["joint_positions"][-1, 0] < -0.1 and not frames["joint_efforts"].any()
+    moves = rollout.tangents(frames, **{"robot.torques": [1.0]})
+    assert moves["joint_positions"][-1, 0] == pytest.approx(5e-3**2 * 30 * 31 / 2 / 2.0)
+    assert moves["joint_efforts"][-1, 0] == pytest.approx(1.0)
 
 
-def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works():
+def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works(monkeypatch):
     for change in (('lower="-3"', 'lower="3"'), ('upper="3"', 'upper="0.2"')):
         text, given = ARM.replace(*change, 1), dict(positions=Q, links=())
         with pytest.raises(ValueError, match="limits=False"):
@@ -610,5 +614,8 @@ def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advic
         with pytest.raises(ValueError, match=message):
             ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **options), dt=1e-3))
         ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **less), dt=1e-3))
+    monkeypatch.setattr(ds.SemiImplicitSolver, "moves_robots", True)
+    with pytest.raises(ValueError, match="attached= of a robot is for backward Euler steps alone: take Impl"):
+        ds.SemiImplicitSolver(scene_of(arm), dt=1e-5)
     with pytest.raises(ValueError, match="LinkMotion: no link 'hand'; there are base"):
         ds.LinkMotion("hand").settled(scene_of(arm))

@@ -75,13 +75,13 @@ class Joints:
         self.shares = Shares(workspace) if self.links and self.p else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
         self.loose = max(1e-6, 1e3 * self.eps)  # of their forces, what rounding of the vertices' places may leave
-        self._known, self._zero, self._held, self._placed, self._anchor = None, None, None, None, None
+        self._known, self._zero, self._held, self._placed, self._back, self._anchor = [None] * 6
         self.q, self.left, self.now = None, 0.0, self.start()
 
     def _take_held(self) -> None:
         """at: vertices that links hold; grips: of each link the places among them, the joint that carries it, -1 of the
         base, and the joints that move it; holding: the last of each vertex, shape (k, joints, 1)."""
-        self.at, self.grips, self.holding, self.felt = np.zeros(0, np.int64), [], np.zeros((0, self.count, 1)), 0.0
+        self.at, self.grips, self.holding = np.zeros(0, np.int64), [], np.zeros((0, self.count, 1))
         self.pull, self.J_a = np.zeros((0, 3)), np.zeros((0, self.count, 3))  # R_a and J
         for robot, own in zip(self.robots.terms, self.slices):
             for joint, vertices in robot.holds:
@@ -182,7 +182,8 @@ class Joints:
         self.torques = given[schedule.load_row(given, j)][:, 2]
         self.k = np.where(self.robots.prescribed, STIFF * self.robots.typical / self.h**2, self.k)
         self.c = self.c + self.robots.damping
-        self.q, self._held, self._placed, self._anchor = self.q_n.copy(), None, None, None
+        self.q, self._held, self._placed, self._anchor, self.felt = self.q_n.copy(), None, None, None, 0.0
+        self._back = None
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
         self._put_rates(rows, np.zeros(self.count))
 
@@ -193,12 +194,12 @@ class Joints:
     @contextmanager
     def still(self):
         """Stand where they are while the body is placed elsewhere."""
-        kept = self._held
+        kept, found = self._held, self._placed
         self.hold(self.q)
         try:
             yield
         finally:
-            self._held, self._placed = kept, None
+            self._held, self._placed, self._back = kept, None, np.zeros(0) if found is None else found
 
     def check_forces(self, others) -> None:
         """Raise ValueError for forces on the body that are not symmetric, beside vertices that links hold."""
@@ -328,9 +329,13 @@ class Joints:
         if self._placed is not None and np.array_equal(own, self._placed):
             self._carry(u)
             return
-        self._placed = own
+        self._placed, back, self._back = own, self._back, None
         if self._held is not None:
             self._stand(self._held, u)
+            return
+        if back is not None:  # `still` is over
+            self._placed = own if np.array_equal(own, back) else None
+            self._stand(self.q, u)
             return
         R, size = self._stand(self._predicted(u), u)
         best, stalled = np.inf, 0

@@ -410,7 +410,8 @@ class Newton:
         if device:
             device.stand(self, u)
             return device.rise
-        u = self.potential.place(u)
+        placed = self.potential.place(u)
+        u = placed if self.potential.joints else u  # vertices that links hold are elsewhere
         E, _, J0 = self.potential.energy()
 
         def rise(there: np.ndarray) -> float:

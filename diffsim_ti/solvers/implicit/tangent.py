@@ -82,7 +82,7 @@ class ImplicitTangent(RecordedPasses):
         if tangent.growths is not None:
             moved = ws.growth_of(tangent.growths, j, s)
             runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
-        if poses is not None:
+        if poses is not None and len(poses):
             runtime.fill(self.poses, poses)
         if ws.strains:
             ws.strains.jvp(s, (self.u, self.du), (self.before, self.tangent_before), self)
@@ -114,7 +114,8 @@ class ImplicitTangent(RecordedPasses):
         if self.joints:
             d_star[ws.joints.at] += np.einsum("iad,a->id", ws.joints.J_a, dq)
             poses = poses + self.joints.rows_jvp(dq, np.zeros_like(dq))
-            runtime.fill(self.poses, poses)
+            if len(poses):
+                runtime.fill(self.poses, poses)
         if self.contacts:
             self._note_contacts(j, save_every, d_star, dx, poses)
         if self.joints:
