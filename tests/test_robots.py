@@ -570,22 +570,24 @@ def test_a_pendulum_with_a_stiff_bob_is_a_rigid_one_and_its_energy_is_balanced()
     assert lost > 0 and lost / lost_less == pytest.approx(2, abs=0.1)
 
 
-def test_a_joint_stops_at_its_limit_and_says_what_that_takes():
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_a_joint_stops_at_its_limit_and_says_what_that_takes(kind):
+    h, steps = (1e-3, 150) if kind.explicit else (5e-3, 30)
     text = urdf(link("a"), link("b", 2.0), joint("j", "prismatic", "a", "b", "0 0 0", "0 1 0"))
     robot = ds.Robot.from_urdf(text.replace('lower="-3"', 'lower="-0.01"'), links=())
     outputs = [ds.JointPositions(), ds.JointVelocities(), ds.JointEfforts()]
-    solver = ds.ImplicitEulerSolver(scene_of(robot, terms=[ds.Gravity()], fixed="ymin"), dt=5e-3)
-    rollout = ds.Rollout(solver, 30, save_every=10, outputs=outputs)
+    solver = kind(scene_of(robot, terms=[ds.Gravity()], fixed="ymin"), dt=h)
+    rollout = ds.Rollout(solver, steps, save_every=steps, outputs=outputs)
     frames = rollout.forward()
     assert frames["joint_positions"][-1, 0] == pytest.approx(-0.01, abs=1e-6)
     assert abs(frames["joint_velocities"][-1, 0]) < 1e-9 and frames["joint_efforts"][-1, 0] == pytest.approx(2 * 9.81)
     free = ds.Robot.from_urdf(text.replace('lower="-3"', 'lower="-0.01"'), links=(), limits=False)
-    solver = ds.ImplicitEulerSolver(solver.scene.replace(terms=[free, ds.Gravity()]), dt=5e-3)
-    rollout = ds.Rollout(solver, 30, outputs=outputs)
+    solver = kind(solver.scene.replace(terms=[free, ds.Gravity()]), dt=h)
+    rollout = ds.Rollout(solver, steps, outputs=outputs)
     frames = rollout.forward()
     assert frames["joint_positions"][-1, 0] < -0.1 and not frames["joint_efforts"].any()
     moves = rollout.tangents(frames, **{"robot.torques": [1.0]})
-    assert moves["joint_positions"][-1, 0] == pytest.approx(5e-3**2 * 30 * 31 / 2 / 2.0)
+    assert moves["joint_positions"][-1, 0] == pytest.approx(h**2 * steps * (steps + 1) / 2 / 2.0)
     assert moves["joint_efforts"][-1, 0] == pytest.approx(1.0)
 
 
