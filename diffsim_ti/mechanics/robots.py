@@ -8,7 +8,7 @@ from diffsim_ti.terms.robots.robot import Robot
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.whole_body import RotatingFrame
 
-SOFT = 1e-4  # of the range of a joint
+SOFT = 1e-4  # of the range of a joint, on which its limits grow stiff
 
 
 class Robots(Interaction):

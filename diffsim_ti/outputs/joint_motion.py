@@ -107,10 +107,8 @@ class LinkMotion(JointPositions):
         joint, place = self.model.links[self.link]
         turn, t = joined(frames[joint], place) if joint >= 0 else place
         S = S * self.model.carries(joint)[:, None]
-        J, turns = (
-            np.concatenate([moved(S, t), S[:, 3:]], 1),
-            bracket(S[:, None], S[None]) * self.model.above[..., None],
-        )
+        J = np.concatenate([moved(S, t), S[:, 3:]], 1)
+        turns = bracket(S[:, None], S[None]) * self.model.above[..., None]
         way = turns[..., :3] + np.cross(turns[..., 3:], t) + np.cross(S[None, :, 3:], J[:, None, :3])
         bent = np.einsum("bad,a->bd", np.concatenate([way, turns[..., 3:]], 2), v)
         return turn if turn[0] >= 0 else -turn, t, J, v, bent
@@ -170,8 +168,9 @@ class LinkEnergy(JointPositions):
         M, _ = model.dynamics(q, 0 * v, masses, none)
         _, weight = model.dynamics(q, 0 * v, masses, g)
         by_q, _, by_masses, _ = model.derivatives(q, 0 * v, v, masses, none)
-        places = [t + rotations.turned(turn, i.lever) for (turn, t), i in zip(model.kinematics(q)[0], model.inertias)]
-        c = np.array(places)
+        c = np.array(
+            [t + rotations.turned(turn, i.lever) for (turn, t), i in zip(model.kinematics(q)[0], model.inertias)]
+        )
         energies = np.array([0.5 * v @ M @ v, -masses @ c @ g])
         own = [0.5 * v @ by_q, weight], [M @ v, 0 * v], [0.5 * v @ by_masses, -c @ g], [none, -masses @ c]
         return energies, tuple(np.stack(rows) for rows in own)

@@ -366,7 +366,8 @@ class Joints:
         if not (self.links or len(self.at) and len(self.rows)):
             return 1.0
         before, after, way = self.rows[::3].copy(), self.rows.copy(), np.zeros_like(u)
-        way[self.at] = self.carried(q + step) - self.carried(q)
+        if len(self.at):
+            way[self.at] = self.carried(q + step) - self.carried(q)
         self.put(after, q + step)
         there = self.a.poses.drift(before, after[::3])
         return self.ws.collisions.detection.share(self.p.held_at, way, before, there)
