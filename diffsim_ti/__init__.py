@@ -26,7 +26,8 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.energy_balance import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import CenterOfMass, ChamberPressure, ContactForce, ContactSlip, ContactTraction, Dissipation
-from diffsim_ti.outputs import ElasticEnergy, EnclosedVolume, JointPositions, JointVelocities, KineticEnergy, Length
+from diffsim_ti.outputs import ElasticEnergy, EnclosedVolume, JointEfforts, JointPositions, JointVelocities
+from diffsim_ti.outputs import KineticEnergy, Length, LinkEnergy, LinkMotion
 from diffsim_ti.outputs import MaterialPoints, PixelTracks, PlasticStrain, Reaction, SectionForce, SelfContactForce
 from diffsim_ti.outputs import SmoothMaximum, Strain, Stress, TactilePad, Tension, WorkOfLoads
 from diffsim_ti.outputs.load_path import CriticalPoint, LoadPath, load_path
@@ -61,7 +62,8 @@ __all__ += ["BatchFrames", "Ensemble", "UnequalSteps", "adaptive_steps", "SolveR
 __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPoints", "ContactForce"]
 __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactSlip", "ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
-__all__ += ["JointPositions", "JointVelocities", "PixelTracks", "TactilePad"]
+__all__ += ["JointPositions", "JointVelocities", "JointEfforts", "LinkMotion", "LinkEnergy"]
+__all__ += ["PixelTracks", "TactilePad"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["load_path", "LoadPath", "CriticalPoint", "SectionForce", "SmoothMaximum"]
 __all__ += ["RemoteLoad", "MultiPointConstraint"]

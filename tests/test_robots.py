@@ -1,4 +1,4 @@
-"""Robots of URDF files in implicit steps: joints against closed forms, both ways of contact, and every gradient."""
+"""Robots of URDF files: joints against closed forms, both ways of contact, and every gradient."""
 
 import sys
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.common import rotations
 
 MASS = (
     '<inertial><origin xyz="{at} 0 0"/><mass value="{m}"/>'
@@ -163,7 +164,7 @@ def test_a_prescribed_joint_hides_no_light_one(precision, kind, force, h, inerti
 def wheel():
     """A link that turns far from the body."""
     text = urdf(link("a"), link("b", 1.0, shape='<sphere radius="0.01"/>'), joint("j", "revolute", "a", "b", "0 5 0"))
-    robot = ds.Robot.from_urdf(text, width=1e-3, stiffness_per_area=1e7)
+    robot = ds.Robot.from_urdf(text, width=1e-3, stiffness_per_area=1e7, limits=False)
     return ds.ImplicitEulerSolver(scene_of(robot, fixed="ymin"), dt=1e-2)
 
 
@@ -179,8 +180,9 @@ def test_a_run_that_stops_keeps_its_joints_and_has_no_gradient(wheel):
     assert found["joint_positions"][0, -1, 0] == pytest.approx(0.02)
 
 
-def test_adjoints_of_joints_are_cut_clipped_and_reported(wheel):
-    run = dict(steps=2, save_every=1, outputs=[ds.JointPositions()])
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.VelocityVerletSolver])
+def test_adjoints_of_joints_are_cut_clipped_and_reported(wheel, kind):
+    wheel, run = kind(wheel.scene, dt=1e-2), dict(steps=2, save_every=1, outputs=[ds.JointPositions()])
     seed = dict(joint_positions=[[0], [0], [3.0]])
     for options in (dict(health=True), dict(clip=0.5), dict(truncate=1)):
         rollout = ds.Rollout(wheel, **run, **options)
@@ -214,8 +216,8 @@ def test_links_stand_where_they_are_when_a_run_goes_on():
     for one in (first, second):
         one.step()
     np.testing.assert_array_equal(first.positions, second.positions)
-    with pytest.raises(ValueError, match=r"joint_states: expected finite numbers, float64 of shape \(1, 2\)"):
-        second.resume(kept | dict(joint_states=np.zeros((3, 2))))
+    with pytest.raises(ValueError, match=r"joint_states: expected finite numbers, float64 of shape \(1, 3\)"):
+        second.resume(kept | dict(joint_states=np.zeros((3, 3))))
     run = ForwardRun(scene, ds.ImplicitEulerSolver, 0.04, dt=1e-2)
     run.advance()
     assert run.seen.crossed == 0 and run.seen.gap > 0
@@ -223,8 +225,8 @@ def test_links_stand_where_they_are_when_a_run_goes_on():
 
 def test_other_solvers_refuse_and_say_which_takes_robots(monkeypatch):
     scene = scene_of(ds.Robot.from_urdf(ARM, links=()), fixed="ymin")
-    for solver in (ds.SemiImplicitSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver):
-        with pytest.raises(ValueError, match="take ImplicitEulerSolver"):
+    for solver in (ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver):
+        with pytest.raises(ValueError, match="take ImplicitEulerSolver, SemiImplicitSolver or VelocityVerletSolver"):
             solver(scene)
     monkeypatch.setitem(sys.modules, "pinocchio", None)
     with pytest.raises(ImportError, match=r'pip install "diffsim-ti\[robots\]"'):
@@ -239,8 +241,11 @@ def test_advice_works_when_it_is_followed(pressing):
     assert ds.ContactSlip("arm_tip", what="share").settled(pressing).what == "share"
     with pytest.raises(ValueError, match="leave it out"):
         ds.ImplicitEulerSolver(pressing.replace(terms=[*pressing.terms_of(ds.Robot), ds.RotatingFrame([0, 0, 3.0])]))
-    with pytest.raises(ValueError, match="take no robots"):
-        ds.stable_dt(pressing)
+    with pytest.raises(ValueError, match='leave out contact="force"'):
+        ds.SemiImplicitSolver(pressing, contact="force")
+    with pytest.raises(ValueError, match="leave out viscous_stages"):
+        ds.SemiImplicitSolver(pressing.replace(material=ds.KelvinVoigt(SOFT, 1e-3)), viscous_stages=2)
+    ds.SemiImplicitSolver(pressing, dt=0.5 * ds.stable_dt(pressing))
     with pytest.raises(ValueError, match="the solver substeps="):
         ds.adaptive_steps(ds.ImplicitEulerSolver(pressing, dt=5e-3), 2, 1e-3)
     ds.Rollout(ds.ImplicitEulerSolver(pressing, dt=5e-3, substeps=2), 2)
@@ -252,7 +257,8 @@ def test_advice_works_when_it_is_followed(pressing):
     ds.ImplicitEulerSolver(pressing.replace(**far, precision="f64"))
 
 
-def test_a_pendulum_swings_as_its_equation_says():
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.VelocityVerletSolver])
+def test_a_pendulum_swings_as_its_equation_says(kind):
     """Against scipy at 1e-10; backward Euler with what is frozen at the start of each step is of first order."""
     from scipy.integrate import solve_ivp
 
@@ -267,15 +273,17 @@ def test_a_pendulum_swings_as_its_equation_says():
     scene, errors = scene_of(robot, terms=[ds.Gravity()], fixed="ymin"), []
     for steps in (10, 20):
         outputs = [ds.JointPositions("robot"), ds.JointVelocities("robot")]
-        rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=0.2 / steps), steps, outputs=outputs)
+        substeps = 20 if kind.explicit else 1
+        rollout = ds.Rollout(kind(scene, dt=0.2 / steps, substeps=substeps), steps, outputs=outputs)
         frames = rollout.forward()
         errors.append(np.array([frames[name][-1, 0] for name in ("joint_positions", "joint_velocities")]) - exact)
     assert np.abs(errors[1]).max() < 0.04
     assert np.linalg.norm(errors[0]) / np.linalg.norm(errors[1]) == pytest.approx(2, abs=0.1)
 
 
-def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses():
-    """A sliding ball flies at a body that floats; p of both is kept to the tolerance of the solves."""
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses(kind):
+    """A sliding ball flies at a body that floats; p of both is kept to the tolerance of the solves, or to round-off."""
     text = urdf(
         link("a"),
         link("b", 1.0, 0.0, shape='<sphere radius="0.02"/>'),
@@ -283,14 +291,15 @@ def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses():
     )
     robot = ds.Robot.from_urdf(text, velocities=[1.0], width=2e-3, stiffness_per_area=3e7, friction=0.3)
     scene = scene_of(robot)
-    solver = ds.ImplicitEulerSolver(scene, dt=4e-3, tolerance=1e-9)
+    solver = kind(scene, dt=4e-3, **({} if kind.explicit else dict(tolerance=1e-9)))
     rollout = ds.Rollout(solver, 6, save_every=6, outputs=[ds.JointVelocities("robot")])
     body, m = 500.0 * 0.06**3, scene.mass_matrix().diagonal()[::3]
     for ratio in (1e-3, 1.0, 1e3):
         frames = rollout.forward(**{"robot.masses": [ratio * body]})
         gained = float(m @ frames.velocities[-1, :, 0])
         lost = ratio * body * (1.0 - frames["joint_velocities"][-1, 0])
-        assert lost > 0.1 * body * min(ratio, 1.0) and gained == pytest.approx(lost, rel=1e-6)
+        exact = 1e-12 * max(ratio, 1.0) if kind.explicit else 1e-6
+        assert lost > 0.1 * body * min(ratio, 1.0) and gained == pytest.approx(lost, rel=exact)
 
 
 @pytest.fixture(scope="module")
@@ -315,10 +324,11 @@ def pressing():
     return scene_of(robot, mesh, [ds.Gravity()], fixed="ymin")
 
 
-def test_every_gradient_goes_through_body_and_joints(pressing):
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver, ds.VelocityVerletSolver])
+def test_every_gradient_goes_through_body_and_joints(pressing, kind):
     steps, rng = 3, np.random.default_rng(1)
-    outputs = [ds.JointPositions("arm"), ds.JointVelocities("arm"), ds.ContactForce("arm_tip")]
-    solver = ds.ImplicitEulerSolver(pressing, dt=5e-3, tolerance=1e-12)
+    outputs = [ds.JointPositions("arm"), ds.JointVelocities("arm"), ds.JointEfforts("arm"), ds.ContactForce("arm_tip")]
+    solver = kind(pressing, dt=5e-3, **({} if kind.explicit else dict(tolerance=1e-12)))
     rollout = ds.Rollout(solver, steps, save_every=1, gradients="all", outputs=outputs)
     given = {"arm.torques": rng.normal(size=(steps, 2))}
     frames = rollout.forward(**given)
@@ -338,12 +348,12 @@ def test_every_gradient_goes_through_body_and_joints(pressing):
         pushed = sum(float((seeds[k] * tangents[k]).sum()) for k in seeds)
         pulled = sum(float((gradients[name] * change[name]).sum()) for name in names)
         assert pushed == pytest.approx(pulled, rel=1e-9), names
-    sides = []
-    for e in (1e-5, -1e-5):
+    sides, size = [], 2e-6 if kind.explicit else 1e-5
+    for e in (size, -size):
         there = rollout.forward(**{name: value + e * change[name] for name, value in frames.inputs.items()})
         sides.append(sum(float((seeds[k] * there[k]).sum()) for k in seeds))
     whole = sum(float((gradients[name] * change[name]).sum()) for name in change)
-    assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(whole, rel=1e-5)
+    assert (sides[0] - sides[1]) / (2 * size) == pytest.approx(whole, rel=1e-5)
 
 
 def test_what_links_do_to_vertices_they_feel_in_the_same_step(pressing):
@@ -369,8 +379,9 @@ def test_what_links_do_to_vertices_they_feel_in_the_same_step(pressing):
     assert frames["n"][-1].sum(0)[1] < -1 and np.abs(own).max() < 1e-9
 
 
-def test_steps_that_are_given_torques_are_those_of_a_run(pressing):
-    solver, torques = ds.ImplicitEulerSolver(pressing, dt=5e-3), np.random.default_rng(2).normal(size=(2, 2))
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_steps_that_are_given_torques_are_those_of_a_run(pressing, kind):
+    solver, torques = kind(pressing, dt=5e-3), np.random.default_rng(2).normal(size=(2, 2))
     simulator = ds.Simulator(solver)
     for row in torques:
         simulator.step(**{"arm.torques": row})
@@ -441,3 +452,172 @@ def test_two_robots_and_a_ball_in_any_order_have_the_same_run_and_exact_gradient
         sides.append(sum(float((seeds[k] * there[k]).sum()) for k in seeds))
     whole = sum(float((gradients[name] * change[name]).sum()) for name in change)
     assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(whole, rel=1e-5)
+
+
+# ---- bodies that links hold ------------------------------------------------------------------------------------------
+
+CONTACT = dict(friction=0.4, friction_speed=0.05, width=4e-3, stiffness_per_area=3e7)
+Q = np.array([0.3, -1.0])
+
+
+def held_by_arm(mesh, terms=(), limits=True, **options):
+    """A block on the tip of the arm."""
+    text = ARM.replace('upper="3"', 'upper="0.3005"', 1) if limits else ARM
+    given = dict(positions=Q, velocities=[1.0, -0.5], drive_stiffness=2.0, torques=[5.0, 0.1], links=())
+    arm = ds.Robot.from_urdf(text, "arm", attached=dict(tip="xmin"), **given | options)
+    return ds.Scene(mesh, SOFT, 500.0, [arm, *terms], precision="f64")
+
+
+def differs(rollout, frames, seeds, gradients, change):
+    """Central difference of a loss along a change of all inputs, and what gradients say of it."""
+    sides = []
+    for e in (1e-5, -1e-5):
+        there = rollout.forward(**{name: x + e * change[name] for name, x in frames.inputs.items()})
+        sides.append(sum(float((seeds[k] * there[k]).sum()) for k in seeds))
+    return (sides[0] - sides[1]) / 2e-5, sum(float((gradients[name] * change[name]).sum()) for name in change)
+
+
+def test_every_gradient_goes_through_vertices_that_links_hold():
+    """A block on an arm whose shoulder meets its limit; a link touches it where it is held, a ball elsewhere."""
+    tip = ds.Robot.from_urdf(ARM).poses(Q)["robot_tip"][:3]
+    mesh = moved(tip - [0.0, 0.03, 0.03])
+    text = urdf(
+        link("foot"),
+        link("b", 0.3, 0.0, shape='<sphere radius="0.02"/>'),
+        joint("j", "prismatic", "foot", "b", "0 0 0", "0 1 0"),
+    )
+    above = [*(tip + [0.004, 0.0526, 0.003]), 0, 0, 0]
+    slide = ds.Robot.from_urdf(text, "slide", above, targets=lambda t: [-0.2 * t], prescribed=["j"], **CONTACT)
+    ball = ds.Sphere(tip + [0.063, -0.0521, -0.004], 0.02, name="ball", by_pairs=False, **CONTACT)
+    scene = held_by_arm(mesh, [slide, ball, ds.Gravity()])
+    outputs = [
+        f(robot) for f in (ds.JointPositions, ds.JointVelocities, ds.JointEfforts, ds.LinkEnergy) for robot in ("arm",)
+    ]
+    outputs += [ds.LinkMotion("tip", "arm"), ds.JointEfforts("slide", "pushed"), ds.ElasticEnergy()]
+    outputs += [ds.Reaction("xmin"), ds.Reaction("xmin", "moment", about=tip)]
+    outputs += [ds.ContactForce("ball"), ds.ContactForce("slide_b", name="on_slide", per_vertex=True)]
+    steps, rng = 2, np.random.default_rng(1)
+    solver = ds.ImplicitEulerSolver(scene, dt=5e-3, tolerance=1e-12)
+    rollout = ds.Rollout(solver, steps, save_every=1, gradients="all", outputs=outputs)
+    frames = rollout.forward()
+    held = mesh.vertex_indices("xmin")
+    assert np.abs(frames["on_slide"][-1, held]).max() > 0.05 and np.abs(frames["contact_force"][-1]).max() > 0.05
+    assert 0.3005 < frames["joint_positions"][-1, 0] < 0.3006
+    x, (t, turn) = frames.positions[-1, held], np.split(frames["link_motion"][-1, :7], [3])
+    x0, (t0, turn0) = mesh.vertices[held], np.split(frames["link_motion"][0, :7], [3])
+    local = rotations.turned(rotations.conjugate(turn0), x0 - t0)
+    np.testing.assert_allclose(t + rotations.turned(turn, local), x, atol=1e-14)
+    seeds = {
+        name: rng.normal(size=frames[name].shape) for name in ("positions", "velocities", *(y.name for y in outputs))
+    }
+    gradients, change = rollout.vjp(frames, **seeds), {}
+    for name, value in frames.inputs.items():
+        size = 1e-3 if name.endswith("positions") else max(0.1 * float(np.abs(value).max()), 1e-3)
+        change[name] = size * rng.normal(size=value.shape)
+    own = [name for name in change if name.startswith("arm.") or name.endswith("_positions")]
+    for names in (*([name] for name in own), change.keys() - set(own)):
+        tangents = rollout.tangents(frames, **{name: change[name] for name in names})
+        pushed = sum(float((seeds[k] * tangents[k]).sum()) for k in seeds)
+        pulled = sum(float((gradients[name] * change[name]).sum()) for name in names)
+        assert pushed == pytest.approx(pulled, rel=1e-9), names
+    difference, whole = differs(rollout, frames, seeds, gradients, change)
+    assert difference == pytest.approx(whole, rel=1e-5)
+
+
+BOB = ds.TetrahedralMesh.create_box((3, 3, 3), 0.06, origin=(0.2, -0.03, -0.03))
+ROD = urdf(
+    link("a"),
+    link("rod", 0.2, 0.1),
+    joint(
+        "j",
+        "revolute",
+        "a",
+        "rod",
+        "0 0 0",
+        more='<limit lower="-3" upper="3" effort="9" velocity="9"/><dynamics damping="0.02"/>',
+    ),
+)
+
+
+def swing(E: float, steps: int):
+    """A rod with a block at its end falls from where it is level, for 0.2 s, with a torque: (angle, energy that is lost)."""
+    robot = ds.Robot.from_urdf(ROD, attached=dict(rod="xmin"), torques=[0.1], links=())
+    scene = ds.Scene(BOB, ds.StableNeoHookean(E, 0.3), 500.0, [robot, ds.Gravity()], precision="f64")
+    outputs = [ds.JointPositions(), ds.JointEfforts(), ds.LinkEnergy(), ds.KineticEnergy(), ds.ElasticEnergy()]
+    rollout = ds.Rollout(
+        ds.ImplicitEulerSolver(scene, dt=0.2 / steps),
+        steps,
+        save_every=1,
+        outputs=[*outputs, ds.WorkOfLoads(weight=True)],
+    )
+    f = rollout.forward()
+    worked = f["work"][-1] + float((f["joint_efforts"][1:] * np.diff(f["joint_positions"], axis=0)).sum())
+    stored = f["link_energy"].sum(1) + f["kinetic_energy"] + f["elastic_energy"]
+    return f["joint_positions"][-1, 0], worked - (stored[-1] - stored[0]), scene
+
+
+def test_a_pendulum_with_a_stiff_bob_is_a_rigid_one_and_its_energy_is_balanced():
+    """Against scipy at 1e-10: both errors halve with the step, and what is left of them by extrapolation is small."""
+    from scipy.integrate import solve_ivp
+
+    (coarse, lost, scene), (fine, lost_less, _) = swing(1e7, 20), swing(1e7, 40)
+    m, x = scene.mass_matrix().diagonal()[::3], BOB.vertices
+    inertia, arm = 0.2 * 0.1**2 + 1e-3 + m @ (x[:, :2] ** 2).sum(1), 0.2 * 0.1 + m @ x[:, 0]
+    equation = lambda t, y: (y[1], (0.1 - 9.81 * arm * np.cos(y[0]) - 0.02 * y[1]) / inertia)  # noqa: E731
+    exact = solve_ivp(equation, (0, 0.2), (0.0, 0.0), rtol=1e-10, atol=1e-10).y[0, -1]
+    assert (coarse - exact) / (fine - exact) == pytest.approx(2, abs=0.1)
+    assert 2 * fine - coarse == pytest.approx(exact, abs=1e-3)
+    assert lost > 0 and lost / lost_less == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_a_joint_stops_at_its_limit_and_says_what_that_takes(kind):
+    h, steps = (1e-3, 150) if kind.explicit else (5e-3, 30)
+    text = urdf(link("a"), link("b", 2.0), joint("j", "prismatic", "a", "b", "0 0 0", "0 1 0"))
+    robot = ds.Robot.from_urdf(text.replace('lower="-3"', 'lower="-0.01"'), links=())
+    outputs = [ds.JointPositions(), ds.JointVelocities(), ds.JointEfforts()]
+    solver = kind(scene_of(robot, terms=[ds.Gravity()], fixed="ymin"), dt=h)
+    rollout = ds.Rollout(solver, steps, save_every=steps, outputs=outputs)
+    frames = rollout.forward()
+    assert frames["joint_positions"][-1, 0] == pytest.approx(-0.01, abs=1e-6)
+    assert abs(frames["joint_velocities"][-1, 0]) < 1e-9 and frames["joint_efforts"][-1, 0] == pytest.approx(2 * 9.81)
+    free = ds.Robot.from_urdf(text.replace('lower="-3"', 'lower="-0.01"'), links=(), limits=False)
+    solver = kind(solver.scene.replace(terms=[free, ds.Gravity()]), dt=h)
+    rollout = ds.Rollout(solver, steps, outputs=outputs)
+    frames = rollout.forward()
+    assert frames["joint_positions"][-1, 0] < -0.1 and not frames["joint_efforts"].any()
+    moves = rollout.tangents(frames, **{"robot.torques": [1.0]})
+    assert moves["joint_positions"][-1, 0] == pytest.approx(h**2 * steps * (steps + 1) / 2 / 2.0)
+    assert moves["joint_efforts"][-1, 0] == pytest.approx(1.0)
+
+
+def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works(monkeypatch):
+    for change in (('lower="-3"', 'lower="3"'), ('upper="3"', 'upper="0.2"')):
+        text, given = ARM.replace(*change, 1), dict(positions=Q, links=())
+        with pytest.raises(ValueError, match="limits=False"):
+            ds.Robot.from_urdf(text, **given)
+        assert not np.isfinite(ds.Robot.from_urdf(text, limits=False, **given).limits).any()
+    narrow = ds.Robot.from_urdf(ARM.replace('upper="3"', 'upper="0.4"', 1), links=())
+    with pytest.raises(ValueError, match="starts at 0.5, beyond its limits -3 and 0.4"):
+        ds.Rollout(ds.ImplicitEulerSolver(scene_of(narrow), dt=1e-3), 1).forward(**{"robot.positions": [0.5, 0.0]})
+    with pytest.raises(ValueError, match="attached: no link 'hand'; the file has base"):
+        ds.Robot.from_urdf(ARM, attached=dict(hand="xmin"))
+    arm = ds.Robot.from_urdf(ARM, attached=dict(tip="xmin"), links=())
+    for options, message, less in (
+        (dict(fixed="ymin"), "name sets that share no vertices", dict(fixed="xmax")),
+        (dict(terms=[ds.SelfContact()]), "leave these out", dict()),
+        (
+            dict(terms=[ds.Sphere((0, 1, 0), 0.1, by_pairs=True, **CONTACT)]),
+            "by_pairs=False",
+            dict(terms=[ds.Sphere((0, 1, 0), 0.1, by_pairs=False, **CONTACT)]),
+        ),
+        (dict(terms=[ds.Pressure(10.0, "ymax")]), "which .* has not: leave out", dict()),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **options), dt=1e-3))
+        ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **less), dt=1e-3))
+    monkeypatch.setattr(ds.SemiImplicitSolver, "moves_robots", True)
+    with pytest.raises(ValueError, match="attached= of a robot is for backward Euler steps alone: take Impl"):
+        ds.SemiImplicitSolver(scene_of(arm), dt=1e-5)
+    with pytest.raises(ValueError, match="LinkMotion: no link 'hand'; there are base"):
+        ds.LinkMotion("hand").settled(scene_of(arm))

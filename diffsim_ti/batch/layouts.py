@@ -162,11 +162,11 @@ def why_not(solver) -> str | None:
     values = scene.inputs.values
     terms |= dict(numbers_at_points=any(values[x].ndim == 2 for x in scene.material.at_points if x in values))
     terms |= dict(mesh_obstacles=any(term.table.size for term in scene.ordered_terms if term.acts_on_surface))
+    terms |= dict(robots=scene.terms_of(Robot))
     if solver.explicit:
         terms |= dict(reduced_sets=scene.reduced)
     else:
         terms |= dict(reduced_sets_or_ties=scene.reduced, volumes_or_relations_that_are_held=scene.has_multipliers)
-        terms |= dict(robots=scene.terms_of(Robot))
     if there := [name.replace("_", " ") for name, some in terms.items() if some]:
         return f"it has {' and '.join(there)}"
     return None if solver.explicit else _why_not_joined(solver)

@@ -5,13 +5,16 @@ import numpy as np
 from diffsim_ti.inputs.joints import JointRows
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.terms.robots.robot import Robot
+from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.whole_body import RotatingFrame
+
+SOFT = 1e-4  # of the range of a joint, on which its limits grow stiff
 
 
 class Robots(Interaction):
-    """Their joints are unknowns of implicit steps (joints/joints.py), which no other solver has."""
+    """Their joints are unknowns of backward Euler steps (joints/joints.py), and of explicit ones (joints/explicit.py)."""
 
-    name, kinds, works, on_host = "robots", (Robot,), "robots", False
+    name, kinds, works, on_host, in_kernels = "robots", (Robot,), "robots", False, False
     derived = dict(joints="vectors2")
 
     def __init__(self, scene, terms):
@@ -20,6 +23,9 @@ class Robots(Interaction):
         self.prescribed = np.concatenate([term.prescribed for term in terms])
         self.damping = np.concatenate([term.damping for term in terms])
         self.typical = np.concatenate([term.typical for term in terms])
+        self.lower, self.upper = (np.concatenate(x) for x in zip(*(term.limits for term in terms)))
+        span = self.upper - self.lower
+        self.soft = np.where(np.isfinite(span), SOFT * span, 1.0)  # on which the stiffness of limits grows [rad or m]
 
     def slices(self) -> list[slice]:
         """Places of each robot's joints among all."""
@@ -33,13 +39,31 @@ class Robots(Interaction):
     def check_solver(self, solver) -> None:
         if not solver.moves_robots:
             raise ValueError(
-                f"{type(solver).__name__}: robots are unknowns of backward Euler steps alone: take ImplicitEulerSolver; "
-                "recommend and stable_dt take no robots"
+                f"{type(solver).__name__}: robots move in backward Euler and explicit steps: take ImplicitEulerSolver, "
+                "SemiImplicitSolver or VelocityVerletSolver; recommend takes no robots"
             )
+        if solver.explicit and solver.contact == "force" and any(term.companions for term in self.terms):
+            raise ValueError('links of robots act in a stage of explicit steps: leave out contact="force"')
+        if solver.explicit and len(solver.kicks.kicks) > 1:
+            raise ValueError("robots take one kick in each substep: leave out viscous_stages, and take more substeps")
         if self.scene.term(RotatingFrame):
             raise ValueError("a RotatingFrame does not act on robots: leave it out")
         if self.scene.reduced:
             raise ValueError("robots do not support reduced sets and ties beside them: leave out reduced= and Tie")
+        held = [vertices for term in self.terms for _, vertices in term.holds]
+        if held and (solver.explicit or solver.order > 1):
+            raise ValueError("attached= of a robot is for backward Euler steps alone: take ImplicitEulerSolver")
+        if held and (
+            self.scene.holds_volumes or any(t.primitives or isinstance(t, SelfContact) for t in self.scene.terms)
+        ):
+            raise ValueError(
+                "attached= of a robot does not go with SelfContact, obstacles that act by pairs and FilledChamber: leave "
+                "these out, or pass by_pairs=False to the obstacles"
+            )
+        if len(np.unique(np.concatenate([*held, self.scene.held]))) < sum(map(len, held)) + len(self.scene.held):
+            raise ValueError(
+                "attached=: some vertices are held by two links, or are fixed as well: name sets that share no vertices"
+            )
         if self.scene.origin.any():
             raise ValueError(
                 'robots do not support bodies far from the origin in float32: pass precision="f64", or move all nearer to it'

@@ -17,7 +17,7 @@ from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.bending import Bending
 from diffsim_ti.state.history import History, first_bad_vertex
-from diffsim_ti.state.obstacle_poses import AT_STAGE, Moment
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, Moment
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactWatch
 
@@ -45,6 +45,7 @@ class Workspace:
     changes = 0  # of the state from outside its passes
     last_multipliers = None  # of constrained volumes, in implicit steps
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
+    joints = None  # of robots
     law_frames = None  # what the law remembers in each frame, where an output reads it
 
     def __init__(self, solver, derived: Derived, bend: float = 0.0):
@@ -83,12 +84,22 @@ class Workspace:
         runtime.fill(self.state.v, self.arrays.values.velocity[None])
         if self.state.z is not None:
             runtime.fill(self.state.z, self.arrays.initial_state_blocks())
+        self.start_joints()
         self.place_obstacles(0)
         self.watch.clear()
+
+    def start_joints(self) -> None:
+        """Joints are where they start."""
+        if self.joints:
+            self.state.joints[0] = self.joints.start()
 
     def place_obstacles(self, now: int) -> None:
         """Put obstacles where they are before pass `now`, for what looks at the state there."""
         self.arrays.place_obstacles(self.solver.schedule, now)
+        if self.joints:
+            rows = runtime.fetch(self.arrays.offsets)[:, :3].astype(np.float64)
+            self.joints.put(rows, self.state.joints[0][0], (AT_STAGE, AT_BEGIN))
+            runtime.fill(self.arrays.offsets, rows)
         if self.pairs:
             self.pairs.follow(runtime.fetch(self.arrays.offsets).astype(np.float64), AT_STAGE)
 
@@ -168,6 +179,7 @@ class Workspace:
     def make_frames(self, count: int) -> None:
         """Room for `count` saved states."""
         self.frames = FrameArrays.of(self.arrays, count, self.arrays.num_vertices)
+        self.joint_frames = [None] * count  # positions, velocities and efforts of joints, a column each
         self._launches.clear()
 
     def balance(self):
@@ -217,10 +229,13 @@ class Workspace:
     def velocity_of_obstacle(self, k: int, j: int, vertex: int) -> np.ndarray:
         """At a vertex, when pass j begins [m/s]."""
         arrays, schedule = self.arrays, self.solver.schedule
-        if arrays.obstacles[k][2] < 0:
+        led = self.joints and k in dict(self.joints.links)
+        if arrays.obstacles[k][2] < 0 and not led:
             return np.zeros(3)
         begin = schedule.begin(j)
         rows = arrays.poses.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
+        if led:
+            self.joints.put_moving(rows, *self.state.joints[0][:2])
         position = arrays.values.rest[vertex] + runtime.fetch(self.state.u)[0, vertex]
         return arrays.poses.velocity_at(k, rows, position, self.watch.contacts[k].about)
 
@@ -243,3 +258,9 @@ class Workspace:
         copy_slot(self.state.v, 0, self.frames[1], frame)
         if self.law_frames:
             self.law_frames.note(frame, self.state.z)
+        self.note_joints(frame, self.state, 0)
+
+    def note_joints(self, frame: int, history: History, slot: int) -> None:
+        """A frame has the joints of a slot."""
+        if self.joints and frame >= 0:
+            self.joint_frames[frame] = np.stack(history.joints[slot], 1)

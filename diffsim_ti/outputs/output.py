@@ -38,7 +38,7 @@ class Frames(metaclass=Public):
     `law_state`, where an output reads it: what the law remembers of each tetrahedron, shape (frames, num_tetrahedra, S), or
     (frames, num_tetrahedra, 4, S) at the points of ten-node tetrahedra, in the order of the law's `state_names`.
 
-    `joint_states`, of scenes with robots: joint positions and velocities, shape (frames, joints of all robots, 2).
+    `joint_states`, of scenes with robots: joint positions, velocities and efforts, shape (frames, joints of all robots, 3).
 
     `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
     the last good one.

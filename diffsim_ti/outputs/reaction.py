@@ -13,7 +13,7 @@ from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Frames, Output
 from diffsim_ti.outputs.tensors import Stress
 from diffsim_ti.scene import Scene
-from diffsim_ti.terms import Tie
+from diffsim_ti.terms import Robot, Tie
 
 
 class Reaction(Output):
@@ -32,7 +32,7 @@ class Reaction(Output):
 
     support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
         Or a `Tie` of the scene: the force on its surface b, which acts on the vertices there where no support holds them,
-        without their inertia.
+        without their inertia. Or vertices that a link of a `Robot` holds: what the link does to them, without their inertia.
     about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
         `mesh.vertex_indices(support)`. name: how a loss calls it.
     The gradient is exact by all inputs. In single precision a reaction is the small sum of large forces of stress: it has an
@@ -79,13 +79,16 @@ class Reaction(Output):
             out.onto = scene.supports.freedom(scene.mesh.num_vertices)[out.vertices]
         else:
             out.vertices = scene.held if self.support is None else scene.mesh.vertex_indices(self.support)
-            loose = np.setdiff1d(out.vertices, scene.held)
+            of_robots = [vertices for robot in scene.terms_of(Robot) for _, vertices in robot.holds]
+            loose = np.setdiff1d(out.vertices, np.concatenate([scene.held, *of_robots]))
             if len(out.vertices) == 0 or len(loose):
                 raise ValueError(
                     f"Reaction: the support must be among the fixed vertices, but {len(loose) or 'all'} of its "
                     f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
                 )
-            out.onto = scene.supports.projectors(out.vertices, self.support)
+            out.onto = np.tile(np.eye(3), (len(out.vertices), 1, 1))
+            if np.isin(out.vertices, scene.held).all():
+                out.onto = scene.supports.projectors(out.vertices, self.support)
         out.scene, out.body, out.loads = scene, BodyForces(scene), AppliedLoads(scene, moving=True)
         return out
 

@@ -271,7 +271,7 @@ class Simulator(metaclass=Public):
 
     @property
     def joint_states(self) -> np.ndarray | None:
-        """Positions and velocities of the joints of all robots, shape (joints, 2); None without robots."""
+        """Positions, velocities and efforts of the joints of all robots, shape (joints, 3); None without robots."""
         joints = self.workspace.state.joints[0]
         return None if joints is None else np.stack(joints, 1)
 

@@ -22,6 +22,11 @@ class ObstacleGroup:
     def size(self) -> int:
         return self.force.size
 
+    @property
+    def led(self) -> bool:
+        """Whether robots move them."""
+        return self.force.turns and self.path < 0
+
     def holds(self, force: VertexForce, first: int, path: int) -> bool:
         """Whether one more obstacle, next in the parameters and the paths, belongs to the group."""
         next_path = -1 if self.path < 0 else self.path + self.count * (COLUMNS if force.turns else 1)
@@ -84,6 +89,11 @@ class Features:
     def first_staged(self) -> int:
         """Number of the first obstacle that acts as a stage; the others of them follow it."""
         return self.staged[0].number if self.staged else 0
+
+    @property
+    def led(self) -> bool:
+        """Whether robots move some."""
+        return any(group.led for group in self.groups)
 
     @property
     def driven(self) -> bool:

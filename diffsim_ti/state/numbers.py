@@ -76,6 +76,7 @@ def _absent(has) -> set[str]:
         ("growths",): has.growing,
         ("surface", "seen", "path"): obstacles,
         ("path_adjoint",): has.moving,
+        ("offsets",): has.led,
         ("rest",): obstacles or has.shape or any(x.reads_rest for x in has.interactions),
         ("parameters",): obstacles or has.num_parameters,
         ("stage",): has.num_staged,

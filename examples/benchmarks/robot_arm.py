@@ -3,7 +3,7 @@
 The reverse sweep is held against the tangent along all inputs of the robot together (dot products), and against central
 differences.
 
-    python examples/benchmarks/robot_arm.py [steps of 5 ms, 200 by default]
+    python examples/benchmarks/robot_arm.py [steps of 5 ms, 200 by default] [explicit]
 """
 
 import sys
@@ -32,7 +32,7 @@ START, STIFFNESS = np.array([0.3, -1.0]), 60.0
 SEEN = "joint_positions", "joint_velocities"
 
 
-def rollout_of(steps: int, dt: float) -> ds.Rollout:
+def rollout_of(steps: int, dt: float, explicit: bool = False) -> ds.Rollout:
     """Targets that press the tip 1 cm into the block and draw it over it by 3 cm and back once a second."""
     way = lambda t: START + [-0.05 + 0.04 * np.sin(2 * np.pi * t), -0.02 - 0.08 * np.sin(2 * np.pi * t)]  # noqa: E731
     robot = ds.Robot.from_urdf(
@@ -52,12 +52,13 @@ def rollout_of(steps: int, dt: float) -> ds.Rollout:
     terms = [ds.Gravity(), robot]
     scene = ds.Scene(mesh, ds.StableNeoHookean(3e4, 0.35), 500.0, terms, fixed="ymin", precision="f64")
     outputs = [ds.JointPositions("arm"), ds.JointVelocities("arm"), ds.ContactForce("arm_fore")]
-    return ds.Rollout(ds.ImplicitEulerSolver(scene, dt=dt, tolerance=1e-12), steps, outputs=outputs)
+    implicit = ds.ImplicitEulerSolver(scene, dt=dt, tolerance=1e-12)
+    return ds.Rollout(ds.SemiImplicitSolver(scene, dt=dt) if explicit else implicit, steps, outputs=outputs)
 
 
-def main(steps: int = 200, dt: float = 5e-3) -> dict:
+def main(steps: int = 200, dt: float = 5e-3, explicit: bool = False) -> dict:
     """Returns the relative differences of dot products and of central differences, the last contact force [N], seconds."""
-    begin, rng, rollout = time.perf_counter(), np.random.default_rng(0), rollout_of(steps, dt)
+    begin, rng, rollout = time.perf_counter(), np.random.default_rng(0), rollout_of(steps, dt, explicit)
     frames = rollout.forward()
     seeds = {name: rng.normal(size=frames[name].shape) for name in ("positions", "velocities", *SEEN)}
     gradients, out = rollout.vjp(frames, **seeds), dict(force=frames["contact_force"][-1])
@@ -81,4 +82,4 @@ def main(steps: int = 200, dt: float = 5e-3) -> dict:
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main(*map(int, sys.argv[1:2]))
+    main(*map(int, sys.argv[1:2]), explicit="explicit" in sys.argv[2:])

@@ -192,12 +192,16 @@ class Potential:
 
     def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
         """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
+        y = self.product_of_body(w, convex)
+        return y - self.joints.product(w) if self.joints else y
+
+    def product_of_body(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
+        """The same while joints of robots stay where they are."""
         scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the units
         runtime.fill(self.w, (w / scale)[None])
         self.multiply(convex)
         y = runtime.fetch(self.y)[0].astype(np.float64) * -scale
-        y = y + self.hosts.product(self.held_at, w, convex) if self.hosts else y
-        return y - self.joints.product(w) if self.joints else y
+        return y + self.hosts.product(self.held_at, w, convex) if self.hosts else y
 
     def multiply(self, convex: bool = False) -> None:
         """y = -d2E/du2 w on the device, without host forces."""

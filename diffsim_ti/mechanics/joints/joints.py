@@ -11,6 +11,11 @@ link's point there by J_a = v_a + w_a x x. Since turning link and vertex togethe
     K_qq = sum f . dJ_a/dq_b + J_a . (w_b x f + H J_b) + J'_a . F J'_b,    dS_a/dq_b = [S_b, S_a] of a joint b below a,
 
 J' being taken at the place where the step begins, from which friction takes its arm.
+
+Vertices that a link holds move with it, u_a = y(q) - X, and are no unknowns of their own. With R_a what acts on them, less
+their inertia, and J = dy/dq, the joints feel J^T R_a, and to K come, u being the other vertices,
+
+    K_uq += K_ua J,    K_qq += J^T K_aq + K_qa J + J^T K_aa J - R_a . dJ/dq.
 """
 
 import weakref
@@ -29,7 +34,7 @@ from diffsim_ti.state.numbers import Tangent
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
 from diffsim_ti.terms.robots.model import bracket
 
-STIFF = 1e6  # of a prescribed joint's drive, over inertia / h^2
+STIFF = 1e6  # of a prescribed joint's drive, and of a limit, over inertia / h^2
 
 
 def moved(S: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -66,28 +71,73 @@ class Joints:
                 carried = np.zeros(self.count, bool)
                 carried[own] = robot.model.carries(joint)
                 self.links.append((names.index(name), carried))
-        self.shares = Shares(workspace) if self.links else None
+        self._take_held()
+        self.shares = Shares(workspace) if self.links and self.p else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
         self.loose = max(1e-6, 1e3 * self.eps)  # of their forces, what rounding of the vertices' places may leave
-        self._known, self._zero, self._held, self._placed, self._anchor = None, None, None, None, None
+        self._known, self._zero, self._held, self._placed, self._back, self._anchor = [None] * 6
         self.q, self.left, self.now = None, 0.0, self.start()
 
-    def start(self) -> tuple[np.ndarray, np.ndarray]:
-        """(positions, velocities) where a run begins."""
-        q, v, *_ = self.robots.numbers(self.a.values.parameters)
-        return q.copy(), v.copy()
+    def _take_held(self) -> None:
+        """at: vertices that links hold; grips: of each link the places among them, the joint that carries it, -1 of the
+        base, and the joints that move it; holding: the last of each vertex, shape (k, joints, 1)."""
+        self.at, self.grips, self.holding = np.zeros(0, np.int64), [], np.zeros((0, self.count, 1))
+        self.pull, self.J_a = np.zeros((0, 3)), np.zeros((0, self.count, 3))  # R_a and J
+        for robot, own in zip(self.robots.terms, self.slices):
+            for joint, vertices in robot.holds:
+                carried, first = np.zeros(self.count, bool), len(self.at)
+                carried[own] = robot.model.carries(joint)
+                self.at = np.concatenate([self.at, vertices])
+                self.grips.append((slice(first, len(self.at)), joint if joint < 0 else own.start + joint, carried))
+                moving = np.tile(carried[:, None], (len(vertices), 1, 1))
+                self.holding = np.concatenate([self.holding, moving])
+
+    def start(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(positions, velocities, efforts) where a run begins."""
+        values = self.a.values
+        q, v, *_ = self.robots.numbers(values.parameters)
+        for robot, own in zip(self.robots.terms, self.slices):
+            robot.check_limits(q[own])
+        x = (values.rest + values.displacement)[self.at]
+        self.local = self._each_held(q, lambda turn, t, rows: rotations.turned(rotations.conjugate(turn), x[rows] - t))
+        return q.copy(), v.copy(), np.zeros(self.count)
 
     # ---- kinematics --------------------------------------------------------------------------------------------------
 
     def kinematics(self, q: np.ndarray) -> tuple[list, np.ndarray]:
         """(pose of each link's obstacle, twists of all joints)"""
         if self._known is None or not np.array_equal(q, self._known[0]):
-            twists, poses = np.zeros((self.count, 6)), []
+            twists, poses, self._frames = np.zeros((self.count, 6)), [], []
             for robot, own in zip(self.robots.terms, self.slices):
                 frames, twists[own] = robot.model.kinematics(q[own])
                 poses += robot.poses_of(frames)
+                self._frames += frames
             self._known = q.copy(), poses, twists
         return self._known[1:]
+
+    def _each_held(self, q: np.ndarray, of) -> np.ndarray:
+        """of(quaternion, position, rows) of the joint that carries each link at q, for rows of vertices that it holds."""
+        self.kinematics(q)
+        out, base = np.zeros((len(self.at), 3)), (np.eye(1, 4)[0], np.zeros(3))
+        for rows, joint, _ in self.grips:
+            out[rows] = of(*(base if joint < 0 else self._frames[joint]), rows)
+        return out
+
+    def carried(self, q: np.ndarray) -> np.ndarray:
+        """Where links at q have the vertices that they hold [m]."""
+        return self._each_held(q, lambda turn, t, rows: t + rotations.turned(turn, self.local[rows]))
+
+    def from_joints(self, q: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Vectors of the vertices that links hold, from the frames of the joints to space."""
+        return self._each_held(q, lambda turn, t, rows: rotations.turned(turn, x[rows]))
+
+    def to_joints(self, q: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """The way back."""
+        return self._each_held(q, lambda turn, t, rows: rotations.turned(rotations.conjugate(turn), x[rows]))
+
+    def ways(self, S: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """How joints move vertices that links hold at y, shape (k, joints, 3)."""
+        return self.holding * moved(S, y)
 
     def turns(self, S: np.ndarray) -> np.ndarray:
         """How twist S_a changes as joint b turns, [b, a]."""
@@ -100,6 +150,12 @@ class Joints:
                 rows[3 * k + m] = t
                 rows[3 * self.a.poses.place_of[k] + m] = rotations.rodrigues(turn)
 
+    def put_moving(self, rows: np.ndarray, q: np.ndarray, v: np.ndarray) -> None:
+        """The same with velocities."""
+        self.put(rows, q)
+        self.poses_n, self.S_n = self.kinematics(q)
+        self._put_rates(rows, v)
+
     def _put_rates(self, rows: np.ndarray, rate: np.ndarray) -> None:
         for (k, carried), (_, t) in zip(self.links, self.poses_n):
             J = moved(self.S_n, t)
@@ -110,7 +166,7 @@ class Joints:
 
     def begin(self, j: int, stage, rows: np.ndarray) -> None:
         """Pass j from `now`; rows: of obstacles, which links write into."""
-        (self.q_n, self.v_n), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
+        (self.q_n, self.v_n, *_), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
         self.poses_n, self.S_n = self.kinematics(self.q_n)
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
         at = a.features().gravity
@@ -126,7 +182,8 @@ class Joints:
         self.torques = given[schedule.load_row(given, j)][:, 2]
         self.k = np.where(self.robots.prescribed, STIFF * self.robots.typical / self.h**2, self.k)
         self.c = self.c + self.robots.damping
-        self.q, self._held, self._placed, self._anchor = self.q_n.copy(), None, None, None
+        self.q, self._held, self._placed, self._anchor, self.felt = self.q_n.copy(), None, None, None, 0.0
+        self._back = None
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
         self._put_rates(rows, np.zeros(self.count))
 
@@ -137,12 +194,21 @@ class Joints:
     @contextmanager
     def still(self):
         """Stand where they are while the body is placed elsewhere."""
-        kept = self._held
+        kept, found = self._held, self._placed
         self.hold(self.q)
         try:
             yield
         finally:
-            self._held, self._placed = kept, None
+            self._held, self._placed, self._back = kept, None, np.zeros(0) if found is None else found
+
+    def check_forces(self, others) -> None:
+        """Raise ValueError for forces on the body that are not symmetric, beside vertices that links hold."""
+        if len(self.at) and not others.symmetric:
+            names = ", ".join(type(part).__name__ for part in others if not part.symmetric)
+            raise ValueError(
+                f"attached= of a robot needs forces with symmetric derivatives, which {names} has not: leave out "
+                "SurfaceDrag, and Pressure on open surfaces, or hold the body by contact of links"
+            )
 
     def end(self) -> None:
         """The pass is over. Raises NotConverged where the joints are not in balance."""
@@ -151,14 +217,15 @@ class Joints:
                 f"the joints of robots are out of balance by {self.left:.2g} of their forces: take smaller steps",
                 [self.left],
             )
-        met = self.ws.collisions.detection.nearest(self.p.held_at, self.rows[::3]) if self.links else None
-        if met and met.obstacle in dict(self.links):
-            link = self.a.contacts[met.obstacle].name
-            raise NotConverged(f"{link} has got {-met.value:.2g} m into {met}: take smaller steps", [self.left])
+        meets = self.links or len(self.at) and len(self.rows)
+        met = self.ws.collisions.detection.nearest(self.p.held_at, self.rows[::3]) if meets else None
+        if met and (met.obstacle in dict(self.links) or np.isin(met.vertices, self.at).any()):
+            obstacle = self.a.contacts[met.obstacle].name
+            raise NotConverged(f"{obstacle} has got {-met.value:.2g} m into {met}: take smaller steps", [self.left])
         turned = np.abs(self.q - self.q_n) * np.linalg.norm(self.S_n[:, 3:], axis=1)
         if any(turned @ carried >= np.pi for _, carried in self.links):
             raise NotConverged("a link of a robot turns by more than half a turn: take smaller steps", [self.left])
-        self.now = self.q.copy(), (self.q - self.q_n) / self.h
+        self.now = self.q.copy(), (self.q - self.q_n) / self.h, sum(self._efforts())
 
     def forget(self) -> None:
         """Rows of obstacles were written by others."""
@@ -171,14 +238,35 @@ class Joints:
 
     def _own_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(-dPhi/dq but for contact, sizes of what it adds up)"""
-        parts = -self.bias, self.torques, -self.k * (self.q - self.targets), -self.c * (self.q - self.q_n) / self.h
+        parts = -self.bias, *self._efforts()
         size = np.abs(self.M) @ np.abs(self.acceleration) + sum(np.abs(part) for part in parts)
         return sum(parts) - self.M @ self.acceleration, size
+
+    def _efforts(self) -> tuple[np.ndarray, ...]:
+        """Of torques, drives, damping and limits [N m or N]."""
+        drive, damping = -self.k * (self.q - self.targets), -self.c * (self.q - self.q_n) / self.h
+        return self.torques, drive, damping, -self._limits()[1]
+
+    def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Energies of the limits of joints, and their first two derivatives: k d^3 / (6 w) of what is beyond by d < w, and
+        beyond w with the constant stiffness k."""
+        k, w = STIFF * self.robots.typical / self.h**2, self.robots.soft
+        past = np.maximum(self.q - self.robots.upper, 0) - np.maximum(self.robots.lower - self.q, 0)
+        s = np.abs(past) / w
+        c = np.minimum(s, 1.0)
+        energies = k * w**2 * c * (s**2 / 2 - c * s / 2 + c**2 / 6)
+        return energies, k * w * c * (s - c / 2) * np.sign(past), k * c
+
+    @property
+    def yielding(self) -> np.ndarray:
+        """How efforts fall as joints move: stiffness of drives, damping and limits."""
+        return self.k + self.c / self.h + self._limits()[2]
 
     def _rounding(self) -> np.ndarray:
         """Of each joint's own forces, by the digits of their positions."""
         reach = np.abs(self.q) + np.abs(self.q_n) + self.h * np.abs(self.v_n)
-        return 1e-15 * (np.abs(self.M) @ reach / self.h**2 + self.k * reach) + 1e-300
+        own = 1e-15 * (np.abs(self.M) @ reach / self.h**2 + self.yielding * reach) + 1e-300
+        return own + self.eps * self.felt
 
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
@@ -187,11 +275,12 @@ class Joints:
         a, d = self.acceleration, self.q - self.q_n
         inertia = 0.5 * self.h**2 * a @ self.M @ a
         drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * d**2 / self.h
-        return np.array([inertia, self.bias @ d, drives.sum(), -self.torques @ d])
+        return np.array([inertia, self.bias @ d, drives.sum(), -self.torques @ d, self._limits()[0].sum()])
 
     def _stand(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Go to q; (-dPhi/dq, sizes of what it adds up)."""
         self.q, self._linear = q, None
+        u = self._carry(u)
         self.put(self.rows, q)
         self._put_rates(self.rows, (q - self.q_n) / self.h)
         if len(self.rows):
@@ -209,7 +298,22 @@ class Joints:
             for arm, force in ((J, f[at]), (J_n, drag[at])):
                 R = R - np.einsum("iad,id->a", arm, force)
                 size = size + np.einsum("iad,id->a", np.abs(arm), np.abs(force))
+        if len(self.at):
+            self.pull, sizes = (x[self.at] for x in self.ws.newton.balance(u, *self.problem))
+            self.J_a = self.ways(self.S, x[self.at])
+            R = R + np.einsum("iad,id->a", self.J_a, self.pull)
+            size = size + np.linalg.norm(self.J_a, axis=2).T @ sizes
         return R, size
+
+    def _carry(self, u: np.ndarray) -> np.ndarray:
+        """u with the vertices that links hold where they are at q; the potential goes there."""
+        if self._held is not None or not len(self.at):
+            return u
+        u = u.copy()
+        u[self.at] = self.carried(self.q) - self.a.values.rest[self.at]
+        runtime.fill(self.p.u, u[None])
+        self.p.held_at = runtime.fetch_row(self.p.u, 0)
+        return self.p.held_at
 
     def places(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions of vertices where forces are taken, and where the pass begins [m]."""
@@ -218,15 +322,24 @@ class Joints:
 
     def settle(self, u: np.ndarray) -> None:
         """Find q(u). The potential is placed at u; before the first pass there is nothing to find."""
-        if self.q is None or (self._placed is not None and np.array_equal(u, self._placed)):
+        if self.q is None:
             return
-        self._placed = u.copy()
+        own = u.copy()
+        own[self.at if self._held is None else []] = 0.0
+        if self._placed is not None and np.array_equal(own, self._placed):
+            self._carry(u)
+            return
+        self._placed, back, self._back = own, self._back, None
         if self._held is not None:
             self._stand(self._held, u)
             return
+        if back is not None:  # `still` is over
+            self._placed = own if np.array_equal(own, back) else None
+            self._stand(self.q, u)
+            return
         R, size = self._stand(self._predicted(u), u)
         best, stalled = np.inf, 0
-        scale = np.sqrt(np.diag(self.M) / self.h**2 + self.k + self.c / self.h)  # of joints, some stiff, some light
+        scale = np.sqrt(np.diag(self.M) / self.h**2 + self.yielding)  # of joints, some stiff, some light
         for _ in range(self.most):
             noise = self._rounding()
             left = float(np.max(np.abs(R) / (max(1e-13, 4 * self.eps) * size + noise)))
@@ -250,11 +363,14 @@ class Joints:
 
     def _free_share(self, u, q: np.ndarray, step: np.ndarray) -> float:
         """How far links may go along a step of the joints."""
-        if not self.links:
+        if not (self.links or len(self.at) and len(self.rows)):
             return 1.0
-        before, after = self.rows[::3].copy(), self.rows.copy()
+        before, after, way = self.rows[::3].copy(), self.rows.copy(), np.zeros_like(u)
+        if len(self.at):
+            way[self.at] = self.carried(q + step) - self.carried(q)
         self.put(after, q + step)
-        return self.ws.collisions.detection.share(u, np.zeros_like(u), before, self.a.poses.drift(before, after[::3]))
+        there = self.a.poses.drift(before, after[::3])
+        return self.ws.collisions.detection.share(self.p.held_at, way, before, there)
 
     @property
     def linear(self) -> tuple[list, np.ndarray]:
@@ -264,7 +380,7 @@ class Joints:
         return self._linear
 
     def _linearise(self) -> tuple[list, np.ndarray]:
-        K, columns = self.M / self.h**2 + np.diag(self.k + self.c / self.h), []
+        K, columns = self.M / self.h**2 + np.diag(self.yielding), []
         if any(len(part.at) for part in self.pushed):
             blocks = self._blocks()
             turns, x = self.turns(self.S), self.places(self.p.held_at)[0]
@@ -278,7 +394,37 @@ class Joints:
                 bent = turns[..., :3] @ force + turns[..., 3:] @ moment
                 K = K + (bent * carried * carried[:, None]).T
                 K = K + np.einsum("iad,ibd->ab", J, turned + HJ) + np.einsum("iad,ibd->ab", J_n, FJ)
+        if len(self.at):
+            columns, K = self._with_held(columns, K)
         return columns, 0.5 * (K + K.T)
+
+    def _with_held(self, columns: list, K: np.ndarray) -> tuple[list, np.ndarray]:
+        """The same with the vertices that links hold going along."""
+        J, n = self.J_a, self.a.num_vertices
+        of_links, own = np.zeros((2, n, 3, self.count))
+        for at, part in columns:
+            of_links[at] += part
+        for a in np.flatnonzero(J.any((0, 2))):
+            w = np.zeros((n, 3))
+            w[self.at] = J[:, a]
+            own[..., a] = self.of_places(w)
+        self.felt = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
+        turns, y = self.turns(self.S), self.places(self.p.held_at)[0][self.at]
+        for rows, _, carried in self.grips:
+            force, moment = -self.pull[rows].sum(0), -np.cross(y[rows], self.pull[rows]).sum(0)
+            K = K + ((turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]).T
+        pulled = np.cross(self.holding * self.S[:, 3:], self.pull[:, None])
+        crossed = np.einsum("iad,idb->ab", J, of_links[self.at])
+        K = K + np.einsum("iad,ibd->ab", pulled, J) + crossed + crossed.T + np.einsum("iad,idb->ab", J, own[self.at])
+        own += of_links
+        own[self.at] = 0.0
+        return [(np.arange(n), own)], K
+
+    def of_places(self, w: np.ndarray) -> np.ndarray:
+        """d2Phi/du2 w of all vertices, joints staying where they are."""
+        others = self.ws.newton.others
+        y = self.problem[0] * w + self.p.product_of_body(w)
+        return y - others.tangent(self.p.held_at)(w) if others else y
 
     def _blocks(self) -> np.ndarray:
         """-df/du of barriers and of friction, a column each, shape (3, obstacles, 2, n, 3)."""
@@ -317,6 +463,13 @@ class Joints:
         if self.q is None or not self.linear[0]:
             return np.zeros(w.shape)
         return self.of_joints(self.follow(self.of_body(w)), w.shape)
+
+    def extended(self, w: np.ndarray) -> np.ndarray:
+        """A direction of the body with what the vertices do that links hold."""
+        if len(self.at):
+            w = w.copy()
+            w[self.at] = np.einsum("iad,a->id", self.J_a, -self.follow(self.of_body(w)))
+        return w
 
     def anchor(self, u: np.ndarray) -> None:
         """From here on predict q from where it is at u."""

@@ -93,18 +93,28 @@ class JointTangent(JointSweep):
 
     def __init__(self, workspace, tangent):
         super().__init__(workspace)
-        self.tangent = tangent
-        self.dq, self.dv, *_ = self.joints.robots.numbers(tangent.parameters)
-        self.frames: list = []
+        self.tangent, J, self.frames = tangent, self.joints, []
+        self.dq, self.dv, *_ = J.robots.numbers(tangent.parameters)
+        self.deffort, (q, *_) = np.zeros(J.count), J.start()
+        at, x = J.at, (J.a.values.rest + J.a.values.displacement)[J.at]
+        moved_on = (tangent.rest + tangent.displacement)[at] - np.einsum(
+            "iad,a->id", J.ways(J.kinematics(q)[1], x), self.dq
+        )
+        self.dlocal = J.to_joints(q, moved_on)
 
     def note(self) -> None:
         """A frame has the change of the present state."""
-        self.frames.append(np.stack([self.dq, self.dv], 1))
+        self.frames.append(np.stack([self.dq, self.dv, self.deffort], 1))
 
-    def force(self, shares: np.ndarray, held: np.ndarray, du: np.ndarray) -> np.ndarray:
+    def led(self) -> np.ndarray:
+        """Change of displacements of the vertices that links hold, joints staying where the pass ends."""
+        return self.joints.from_joints(self.joints.q, self.dlocal) - self.tangent.rest[self.joints.at]
+
+    def force(self, shares=None, held=None, du=None, dR=None) -> np.ndarray:
         """Change of -dPhi/dq, body and joints staying where the pass ends, but for its fixed vertices.
 
-        shares: change of what obstacles do to vertices; held: change of places; du: of those where the pass begins.
+        shares: change of what obstacles do to vertices; held: change of places; du: of those where the pass begins; dR: of
+        what acts on vertices. Without places: that without contact.
         """
         J, moved_numbers, out = self.joints, self.tangent, np.zeros(self.joints.count)
         _, _, dk, dc, dm = J.robots.numbers(moved_numbers.parameters)
@@ -116,11 +126,16 @@ class JointTangent(JointSweep):
             out[own] -= by_q @ self.dq[own] + by_v @ self.dv[own] + by_m @ dm[own] + by_g @ dg
         schedule, rows = self.ws.solver.schedule, moved_numbers.joints
         dtargets = schedule.pressure(rows, J.j, J.share)
-        out += J.M @ (self.dq / J.h**2 + self.dv / J.h) + J.c * self.dq / J.h
-        out += J.k * dtargets - dk * (J.q - J.targets) - dc * (J.q - J.q_n) / J.h
-        out += rows[schedule.load_row(rows, J.j)][:, 2]
+        self._given = J.k * dtargets - dk * (J.q - J.targets) - dc * (J.q - J.q_n) / J.h + J.c * self.dq / J.h
+        self._given += rows[schedule.load_row(rows, J.j)][:, 2]
+        out += J.M @ (self.dq / J.h**2 + self.dv / J.h) + self._given
+        if held is None:
+            return out
         x, x_n = J.places(J.p.held_at)
         dx, dx_n = held + moved_numbers.rest, du + moved_numbers.rest
+        if len(J.at):
+            out += np.einsum("iad,id->a", J.J_a, dR[J.at])
+            out += np.einsum("iad,id->a", J.holding * np.cross(J.S[:, 3:], dx[J.at][:, None]), J.pull)
         for (k, *_), (vertices, carried, f, drag, bent) in zip(J.links, self._of_friction()):
             both = ((J.S, x, shares[k, 0], f, dx), (J.S_n, x_n, shares[k, 1], drag, dx_n))
             for S, y, change, force, dy in both:
@@ -132,6 +147,7 @@ class JointTangent(JointSweep):
     def step(self, dq: np.ndarray) -> None:
         """The pass has changed the joints so."""
         self.dq, self.dv = dq, (dq - self.dq) / self.joints.h
+        self.deffort = self._given - self.joints.yielding * dq
 
 
 class JointAdjoint(JointSweep):
@@ -142,31 +158,49 @@ class JointAdjoint(JointSweep):
         self._shares = SharesAdjoint(workspace, features, numbers) if self.joints.links else None
 
     def seed_frames(self, seeds: np.ndarray | None) -> None:
-        """Begin with the adjoints of the frames, shape (frames, joints, 2)."""
+        """Begin with the adjoints of the frames, shape (frames, joints, 3)."""
         frames = len(self.ws.joint_frames)
-        self.frames = np.zeros((frames, self.joints.count, 2)) if seeds is None else seeds
-        self.by_q, self.by_v = self.frames[-1].T.copy()
-        self.numbers = np.zeros((5, self.joints.count))
+        self.frames = np.zeros((frames, self.joints.count, 3)) if seeds is None else seeds
+        self.by_q, self.by_v, self.by_effort = self.frames[-1].T.copy()
+        self.numbers, self.by_local = np.zeros((5, self.joints.count)), np.zeros((len(self.joints.at), 3))
 
     def clear(self) -> None:
         """The joints where the sweep stands are no start of theirs."""
-        self.by_q, self.by_v = np.zeros((2, self.joints.count))
+        self.by_q, self.by_v, self.by_effort = np.zeros((3, self.joints.count))
 
     def add_frame(self, frame: int) -> None:
         """Add the adjoints of a frame."""
         self.by_q, self.by_v = self.by_q + self.frames[frame, :, 0], self.by_v + self.frames[frame, :, 1]
+        self.by_effort = self.frames[frame, :, 2]
 
-    def begin(self, seed: np.ndarray, rows: np.ndarray | float) -> np.ndarray:
-        """What the body's equation is to be solved for; rows: adjoint of the obstacles' rows by what is seen of contacts."""
-        by_q, self._to_q_n = self.rows_vjp(rows) if np.ndim(rows) else np.zeros((2, self.joints.count))
-        self._seed = self.by_q + self.by_v / self.joints.h + by_q
-        return seed - self.joints.of_joints(self.joints.follow(self._seed), seed.shape)
+    def begin(self, seed: np.ndarray, rows: np.ndarray | float, by_ends: np.ndarray) -> np.ndarray:
+        """What the body's equation is to be solved for; rows: adjoint of the obstacles' rows by what is seen of contacts;
+        by_ends: of the vertices' displacements where the pass ends."""
+        J = self.joints
+        by_q, self._to_q_n = self.rows_vjp(rows) if np.ndim(rows) else np.zeros((2, J.count))
+        self._seed = self.by_q + self.by_v / J.h + by_q - J.yielding * self.by_effort
+        if len(J.at):
+            self._seed = self._seed + np.einsum("iad,id->a", J.J_a, by_ends[J.at])
+        return seed - J.of_joints(J.follow(self._seed), seed.shape)
+
+    def with_held(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """x with what y has at the vertices that links hold."""
+        x = x.copy()
+        x[self.joints.at] = y[self.joints.at]
+        return x
+
+    def follow(self, w: np.ndarray) -> np.ndarray:
+        """The adjoint of the body's equation, with what the joints make of it at vertices that links hold."""
+        J = self.joints
+        self.w, out = J.follow(self._seed - J.of_body(w)), w.copy()
+        if len(J.at):
+            out[J.at] = np.einsum("iad,a->id", J.J_a, self.w)
+        return out
 
     def pull_back(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(adjoint of all places, of the two rows of lag, of the obstacles' rows) by the joints' equation, the body's having
         the adjoint w; those of rest positions are added by the caller as those of places and of the first row."""
         J, n = self.joints, len(w)
-        self.w = J.follow(self._seed - J.of_body(w))
         by_places, by_lag = np.zeros((n, 3)), np.zeros((2, n, 3))
         self.by_rest = np.zeros((n, 3))  # by the arms of forces
         if not J.links:
@@ -190,22 +224,36 @@ class JointAdjoint(JointSweep):
         adjoints of numbers. Returns that of gravity."""
         J, w = self.joints, self.w
         by_q_n = self._to_q_n + self.rows_vjp(rows)[1] - self.by_v / J.h
-        by_q_n = by_q_n + J.M @ w / J.h**2 + J.c * w / J.h
-        by_v_n, by_gravity = J.M @ w / J.h, np.zeros(3)
+        by_q_n = by_q_n + J.M @ w / J.h**2 + J.c * (w + self.by_effort) / J.h
+        by_v_n, by_gravity, e = J.M @ w / J.h, np.zeros(3), w + self.by_effort
         for robot, own in self._each():
             by_q, by_v, by_m, by_g = self._derivatives(robot, own)
             by_q_n[own] -= w[own] @ by_q
             by_v_n[own] -= w[own] @ by_v
             self.numbers[4, own] -= w[own] @ by_m
             by_gravity -= w[own] @ by_g
-        self.numbers[2] -= np.where(J.robots.prescribed, 0.0, w * (J.q - J.targets))
-        self.numbers[3] -= w * (J.q - J.q_n) / J.h
+        self.numbers[2] -= np.where(J.robots.prescribed, 0.0, e * (J.q - J.targets))
+        self.numbers[3] -= e * (J.q - J.q_n) / J.h
         schedule = self.ws.solver.schedule
-        schedule.add_pressure(adj.joints, J.j, J.share, J.k * w)
-        adj.joints[schedule.load_row(adj.joints, J.j)][:, 2] += w
-        self.by_q, self.by_v = by_q_n, by_v_n
+        schedule.add_pressure(adj.joints, J.j, J.share, J.k * e)
+        adj.joints[schedule.load_row(adj.joints, J.j)][:, 2] += e
+        self.by_q, self.by_v, self.by_effort = by_q_n, by_v_n, np.zeros(J.count)
         return by_gravity
 
-    def collect(self, parameters: np.ndarray) -> None:
-        """Add the adjoints of the robots' numbers."""
-        self.joints.robots.add_numbers(parameters, np.concatenate([[self.by_q, self.by_v], self.numbers[2:]]))
+    def hand_on(self, by_places: np.ndarray) -> np.ndarray:
+        """Add to the adjoints of where links hold vertices, for those of all places; returns the latter's."""
+        J = self.joints
+        omega = (J.holding * J.S[:, 3:] * self.w[:, None]).sum(1)
+        by = by_places[J.at] + np.cross(J.pull, omega)
+        self.by_local += J.to_joints(J.q, by)
+        return by_places[J.at]
+
+    def collect(self, out) -> None:
+        """Add the adjoints of the robots' numbers, and of places where links hold vertices."""
+        J = self.joints
+        q, *_ = J.start()
+        by, x = J.from_joints(q, self.by_local), (J.a.values.rest + J.a.values.displacement)[J.at]
+        out.rest[J.at] += by
+        out.displacement[J.at] += by
+        by_q = self.by_q - np.einsum("iad,id->a", J.ways(J.kinematics(q)[1], x), by)
+        J.robots.add_numbers(out.parameters, np.concatenate([[by_q, self.by_v], self.numbers[2:]]))

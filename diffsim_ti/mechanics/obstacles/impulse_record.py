@@ -11,12 +11,13 @@ class ImpulseRecord:
     `rows` are those of obstacles, and a row behind them for surfaces on each other; `contacts`: their numbers.
 
     wanted: whether those of obstacles (True), where these act as forces a ValueError; of "surfaces", or of both. The others
-    are NaN in what is collected.
+    are NaN in what is collected. Where robots move obstacles `impulse` is of a single pass, which their joints read, and
+    `of_frames` on the host sums it up.
     """
 
     def __init__(self, workspace, wanted: frozenset):
         self.arrays, a, features = workspace.arrays, workspace.arrays, workspace.arrays.features()
-        self.wanted, of_obstacles = wanted, True in wanted
+        self.wanted, of_obstacles, self.in_passes = wanted, True in wanted, features.led
         if of_obstacles and len(features.staged) < len(features.groups):
             raise ValueError(
                 "explicit solvers note what obstacles with a distance do, and one of this scene is a force alone: take an "
@@ -29,9 +30,10 @@ class ImpulseRecord:
             self.rows, self.contacts = [*self.rows, len(a.obstacles)], [*self.contacts, 0]
         self.num_frames, self.num_obstacles = (
             workspace.frames.frames_u.shape[0],
-            len(a.obstacles) if of_obstacles else 0,
+            len(a.obstacles) if of_obstacles or self.in_passes else 0,
         )
-        self.impulse = runtime.array(a.vector, max(1, 2 * self.num_frames * self.num_obstacles), a.num_vertices)
+        frames = 1 if self.in_passes else self.num_frames
+        self.impulse = runtime.array(a.vector, max(1, 2 * frames * self.num_obstacles), a.num_vertices)
         self.clear()
 
     @property
@@ -39,13 +41,27 @@ class ImpulseRecord:
         return self.num_frames, self.arrays.num_contact_rows, 2, self.arrays.num_vertices, 3
 
     def clear(self) -> None:
-        runtime.fill(self.impulse, 0)
+        runtime.clear([self.impulse])
         self.of_pairs = np.zeros((self.num_frames, len(self.rows), *self._shape[2:]))
+        if self.in_passes and True in self.wanted:
+            self.of_frames = np.zeros((self.num_frames, 2 * self.num_obstacles, *self._shape[3:]))
+
+    def of_frame(self, frame: int) -> np.ndarray | float:
+        """Those of obstacles in the frame that counts a pass, shape (2 obstacles, num_vertices, 3); 0 where none does."""
+        return self.of_frames[frame] if frame >= 0 and True in self.wanted else 0.0
+
+    def note_pass(self, frame: int) -> None:
+        """Add those of the pass to it."""
+        if frame >= 0 and True in self.wanted:
+            self.of_frames[frame] += runtime.look(self.impulse)
 
     def put(self, impulses: np.ndarray) -> None:
         """Set them; shape as `collect` gives."""
-        if self.num_obstacles:
-            runtime.fill(self.impulse, impulses[:, : self.num_obstacles].reshape(-1, *self._shape[3:]))
+        own = impulses[:, : self.num_obstacles].reshape(self.num_frames, -1, *self._shape[3:])
+        if self.in_passes:
+            self.of_frames = own
+        elif self.num_obstacles:
+            runtime.fill(self.impulse, own.reshape(-1, *self._shape[3:]))
         self.of_pairs = impulses[:, self.rows]
 
     def collect(self) -> np.ndarray:
@@ -54,9 +70,10 @@ class ImpulseRecord:
         out = np.full(self._shape, np.nan)
         if True in self.wanted:
             out[:, : len(self.arrays.obstacles)] = 0.0
-        if self.num_obstacles:
+        if self.num_obstacles and True in self.wanted:
             own = out[:, : self.num_obstacles]
-            own += runtime.fetch(self.impulse).astype(np.float64).reshape(own.shape)
+            of_frames = self.of_frames if self.in_passes else runtime.fetch(self.impulse).astype(np.float64)
+            own += of_frames.reshape(own.shape)
         for k, row in enumerate(self.rows):
             out[:, row] = np.nan_to_num(out[:, row]) + self.of_pairs[:, k]
         return out

@@ -8,6 +8,7 @@ import taichi as ti
 from diffsim_ti.mechanics.obstacles.turned import Turned
 from diffsim_ti.runtime import PRECISIONS, traced
 from diffsim_ti.state.features import Features
+from diffsim_ti.state.obstacle_poses import MORE
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
@@ -44,6 +45,11 @@ class ObstacleFunctions:
     @property
     def num_obstacles(self) -> int:
         return sum(group.count for group in self.features.groups)
+
+    @traced
+    def turning_row(self, g, k):
+        """Where the rows of an obstacle that turns begin."""
+        return 3 * self.num_obstacles + MORE * (g.turning + k)
 
     # An obstacle with a stiffness per area pushes vertex i with that times the vertex's area: energy, forces and friction
     # are linear in it. What kernels of a shape compute is that of one square metre.

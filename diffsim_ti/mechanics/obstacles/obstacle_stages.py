@@ -4,7 +4,8 @@ tangent and adjoint.
 Functions of a shape take positions relative to the obstacle, so that a displaced obstacle is a vertex whose rest position X
 is displaced the other way. Obstacles of one kind are gone through in a loop (state/features.py). A path is a column of
 displacements, or the three of a pose that inputs/poses.py says; places of an obstacle that turns are seven numbers, their
-changes and adjoints six (turned.py).
+changes and adjoints six (turned.py). Where robots move an obstacle (`g.led`), and how fast in the pass, stands in rows of
+`offsets` (state/obstacle_poses.py).
 """
 
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from diffsim_ti.inputs.poses import COLUMNS
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
 from diffsim_ti.mechanics.supports.sliding_supports import SlidingSupports
 from diffsim_ti.runtime import Bundle, at, let, traced
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, RATE
 from diffsim_ti.state.pass_table import pass_at
 from diffsim_ti.terms.obstacles import turning
 
@@ -50,21 +52,26 @@ class ObstacleStages(ObstacleFunctions):
         return g.path + COLUMNS * k if g.force.turns else g.path + k
 
     @ti.func
-    def shift_at(self, g: A, k, share, now: A, path: A):
-        """Displacement of an obstacle at a share of the step."""
+    def shift_at(self, g: A, k, share, now: A, of: A):
+        """Displacement of an obstacle at a share of the step, or its change; of: the scene, or its tangent."""
         place = self.vector(0)
         if ti.static(g.path >= 0):
-            start = path[now.row, self.column(g, k)]
-            place = start + share * (path[now.next, self.column(g, k)] - start)
+            start = of.path[now.row, self.column(g, k)]
+            place = start + share * (of.path[now.next, self.column(g, k)] - start)
+        if ti.static(g.led):
+            place = of.offsets[3 * (g.number + k) + AT_BEGIN]
         return place
 
     @traced
-    def place_at(self, g, k, share, now, path):
+    def place_at(self, g, k, share, now, scene):
         """Displacement of an obstacle at a share of the step; of one that turns with its unit quaternion behind."""
-        shift = self.shift_at(g, k, share, now, path)
+        shift = self.shift_at(g, k, share, now, scene)
         if not g.force.turns:
             return shift
-        return self.turned.joined(shift, self.turn_at(g, k, share, now, path), 4)
+        if g.led:
+            s = self.turned.short(at(scene.offsets, self.turning_row(g, k) + AT_BEGIN))
+            return self.turned.joined(shift, turning.from_rodrigues(s, self.fp), 4)
+        return self.turned.joined(shift, self.turn_at(g, k, share, now, scene.path), 4)
 
     @ti.func
     def turn_at(self, g: A, k, share, now: A, path: A):
@@ -72,22 +79,25 @@ class ObstacleStages(ObstacleFunctions):
         return turning.at_share(self.turned.short(start), self.turned.short(phi), share, self.fp)
 
     @traced
-    def place(self, g, k, now, path):
+    def place(self, g, k, now, scene):
         """The same when the pass begins."""
-        return self.place_at(g, k, now.begin, now, path)
+        return self.place_at(g, k, now.begin, now, scene)
 
     @traced
     def seen_now(self, g, k, rest, now, scene):
         """X of a rest position when the pass begins (obstacle_functions.py)."""
-        return self.seen(g, rest, self.place(g, k, now, scene.path))
+        return self.seen(g, rest, self.place(g, k, now, scene))
 
     @traced
     def moved(self, g, k, X, u, dr, now, scene, tangent):
         """Change of the place for dr of X + u, and for that of the obstacle."""
-        shift = self.shift_at(g, k, now.begin, now, tangent.path)
+        shift = self.shift_at(g, k, now.begin, now, tangent)
         if not g.force.turns:
             return dr - shift
-        dplace = self.turned.joined(shift, self.turn_jvp(g, k, now, scene, tangent))
+        if g.led:
+            dplace = self.turned.joined(shift, at(tangent.offsets, self.turning_row(g, k) + AT_BEGIN))
+        else:
+            dplace = self.turned.joined(shift, self.turn_jvp(g, k, now, scene, tangent))
         return self.turned.moved(g, g.first + k * g.size, X, u, dr, dplace, scene, tangent)
 
     @ti.func
@@ -99,40 +109,44 @@ class ObstacleStages(ObstacleFunctions):
         return turning.rotated(a, theta, self.fp) + now.begin * turning.jacobian(a, dphi, self.fp)
 
     @ti.func
-    def speed(self, g: A, k, now: A, path: A):
-        """Velocity of an obstacle in the pass, of one that turns that of the point which it turns about."""
+    def speed(self, g: A, k, now: A, of: A):
+        """Velocity of an obstacle in the pass, of one that turns that of the point which it turns about; or its change."""
         speed = self.vector(0)
         if ti.static(g.path >= 0):
-            speed = now.per_step * (path[now.next, self.column(g, k)] - path[now.row, self.column(g, k)])
+            speed = now.per_step * (of.path[now.next, self.column(g, k)] - of.path[now.row, self.column(g, k)])
+        if ti.static(g.led):
+            speed = of.offsets[3 * (g.number + k) + RATE]
         return speed
 
-    @ti.func
-    def spin(self, g: A, k, now: A, path: A):
-        """Angular velocity."""
-        return now.per_step * self.turned.short(path[now.row, self.column(g, k) + 2])
+    @traced
+    def spin(self, g, k, now, of):
+        """Angular velocity, or its change."""
+        if g.led:
+            return self.turned.short(at(of.offsets, self.turning_row(g, k) + RATE))
+        return let(now.per_step * self.turned.short(at(of.path, now.row, self.column(g, k) + 2)))
 
     @traced
     def v_obstacle(self, g, k, X, u, now, scene):
         """Velocity of an obstacle at a vertex in the pass."""
-        v = self.speed(g, k, now, scene.path)
+        v = self.speed(g, k, now, scene)
         if not g.force.turns:
             return v
         r = self.turned.arm(g, g.first + k * g.size, X, u, scene)
-        return self.turned.v_obstacle(self.turned.short(v), self.spin(g, k, now, scene.path), now.h, r)
+        return self.turned.v_obstacle(self.turned.short(v), self.spin(g, k, now, scene), now.h, r)
 
     @traced
     def obstacle_velocity_jvp(self, g, k, X, u, dr, now, scene, tangent):
         """Its change, for dr of X + u."""
-        dv = self.speed(g, k, now, tangent.path)
+        dv = self.speed(g, k, now, tangent)
         return self.turned_velocity_jvp(g, k, X, u, dr, dv, now, scene, tangent) if g.force.turns else dv
 
     @ti.func
     def turned_velocity_jvp(self, g: A, k, X, u, dr, dv, now: A, scene: A, tangent: A):
         first = g.first + k * g.size
         arm, darm = self.turned.arm(g, first, X, u, scene), self.turned.short(dr)
-        darm += -1 * self.turned.short(self.shift_at(g, k, now.begin, now, tangent.path))
+        darm += -1 * self.turned.short(self.shift_at(g, k, now.begin, now, tangent))
         darm += -1 * self.turned.about(g, first, tangent.parameters)
-        omega, domega = self.spin(g, k, now, scene.path), self.spin(g, k, now, tangent.path)
+        omega, domega = self.spin(g, k, now, scene), self.spin(g, k, now, tangent)
         return self.turned.obstacle_velocity_jvp(self.turned.short(dv), omega, domega, now.h, arm, darm)
 
     @traced
@@ -148,11 +162,16 @@ class ObstacleStages(ObstacleFunctions):
     @ti.func
     def spread_turned(self, g: A, k, i, column, X, u, by, by_v_obstacle, now: A, scene: A, adjoint: A, felt: A):
         first, b = g.first + k * g.size, self.turned.short(by_v_obstacle)
-        r, omega = self.turned.arm(g, first, X, u, scene), self.spin(g, k, now, scene.path)
+        r, omega = self.turned.arm(g, first, X, u, scene), self.spin(g, k, now, scene)
         by_omega, by_arm = self.turned.obstacle_velocity_vjp(omega, now.h, r, b)
         by_u, _, by_theta = self.turned.spread(g, first, i, X, u, by, by_arm, scene, adjoint.sums)
         self.add_to_path(g, k, column, now, by_u, by_v_obstacle, felt)
-        self.add_to_turn(g, k, column, now, by_theta, by_omega, scene, felt)
+        if ti.static(g.led):
+            row = self.turning_row(g, k)
+            felt.offsets[row + AT_BEGIN, column] = felt.offsets[row + AT_BEGIN, column] + self.turned.long(by_theta)
+            felt.offsets[row + RATE, column] = felt.offsets[row + RATE, column] + self.turned.long(by_omega)
+        else:
+            self.add_to_turn(g, k, column, now, by_theta, by_omega, scene, felt)
         return by_u
 
     @ti.func
@@ -172,13 +191,17 @@ class ObstacleStages(ObstacleFunctions):
             c, rate = now.path_adjoint + 2 * self.column(g, k), now.per_step * by_v_obstacle
             adjoint.path_adjoint[c, i] = adjoint.path_adjoint[c, i] - ((1 - now.begin) * by_X + rate)
             adjoint.path_adjoint[c + 1, i] = adjoint.path_adjoint[c + 1, i] - (now.begin * by_X - rate)
+        if ti.static(g.led):
+            row = 3 * (g.number + k)
+            adjoint.offsets[row + AT_BEGIN, i] = adjoint.offsets[row + AT_BEGIN, i] - by_X
+            adjoint.offsets[row + RATE, i] = adjoint.offsets[row + RATE, i] + by_v_obstacle
 
     @traced
     def displacement_of_obstacle(self, g, k, X, u, now, scene):
         """How far an obstacle goes in the pass at a vertex."""
         if g.force.turns:
             return now.h * self.v_obstacle(g, k, X, u, now, scene)
-        return self.place_at(g, k, now.end, now, scene.path) - self.place(g, k, now, scene.path)
+        return self.place_at(g, k, now.end, now, scene) - self.place(g, k, now, scene)
 
     # ---- adjoints of paths -------------------------------------------------------------------------------------------
 

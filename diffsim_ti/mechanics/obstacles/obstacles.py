@@ -11,7 +11,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
 from diffsim_ti.runtime import assign, at, let, traced
-from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, MORE, RATE, TAU
+from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE, TAU
 from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -25,11 +25,6 @@ class ObstaclePotential(ObstacleFunctions):
     def rest_now(self, g: A, k, i, scene: A, pass_: A):
         """Rest position of vertex i relative to an obstacle where forces are taken."""
         return self.seen(g, scene.rest[i], self.place_of(g, k, AT_STAGE, pass_))
-
-    @traced
-    def turning_row(self, g, k):
-        """Where the rows of an obstacle that turns begin."""
-        return 3 * self.num_obstacles + MORE * (g.turning + k)
 
     @traced
     def place_of(self, g, k, m, pass_):

@@ -20,10 +20,17 @@ STATE |= dict(seen="scalars2", stage="vectors2", work="scalars", own_work="scala
 RECORDED = {name: STATE[name] for name in ("u", "v", "f", "stage")}  # what the way back reads of it
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
 PLAN = dict(ints="ints", floats="scalars")  # the tables of the passes, from pass `window` on
+LED = dict(offsets="vectors")  # where robots have moved obstacles, and its change
 TURNS = dict(turns="ints")  # of the loops of a launch for many passes
 NUMBERS = dict.fromkeys(("num_items", "num_vertices", "window", "first", "count", "base"), "int") | dict(
     contact_damping="float"
 )
+
+
+@traced
+def unseen(now) -> Bundle:
+    """A pass that shows no frame."""
+    return Bundle(**vars(now) | dict(frame=let(0 * now.frame - 1)))
 
 
 @dataclass(frozen=True)
@@ -84,6 +91,8 @@ class ExplicitKernels:
         if not self.vertex.features.recorded:
             return now
         rows = 2 * self.vertex.obstacles.num_obstacles
+        if self.vertex.features.led:  # which are noted pass by pass
+            return Bundle(**vars(now), into=let(0 * now.counted))
         return Bundle(**vars(now), into=let(ti.select(now.counted >= 0, now.counted * rows, -1)))
 
     # ---- which scene a loop's item or vertex k is of, where they are of many (batch/innermost_kernels.py) ---------------
@@ -294,8 +303,36 @@ class ExplicitKernels:
     def step_jvp(self) -> Kernel:
         """The tangent of passes first .. first + count - 1 along recorded slots; the change of the state is advanced in
         place."""
-        own = dict(state=self.with_record(STATE), tangent=self.with_record(CHANGE) | TANGENT | self.items.tangent)
+        own = dict(state=self.with_record(STATE), tangent=self.with_record(CHANGE) | TANGENT | LED | self.items.tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, self.repeated, rate_dot="float")
+
+    # ---- vertices again, where joints of robots meet them (mechanics/joints/explicit.py) --------------------------------
+
+    @ti.func
+    def press_all(self, scene: A, state: A, table: A, plan: A):
+        num_vertices = self.num_vertices(plan)
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(num_vertices):
+            now = self.counted(self.numbers_of(0, plan.first, table, plan))
+            self.vertex.press(i, now, scene, state, plan)
+
+    @cached_property
+    def press(self) -> Kernel:
+        return self._kernel("press", self.press_all, dict(state=self.with_record(STATE)), False, stride="int")
+
+    @ti.func
+    def press_all_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
+        num_vertices = self.num_vertices(plan)
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(num_vertices):
+            now = unseen(self.counted(self.numbers_of(0, plan.first, table, plan)))
+            self.vertex.go_on_jvp(i, plan.base, self.vertex.vector(0), now, scene, state, tangent, plan)
+
+    @cached_property
+    def press_jvp(self) -> Kernel:
+        """Its change where only the rows of obstacles change."""
+        own = dict(state=self.with_record(STATE), tangent=self.with_record(CHANGE) | TANGENT | LED | self.items.tangent)
+        return self._kernel("press_jvp", self.press_all_jvp, own, False, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
@@ -377,7 +414,7 @@ class ExplicitKernels:
         """
         numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
         own = adjoints(self.with_record(CHANGE) | ADJOINT | OF_STEPS, self.vertex.features) | self.corners
-        own |= dict(w="vectors2", path_adjoint="vectors2") | self.items.adjoint
+        own |= dict.fromkeys(("w", "path_adjoint", "offsets"), "vectors2") | self.items.adjoint
         arrays = dict(state=self.with_record(RECORDED), adjoint=own)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
@@ -400,7 +437,7 @@ class ExplicitKernels:
         return self.kernel("finish_vjp", self.gather_rest, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        arrays = dict(scene=SCENE | self.items.arrays) | arrays | dict(table=PLAN)
+        arrays = dict(scene=SCENE | LED | self.items.arrays) | arrays | dict(table=PLAN)
         arrays = {bundle: needed(own, self.vertex.features) for bundle, own in arrays.items()}
         numbers = NUMBERS | self.items.counts | numbers
         if repeated:

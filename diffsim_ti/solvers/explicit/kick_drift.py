@@ -157,16 +157,7 @@ class KickDrift(VertexParts):
         if now.frame >= 0:
             state.frames_u[now.frame, i] = u
             state.frames_v[now.frame, i] = v_mid
-        if ti.static(len(self.features.rough) > 0):
-            if now.alpha > 0 and scene.surface[i] > 0:
-                v_plus = self.obstacles.slide_all(i, u, v_plus, now, scene)
-        # drift and damping
-        u_next, v_next = drift(u, v_plus, now)
-        if ti.static(self.features.num_staged > 0):
-            lead = self.lead(i, u, v, now, scene, scene)
-            u_next, v_next = self.contact.advance(i, u, v_plus, lead, now, scene, state, plan)
-        if ti.static(self.features.partly_fixed or self.features.motion):
-            u_next, v_next = self.driven(i, u, v, u_next, v_next, now, scene, scene)
+        u_next, v_next = self.drifted(i, u, v, v_plus, now, scene, state, plan)
         if ti.static(len(self.features.groups) > 0):
             if scene.surface[i] > 0:
                 self.obstacles.note(i, u, u_next, now, scene, state)
@@ -175,10 +166,35 @@ class KickDrift(VertexParts):
         if ti.static(self.features.balanced):
             done = work_of_own_forces(self, i, v, v_kicked, f, v_next, now, scene, plan)
             state.own_work[i] = state.own_work[i] + done
-        if plan.stride > 0:
+        if ti.static(self.features.led):
+            state.f[s, i] = f
+        elif plan.stride > 0:
             state.f[s, i] = f
         state.u[t, i] = u_next
         state.v[t, i] = v_next
+
+    @ti.func
+    def drifted(self, i, u, v, v_plus, now: A, scene: A, state: A, plan: A):
+        """(u', v') after the kick to v_plus: friction, drift, contact, damping."""
+        if ti.static(len(self.features.rough) > 0):
+            if now.alpha > 0 and scene.surface[i] > 0:
+                v_plus = self.obstacles.slide_all(i, u, v_plus, now, scene)
+        u_next, v_next = drift(u, v_plus, now)
+        if ti.static(self.features.num_staged > 0):
+            lead = self.lead(i, u, v, now, scene, scene)
+            u_next, v_next = self.contact.advance(i, u, v_plus, lead, now, scene, state, plan)
+        if ti.static(self.features.partly_fixed or self.features.motion):
+            u_next, v_next = self.driven(i, u, v, u_next, v_next, now, scene, scene)
+        return u_next, v_next
+
+    @ti.func
+    def press(self, i, now: A, scene: A, state: A, plan: A):
+        """The pass again from slot 0 to slot 1, with the forces that are noted and obstacles that move in another way."""
+        u, v = state.u[0, i], state.v[0, i]
+        _, v_plus = self.kicked(i, v, state.f[0, i], now, scene)
+        u_next, v_next = self.drifted(i, u, v, v_plus, now, scene, state, plan)
+        state.u[1, i] = u_next
+        state.v[1, i] = v_next
 
     # ---- its tangent -------------------------------------------------------------------------------------------------
 

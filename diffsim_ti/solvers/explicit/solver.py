@@ -16,11 +16,13 @@ from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
 from diffsim_ti.mechanics.constraints import Constraints, HeldRelations
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.joints.explicit import JointStage
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies, meets_between_vertices
 from diffsim_ti.mechanics.reduced.projected_sets import ProjectedSets
+from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance, OwnWork
@@ -75,7 +77,7 @@ class ExplicitSolver(Solver):
     Raises ValueError for another `contact`, or damping outside [0, 1].
     """
 
-    explicit = True
+    explicit = moves_robots = True
     arguments = (*Solver.arguments, "contact", "contact_damping")
     check_bodies = staticmethod(check_bodies)
 
@@ -125,7 +127,7 @@ class ExplicitSolver(Solver):
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
         alone = (
             meets_between_vertices(self.scene) or any(x.apart for x in self.scene.interactions) or self.scene.reduced
-        )  # which act between passes
+        ) or self.scene.interaction(Robots)  # which act between passes
         return 1 if alone or runtime.runs_on_cpu() or not runtime.can_repeat() else MOST_PASSES
 
     @abstractmethod
@@ -169,6 +171,7 @@ class ExplicitWorkspace(Workspace):
         self.volumes = VolumeConstraints(self) if self.scene.holds_volumes else None
         self.relations = HeldRelations(self) if self.scene.interaction(Constraints) else None
         self.projected = ProjectedSets(self) if self.scene.reduced.by_basis else None
+        self.joint_stage = JointStage(self) if self.scene.interaction(Robots) else None
         self.stages = stages_of(self)
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
@@ -177,9 +180,15 @@ class ExplicitWorkspace(Workspace):
             work=runtime.array(a.fp, a.num_vertices * (1 + features.pulled) if features.driven else 1),
             own_work=runtime.array(a.fp, a.num_vertices),
         )
+        if self.joint_stage:
+            self.joints = self.joint_stage.joints
+            self.start_joints()
+            self.place_obstacles(0)
+            if features.led:  # joints feel what contact does
+                self.record_contacts(frozenset())
         self.hosts = host_forces(self.scene)  # for what is evaluated between passes
         self.probe = None  # room for a pass that is not taken
-        unwatched = self.scene.term(Growth) or self.has_unnoted_work
+        unwatched = self.scene.term(Growth) or self.has_unnoted_work or self.joints
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not unwatched else None
 
     @property
@@ -189,14 +198,14 @@ class ExplicitWorkspace(Workspace):
         return any(x.in_kernels and not len(x.vertices) and not f.has_energy for x, f in zip(on_host, self.hosts))
 
     def balance(self) -> OwnWork | None:
-        if not OwnWork.serves(self):
+        if self.joints or not OwnWork.serves(self):
             return None
         self.arrays.count_own_work()
         self._launches.clear()
         return OwnWork(self)
 
     def record_contacts(self, wanted: frozenset) -> None:
-        if True in wanted:
+        if True in wanted or self.arrays.features().led:
             self.arrays.record_contacts()
             self._launches.clear()
         self.impulses = ImpulseRecord(self, wanted)
@@ -247,6 +256,10 @@ class ExplicitWorkspace(Workspace):
         of_kicks = (w.share0, w.lag0), (w.share1, w.lag1)
         kicks = [(float(np.ravel(share)[0]), int(np.ravel(lag)[0])) for share, lag in of_kicks]
         return [(share, (j - lag, schedule.end(j - lag) if lag else schedule.begin(j))) for share, lag in kicks]
+
+    def share_at_stage(self, j: int, stage) -> float:
+        """Share of the step at which joints of robots take targets in pass j."""
+        return self.solver.schedule.end(j)
 
     def numbers_of(self, j: int, num_passes: int) -> SimpleNamespace:
         """h [s] of pass j, and its weights as numbers."""

@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import VolumeConstraintAdjoint, VolumeConstraintTangent
 from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
 from diffsim_ti.mechanics.constraints import HeldRelations
+from diffsim_ti.mechanics.joints.explicit import JointStage, JointStageAdjoint, JointStageTangent
 from diffsim_ti.mechanics.reduced.projected_sets import ProjectedAdjoint, ProjectedSets, ProjectedTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
@@ -16,11 +17,13 @@ BUFFERED = dict(
         VolumeConstraints: VolumeConstraintTangent,
         HeldRelations: VolumeConstraintTangent,
         ProjectedSets: ProjectedTangent,
+        JointStage: JointStageTangent,
     },
     adjoint={
         VolumeConstraints: VolumeConstraintAdjoint,
         HeldRelations: VolumeConstraintAdjoint,
         ProjectedSets: ProjectedAdjoint,
+        JointStage: JointStageAdjoint,
     },
 )
 
@@ -56,7 +59,7 @@ class KickDrift(Stage):
 def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
     contact = _contact_of(ws.pairs, ws.solver.contact_damping, ws.scene.reduced.bodies)
-    every = contact, ws.volumes, ws.relations, ws.chambers, ws.projected, KickDrift()
+    every = contact, ws.volumes, ws.relations, ws.chambers, ws.projected, ws.joint_stage, KickDrift()
     return [stage for stage in every if stage]
 
 

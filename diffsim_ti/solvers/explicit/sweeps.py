@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.joints.explicit import JointStageAdjoint, JointStageTangent
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.stress.law_state import LawFrames
@@ -41,6 +42,7 @@ class ExplicitAdjoint:
         vars(self).update(self._arrays)
         self.impulses = ImpulseRecord(workspace, workspace.impulses.wanted) if workspace.impulses else None
         self.stages = with_buffers("adjoint", workspace.stages, self)
+        self.joints = next((stage for stage in self.stages if isinstance(stage, JointStageAdjoint)), None)
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run; they are as long as launches stay bound."""
@@ -62,6 +64,8 @@ class ExplicitAdjoint:
         # of paths: the adjoint by each vertex in the steps that a launch goes through, and the sums of that
         out["path_adjoint"] = 2 * moving * self._most_steps(workspace), n if moving else 1
         out["path"] = a.path.shape[0], moving * self.num_parts
+        if has.led:
+            out["offsets"] = a.poses.size, n
         for x in a.interactions:
             out |= x.adjoints(a.values, has.shape)
         return out
@@ -138,6 +142,8 @@ class ExplicitAdjoint:
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (self.u, self.v))
         reduced = self.ws.scene.reduced
         u, v = reduced.of(u), reduced.of(self.ws.arrays.supports.free(v))
+        if self.joints:
+            u, v = np.append(u, self.joints.by_q), np.append(v, self.joints.by_v)
         return float(np.linalg.norm(u)), float(np.linalg.norm(v))
 
     def scale(self, factor: float) -> None:
@@ -145,6 +151,8 @@ class ExplicitAdjoint:
         for name in {"u", "v", "corner", "rate_corner", "z"} & self._arrays.keys():
             x = self._arrays[name]
             runtime.fill(x, runtime.fetch(x) * factor)
+        if self.joints:
+            self.joints.by_q, self.joints.by_v = factor * self.joints.by_q, factor * self.joints.by_v
 
     def collect(self, state: bool = True) -> Derived:
         """Adjoints of what kernels read, in float64, at the start of the run; state=False leaves out those of the state."""
@@ -188,6 +196,10 @@ class ExplicitTangent:
             runtime.fill(self.z, 0)
         self.rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
         self.stages = with_buffers("tangent", workspace.stages, self)
+        self.joints = next((stage.joints for stage in self.stages if isinstance(stage, JointStageTangent)), None)
+        self.offsets = (
+            runtime.array(a.vector, a.poses.size) if self.features.led else None
+        )  # where robots move obstacles
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
@@ -207,6 +219,13 @@ class ExplicitTangent:
         copy_slot(self.v, 0, self.frames.frames_v, frame)
         if self.law_frames:
             self.law_frames.note(frame, self.z)
+        if self.joints:
+            self.joints.note()
+
+    @property
+    def joint_frames(self) -> list:
+        """Changes of the frames' joint positions and velocities."""
+        return self.joints.frames
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities, float64."""

@@ -148,11 +148,15 @@ class ImplicitAdjoint(RecordedPasses):
         ):  # rounding of what is held, no direction of ours
             seed = np.zeros_like(seed)
         if self.joints:
-            seed = self.joints.begin(seed, 0.0 if seen is None else seen[2])
+            by_ends = s.c0 * p + s.e0 / s.gamma * q + by_contacts
+            seed = self.joints.begin(seed, 0.0 if seen is None else seen[2], by_ends)
+            q_free = self.joints.with_held(q_free, q)
         by_star = self.solve(seed)
         if ws.volumes:
             by_pressure = self.chamber_record.adjoint(j, save_every)
             by_star, nu = ws.volumes.adjoint(ws.potential.held_at, by_star, by_pressure, self.solve)
+        if self.joints:
+            by_star = self.joints.follow(by_star)
         runtime.fill(ws.potential.w, by_star[None])
         for target in (self.lag, self.poses):
             runtime.fill(target, 0)
@@ -188,6 +192,7 @@ class ImplicitAdjoint(RecordedPasses):
             by_lag, x_adj = by_lag + by_joints[1][0], x_adj + by_joints[1][1]
             by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64)) + by_joints[2]
             self.gravity = self.gravity + self.joints.end(by_poses, self.by_hosts)
+            self.rest_adj[ws.joints.at] -= self.joints.hand_on(by_ends + reaction - by_contacts)
         if self.path is not None:
             by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64)) + by_joints[2]
             by_poses = by_poses + (0.0 if seen is None else seen[2])
@@ -292,7 +297,7 @@ class ImplicitAdjoint(RecordedPasses):
         out.forces, out.motion, out.path = self.forces, self.motion, self.path
         out.add(self.by_hosts)
         if self.joints:
-            self.joints.collect(out.parameters)
+            self.joints.collect(out)
         if self.motion is not None:
             out.displacement[a.held] += self.anchor
         return out

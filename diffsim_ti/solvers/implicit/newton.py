@@ -213,13 +213,17 @@ class Newton:
         found = None if self.volumes else self.operator().on_device()
         return found and found[:2]
 
-    def residual(self, u) -> tuple[np.ndarray, np.ndarray]:
-        """(R, shape (num_vertices, 3); the root of the squares of the forces at each vertex that it is measured by)"""
+    def balance(self, u, mass, inertial, loads):
+        """(-dPhi/du of a problem where the potential stands, of all vertices [N]; sizes of the forces that meet at each)."""
         f, sizes = self.potential.forces()
-        inertia = self.mass * (u - self.inertial)
         if self.others:
             f, sizes = f + self.others.forces(u), sizes + self.others.sizes(u)
-        R = f + self.loads - inertia
+        return f + loads - mass * (u - inertial), sizes
+
+    def residual(self, u) -> tuple[np.ndarray, np.ndarray]:
+        """(R, shape (num_vertices, 3); the root of the squares of the forces at each vertex that it is measured by)"""
+        R, sizes = self.balance(u, self.mass, self.inertial, self.loads)
+        inertia = self.mass * (u - self.inertial)
         self.rigid.feel(R)
         return R * self.free, np.sqrt(sizes**2 + (self.loads**2 + inertia**2 * self.moves).sum(1))
 
@@ -229,7 +233,8 @@ class Newton:
         friction = self.potential.surface_friction
         with friction.bounded(self.turning) if friction else nullcontext():
             direction, R = self._direction_of(u, R, forcing)
-        return cleaned(linear_of(self.free), direction), R
+        direction, joints = cleaned(linear_of(self.free), direction), self.potential.joints
+        return joints.extended(direction) if joints else direction, R
 
     def _direction_of(self, u, R, forcing):
         A = self.operator()

@@ -30,6 +30,7 @@ class RecordedPasses:
         self.mass = stage.inertia * ws.mass
         if self.joints:
             self.joints.open(j - base)
+            ws.joints.problem = ws.problem(j, stage, self.x, self.y)
         ws.begin(j, stage, self.u, self.x)
         if self.joints:
             self.joints.hold()

@@ -69,6 +69,7 @@ class ImplicitTangent(RecordedPasses):
             held = ws.rigid.held_jvp(held, self.du, tangent.rest)
         poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
         if self.joints:
+            held[ws.joints.at] = self.joints.led()
             poses = self.joints.rows_jvp(0.0 * self.joints.dq, self.joints.dq) + (0.0 if poses is None else poses)
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
         of_obstacles = dict(poses_dot=poses) if ws.pairs and ws.pairs.obstacles else {}
@@ -81,7 +82,7 @@ class ImplicitTangent(RecordedPasses):
         if tangent.growths is not None:
             moved = ws.growth_of(tangent.growths, j, s)
             runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
-        if poses is not None:
+        if poses is not None and len(poses):
             runtime.fill(self.poses, poses)
         if ws.strains:
             ws.strains.jvp(s, (self.u, self.du), (self.before, self.tangent_before), self)
@@ -101,7 +102,7 @@ class ImplicitTangent(RecordedPasses):
         dR += self.mass * (dx + s.gamma * dy - held)
         if self.joints:
             shares = self._shares.forces("jvp", **self._moved) if self._shares else None
-            push = self.joints.force(shares, held, self.du)
+            push = self.joints.force(shares, held, self.du, dR)
             dR = dR - ws.joints.of_joints(ws.joints.follow(push), dR.shape)
         d_star = self.solve(dR)
         if ws.volumes:
@@ -111,8 +112,10 @@ class ImplicitTangent(RecordedPasses):
         dq = ws.joints.follow(push - ws.joints.of_body(d_star)) if self.joints else None
         d_star = held + d_star
         if self.joints:
+            d_star[ws.joints.at] += np.einsum("iad,a->id", ws.joints.J_a, dq)
             poses = poses + self.joints.rows_jvp(dq, np.zeros_like(dq))
-            runtime.fill(self.poses, poses)
+            if len(poses):
+                runtime.fill(self.poses, poses)
         if self.contacts:
             self._note_contacts(j, save_every, d_star, dx, poses)
         if self.joints:

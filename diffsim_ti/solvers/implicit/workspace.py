@@ -34,7 +34,6 @@ from diffsim_ti.solvers.implicit.overlap import pressed_apart
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.solvers.implicit.prescribed import PrescribedInPasses
 from diffsim_ti.state.history import History
-from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms import Growth
 
@@ -51,7 +50,6 @@ class TwoStepHistory(History):
 class ImplicitWorkspace(PrescribedInPasses):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
-    joints: Joints | None = None  # of robots
     pairs_kind, potential_kind, newton_kind = ImplicitPairs, Potential, Newton
     collisions_kind, preconditioners_kind = ObstacleCollisions, Preconditioners
     enough = 20  # rounds with which a solution that was not found is found by load stepping
@@ -73,11 +71,14 @@ class ImplicitWorkspace(PrescribedInPasses):
             self.potential = self.potential_kind(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
             self.joints = self.potential.joints = Joints(self) if self.scene.interaction(Robots) else None
-            self._start_joints()
+            self.start_joints()
+            self.place_obstacles(0)
             self.strains = FrozenStrains(self) if self.potential.held is not None else None
         a = self.arrays
         self._mass = self.mass_of(derived)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
+        if self.joints:
+            self.free[self.joints.at] = 0.0
         self.rigid = self.potential.rigid = RigidSets(self.scene.reduced, derived.rest)
         if self.scene.reduced:
             self.free = FreeBodies(
@@ -90,6 +91,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         self.hosts.restrict(projectors_of(self.free), derived.rest)
         self.potential.hosts, others = self.hosts.with_energy, self.hosts.without_energy
+        if self.joints:
+            self.joints.check_forces(others)
         self.volumes = self.volume_constraints(eps)
         self.multipliers = {}  # the pressures [Pa] that each pass ended with
         self.preconditioner, self.noted = self.preconditioners_kind(self), Noted(self)
@@ -124,15 +127,9 @@ class ImplicitWorkspace(PrescribedInPasses):
     def restart(self) -> None:
         super().restart()
         self.multipliers = {}
-        self._start_joints()
         self._restart()
         if self.energy_watch:
             self.energy_watch.clear()
-
-    def _start_joints(self) -> None:
-        if self.joints:
-            self.state.joints[0] = self.joints.start()
-            self.place_obstacles(0)
 
     def forget(self) -> None:
         """The state was set from outside: there is none before it."""
@@ -165,22 +162,6 @@ class ImplicitWorkspace(PrescribedInPasses):
         copy_slot(source.before.u, s, target.before.u, min(t, target.before.num_slots - 1))
         copy_slot(source.before.v, s, target.before.v, min(t, target.before.num_slots - 1))
         target.fresh[t] = source.fresh[s]
-
-    def make_frames(self, count: int) -> None:
-        super().make_frames(count)
-        self.joint_frames = [None] * count  # positions and velocities of joints, a column each
-
-    def save_frame(self, frame: int) -> None:
-        super().save_frame(frame)
-        if self.joints:
-            self.joint_frames[frame] = np.stack(self.state.joints[0], 1)
-
-    def place_obstacles(self, now: int) -> None:
-        super().place_obstacles(now)
-        if self.joints:
-            rows = runtime.fetch(self.arrays.offsets)[:, :3].astype(np.float64)
-            self.joints.put(rows, self.state.joints[0][0], (AT_STAGE, AT_BEGIN))
-            runtime.fill(self.arrays.offsets, rows)
 
     # ---- a pass -----------------------------------------------------------------------------------------------------
 
@@ -256,6 +237,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         x, y = self.inertial(stage, u, v, before)
         place, speed = self.prescribed(j, self.arrays.values)
         problem = self.problem(j, stage, x, y)
+        if self.joints:
+            self.joints.problem = problem
         self.rigid.begin(u, stage.c0)
         starts = [] if stage.static else [problem[1], x + stage.gamma * y]
         held = (
@@ -278,7 +261,7 @@ class ImplicitWorkspace(PrescribedInPasses):
             raise self.collisions.explained(error, u) from None
         self.u_star = u_star
         if self.joints:
-            self.potential.place(u_star)
+            u_star = self.u_star = self.potential.place(u_star)
             self.joints.end()
         self.keep_multipliers(j)
         v_star = (u_star - x) / stage.gamma

@@ -26,8 +26,8 @@ class RobotModel:
     """A robot on a base of pose `base`, 7 numbers. Joints have one degree of freedom each, in the order of `joints`.
 
     masses [kg]: of what each joint carries rigidly, fixed links included. above[b, a]: whether joint b carries joint a, a
-    itself not included. links: {name of a link: (joint that carries it, -1 for the base, its pose in the frame of that)}, a
-    pose being (unit quaternion, t [m]).
+    itself not included. limits: (lower, upper) of joints, infinite without. links: {name of a link: (joint that carries it,
+    -1 for the base, its pose in the frame of that)}, a pose being (unit quaternion, t [m]).
     Featherstone, Rigid Body Dynamics Algorithms, 2008; Carpentier, Mansard 2018, Analytical Derivatives of Rigid Body
     Dynamics Algorithms, doi:10.15607/RSS.2018.XIV.038.
     """
@@ -44,6 +44,11 @@ class RobotModel:
                 model.jointPlacements[j] = placed * model.jointPlacements[j]
         self.data, self.size = model.createData(), model.nv
         self.joints = tuple(model.names)[1:]
+        bounds = [
+            (model.lowerPositionLimit[j.idx_q], model.upperPositionLimit[j.idx_q], j.nq) for j in model.joints[1:]
+        ]
+        bounded = np.array([(low, high) if nq == 1 else (-np.inf, np.inf) for low, high, nq in bounds]).reshape(-1, 2)
+        self.limits = bounded[:, 0], bounded[:, 1]
         self.inertias = [model.inertias[j].copy() for j in range(1, model.njoints)]
         self.masses = np.array([inertia.mass for inertia in self.inertias])
         parents = np.array([model.parents[j] for j in range(model.njoints)])

@@ -1,6 +1,7 @@
-"""Articulated robots, whose joints are unknowns of implicit steps together with the body."""
+"""Articulated robots, whose joints are unknowns of steps together with the body."""
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import TypedDict
 
@@ -14,11 +15,12 @@ from diffsim_ti.inputs import NOT_NEGATIVE, POSITIVE, Input
 from diffsim_ti.inputs.description import Range
 from diffsim_ti.inputs.links import Joined
 from diffsim_ti.inputs.loads import InTime
+from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
 from diffsim_ti.terms.robots.model import RobotModel
 from diffsim_ti.terms.robots.urdf import Urdf
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import Term, nonempty
 
 OfJoints = ArrayLike | Mapping[str, ArrayLike]
 AT_LEAST_0 = Range(">= 0", NOT_NEGATIVE.holds, in_runs=False)
@@ -34,29 +36,36 @@ class LinkContact(TypedDict, total=False):
 
 
 class Robot(GivenOverTime, Term):
-    """A tree of rigid links and joints, on a base that stands, with the joint positions q as unknowns of implicit steps.
+    """A tree of rigid links and joints, on a base that stands, with the joint positions q as unknowns of steps.
 
     `Robot.from_urdf(path)` makes one of the model, inputs, targets and name that it finds. A backward Euler step of length h
     from (x_n, q_n, v_n) is a stationary point, found by descent, of one incremental potential of body and joints,
 
         Phi(x) + E_contact(x, links(q)) + 1/2 (q - p)^T M (q - p) / h^2 + b . q
-          + 1/2 k (q - q_target)^2 + 1/2 c (q - q_n)^2 / h - tau . q,    p = q_n + h v_n,
+          + 1/2 k (q - q_target)^2 + 1/2 c (q - q_n)^2 / h + E_limit(q) - tau . q,    p = q_n + h v_n,
 
     with friction by the velocities of body and links in the same step. So no wrench of normal contact lags. The inertia
     M(q_n), the bias b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and arms and normal forces of friction, as
     of every obstacle, are those where the step begins: they change by O(h) within it, which keeps the first order of
     backward Euler. Action is reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
-    Links touch the body alone: not one another, the ground, or other obstacles. No vertex can be fixed to a link; where the
-    joints' motion is given, `Pose` moves a clamp as a link moves. `Simulator.set_state` leaves the joints where they are.
-    `compute_energy` and the guard of the energy are those of the body.
+    In explicit steps joints take substeps of backward Euler, which drives do not limit, and links are obstacles of the
+    contact stage: what vertices do to them turns joints in the same substep, by J M^-1 J^T. Fixed vertices do nothing there.
+    Links touch the body alone: not one another, the ground, or other obstacles. `Simulator.set_state` leaves the joints
+    where they are. `compute_energy` and the guard of the energy are those of the body; `LinkEnergy` is that of links.
+    Vertices that are `attached` move exactly as their links do, from where they and the joints are as a run starts: they are
+    no unknowns of their own, and the joints feel what acts on them, inertia included. `Reaction` of their set is the force
+    of the link on them, or its moment.
+    Limits of joints hold by the one-sided potential E_limit = k d^3 / (6 w) of what is beyond them by d < w, 1e-4 of the
+    range, and of constant stiffness k = 10^6 M / h^2 beyond: joints stop there without rebound. Limits of effort and
+    velocity in the file have no effect.
 
     All inputs have a gradient, by names that begin with the robot's: "positions", "velocities", shape (joints,), where a
     run starts [rad or m, per s]; "torques", (joints,) or (steps, joints) [N m or N]; "targets", of shape (joints,),
     (steps, joints), or (steps + 1, joints) of a function or keyframes; "drive_stiffness" k, "drive_damping" c;
     "masses" [kg], of what each joint carries rigidly, whose inertia goes along. Links are obstacles <robot>_<link> of the
     scene, with _1, _2 behind it where a link has several shapes, and _ for what is no letter or digit.
-    Results: `JointPositions`, `JointVelocities`, and `ContactForce("<robot>_<link>")`.
-    Limits of joints, effort and velocity in the file are not enforced. A link turns by less than half a turn in a step.
+    Results: `JointPositions`, `JointVelocities`, `JointEfforts`, `LinkMotion`, `LinkEnergy`, and
+    `ContactForce("<robot>_<link>")`. A link turns by less than half a turn in a step.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425; Featherstone 2008, Rigid Body Dynamics
     Algorithms.
     """
@@ -66,6 +75,11 @@ class Robot(GivenOverTime, Term):
             raise TypeError("Robot is made by Robot.from_urdf(path)")
         self.model, self.shape = model, (model.size,)
         self.prescribed, self.damping = np.zeros(model.size, bool), np.zeros(model.size)
+        self.limits = np.full(model.size, -np.inf), np.full(model.size, np.inf)
+        self.attached: dict[str, SetOrIndices] = {}
+        self.holds: list[
+            tuple[int, np.ndarray]
+        ] = []  # (joint that carries a link, -1 for the base, vertices that it holds)
         self.companions: tuple[Obstacle, ...] = ()
         self.places: tuple[
             tuple[str, int, tuple], ...
@@ -87,6 +101,8 @@ class Robot(GivenOverTime, Term):
         drive_damping: OfJoints = 0.0,
         prescribed: Sequence[str] = (),
         links: Sequence[str] | None = None,
+        attached: Mapping[str, SetOrIndices] | None = None,
+        limits: bool = True,
         **contact: Unpack[LinkContact],
     ) -> "Robot":
         """The robot of a URDF file, or of its text; joints in the order of `robot.joints`, which need not be the file's.
@@ -99,9 +115,11 @@ class Robot(GivenOverTime, Term):
         being the inertia by the file's masses where the joints start.
         links: whose collision geometry acts on the body; None: all. contact: of all links, as of an `Obstacle`; they act on
         vertices by their distance. Meshes are taken from beside the file.
+        attached: {link: vertices that it holds}, by a vertex set's name, indices, a mask or a list of names, free ones of
+        the scene that are outside of the links' own geometry. limits: whether those of joints in the file hold.
 
-        Raises ValueError for joints of other kinds, mimic joints, closed loops, dry friction, joints that carry no mass, and
-        files that cannot be read; ImportError without Pinocchio.
+        Raises ValueError for joints of other kinds, mimic joints, closed loops, dry friction, joints that carry no mass or
+        start beyond their limits, and files that cannot be read; ImportError without Pinocchio.
         """
         prescribed = tuple(listed("Robot.from_urdf: prescribed", prescribed, "joints by name"))
         links = None if links is None else tuple(listed("Robot.from_urdf: links", links, "links by name"))
@@ -149,7 +167,18 @@ class Robot(GivenOverTime, Term):
             raise ValueError(
                 "Robot.from_urdf: the robot has no positive definite inertia where it starts: check the <inertial> elements"
             )
-        out.typical = np.diag(M).copy()
+        out.typical, out.attached = np.diag(M).copy(), dict(attached or {})
+        for link in out.attached.keys() - model.links.keys():
+            raise ValueError(f"Robot.from_urdf: attached: no link {link!r}; the file has {', '.join(model.links)}")
+        if limits:
+            out.limits = model.limits
+            for joint, low, high in zip(model.joints, *model.limits):
+                if not low < high:
+                    raise ValueError(
+                        f"Robot.from_urdf: joint {joint!r} has the limits {low:g} and {high:g}: give a lower below the "
+                        "upper one in its <limit>, or pass limits=False"
+                    )
+            out.check_limits(out.values["joint_positions"])
         out._take_links(urdf.obstacles(name, links, dict(contact)))
         return out
 
@@ -165,6 +194,23 @@ class Robot(GivenOverTime, Term):
         self.companions, self.places = tuple(parts), tuple(places)
         for obstacle, pose in zip(parts, self.poses(self.values["joint_positions"]).values()):
             obstacle.led = pose
+
+    def settled(self, scene, density, initial_positions, initial_velocities):
+        out = copy(self)
+        out.holds = [
+            (self.model.links[link][0], nonempty(self, scene.mesh.vertex_indices(chosen)))
+            for link, chosen in self.attached.items()
+        ]
+        return out
+
+    def check_limits(self, q: np.ndarray) -> None:
+        """Raise ValueError for joints that start beyond their limits."""
+        for joint, at, low, high in zip(self.joints, q, *self.limits):
+            if not low <= at <= high:
+                raise ValueError(
+                    f"Robot: joint {joint!r} starts at {at:g}, beyond its limits {low:g} and {high:g}: give other "
+                    "positions, or pass limits=False to from_urdf"
+                )
 
     @property
     def joints(self) -> tuple[str, ...]:

@@ -1,0 +1,382 @@
+"""Joints of robots in explicit passes: a stage around the kick and drift, to which links are obstacles that move.
+
+In a pass of length h joints go from (q, v) to q + h w, and links with the velocities J w, J = J(q). The contact stage
+(mechanics/obstacles/contact_stage.py) has vertices meet them, which gets them the impulses P by push and F by friction, for
+each w anew: vertices are eliminated. With Phi of the joints alone (terms/robots/robot.py) and b = (1 + c) / 2 as there
+
+    h dPhi/dq(q + h w) + J^T (b P(w) + F(w)) = 0,    v' = w - (1 - b) A^-1 J^T P,    A = M + h c + h^2 k,
+
+is solved for w by Newton's method: links move by J A^-1 J^T times what vertices do to them in the same pass. What one gets
+the other loses, to round-off, whatever is left of this equation. Fixed vertices do nothing to links.
+"""
+
+import weakref
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.common.errors import NotConverged
+from diffsim_ti.mechanics.joints.joints import Joints, moved
+from diffsim_ti.mechanics.joints.sweeps import JointAdjoint, JointSweep, JointTangent
+from diffsim_ti.mechanics.stage import Passes, Stage
+from diffsim_ti.runtime.slots import copy_slot
+from diffsim_ti.state.history import History
+from diffsim_ti.state.numbers import Tangent
+
+ROUNDS = 100
+
+
+class ExplicitJoints(Joints):
+    """Joints that stand at q + h w."""
+
+    @property
+    def acceleration(self):
+        return (self.w - self.v_n) / self.h
+
+    def go(self, w: np.ndarray, rows: np.ndarray) -> None:
+        """Stand there, with the velocities of links in rows of obstacles."""
+        self.w, self.q = w, self.q_n + self.h * w
+        self.put_rates(rows, w)
+
+    def put_rates(self, rows: np.ndarray, w: np.ndarray) -> None:
+        self._put_rates(rows, w)
+
+    def own_forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(-dPhi/dq, sizes of what it adds up, what digits of places leave)"""
+        return *self._own_forces(), self._rounding()
+
+    def effort(self) -> np.ndarray:
+        return sum(self._efforts())
+
+
+class JointStage(Stage):
+    """The stage. `met`: (w, whether links touched) of each recorded pass, by its slot."""
+
+    def __init__(self, ws):
+        self.ws, a = weakref.proxy(ws), ws.arrays
+        self.joints = ExplicitJoints(ws)
+        self.rows, self.met = np.zeros((a.poses.size, 3)), {}
+        self.blend = 0.5 + 0.5 * ws.solver.contact_damping
+        links = [k for k, _ in self.joints.links]
+        self.own = np.ravel([[2 * k, 2 * k + 1] for k in links]).astype(int)  # their rows of impulses
+        self.carried = np.array([carried for _, carried in self.joints.links], float).reshape(-1, self.joints.count)
+        ws.state.f = runtime.array(a.vector, 1, a.num_vertices)
+        self.pair = History(a, 2, record=True)  # the states that a pass leads from and to
+        self.change, self.none = History(a, 1, record=False), None
+        self.change.offsets = runtime.array(a.vector, a.poses.size)
+        self.change.impulse = runtime.array(a.vector, 2 * len(a.obstacles), a.num_vertices)
+
+    # ---- a pass --------------------------------------------------------------------------------------------------------
+
+    def begin(self, at: Passes) -> None:
+        """Joints stand where the pass begins."""
+        J, self.at = self.joints, at
+        J.now, J.u_n = at.history.joints[at.slot], runtime.fetch_row(at.history.u, at.slot)
+        J.begin(at.j, SimpleNamespace(gamma=at.now.h), self.rows)
+        self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
+        self.near, self.given = np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3))
+        self.wrenches = self.wrenches_of(self.given)
+
+    def go(self, w: np.ndarray) -> None:
+        """Links move with w in the pass; nothing is noted of it."""
+        self.joints.go(w, self.rows)
+        if self.own.size:
+            runtime.fill(self.ws.arrays.offsets, self.rows)
+            runtime.clear([self.ws.impulses.impulse])
+
+    @contextmanager
+    def do(self, at: Passes):
+        ws, history, J = self.ws, at.history, self.joints
+        ws.note_joints(int(ws.solver.schedule.shown(at.j, at.save_every)), history, at.slot)
+        if not at.now.alpha > 0:
+            yield
+            history.joints[at.end] = history.joints[at.slot]
+            return
+        self.begin(at)
+        self.go(J.v_n)
+        self.find()
+        history.copy(at.slot, self.pair, 0)
+        yield
+        touches = bool(self.own.size) and self.look()
+        if touches:
+            copy_slot(history.f, at.slot, self.pair.f, 0)
+            for source, target in ((self.pair.u, history.u), (self.pair.v, history.v)):
+                copy_slot(target, at.end, source, 1)
+            self.find(meets=True)
+            for source, target in ((self.pair.u, history.u), (self.pair.v, history.v)):
+                copy_slot(source, 1, target, at.end)
+        if self.own.size:
+            ws.impulses.note_pass(at.numbers["counted"])
+        history.joints[at.end] = J.q, J.w - self.rebound(), J.effort()
+        self.met[at.end] = J.w, touches
+
+    def look(self) -> bool:
+        """Note what links have done to vertices, and say whether that is anything."""
+        impulses = runtime.look(self.ws.impulses.impulse)
+        self.near = np.flatnonzero(impulses[self.own].any((0, 2)))
+        self.given = impulses[:, self.near].astype(np.float64)
+        self.wrenches = self.wrenches_of(self.given)
+        return bool(self.near.size)
+
+    def launch(self, name: str, **numbers) -> None:
+        """A kernel on the vertices, from the first state of the pair to the second."""
+        ws, a = self.ws, self.ws.arrays
+        own = {}
+        if name == "press_jvp":
+            self.none = self.none or Tangent(a, a.values.zeros())
+            own = dict(tangent=(self.change, self.none, ws.frames))
+        kernel = getattr(ws.kernels(a.features()), name)
+        launch = ws.bound(kernel, state=(self.pair, ws.frames, ws.watch, ws.contact), **own, table=ws.table)
+        launch(**self.at.numbers | dict(base=self.at.j, stride=1) | numbers)
+
+    def wrenches_of(self, impulses: np.ndarray) -> np.ndarray:
+        """Sums of impulses of each link, and of their moments about the origin, shape (links, 2, 6)."""
+        own = impulses[self.own]
+        x = self.joints.places(self.joints.u_n)[1][self.near]
+        return np.concatenate([own.sum(1), np.cross(x, own).sum(1)], 1).reshape(-1, 2, 6)
+
+    def felt(self, wrenches: np.ndarray) -> np.ndarray:
+        """What joints feel of them, by push and by friction, shape (2, joints): J^T."""
+        return np.einsum("la,ad,lkd->ka", self.carried, self.joints.S_n, wrenches)
+
+    def bent(self) -> np.ndarray:
+        """How that changes as joint b turns where the pass begins, shape (2, joints b, joints)."""
+        turns = self.joints.turns(self.joints.S_n)
+        return np.einsum("la,lb,bad,lkd->kba", self.carried, self.carried, turns, self.wrenches)
+
+    def weighed(self, felt: np.ndarray) -> np.ndarray:
+        """What counts of it in the equation of w."""
+        return self.blend * felt[0] + felt[1]
+
+    def left(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(what is left of that equation, sizes of what it adds up, what digits of places leave)"""
+        J = self.joints
+        own, size, noise = J.own_forces()
+        x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
+        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
+        met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
+        return self.weighed(self.felt(self.wrenches)) - J.h * own, J.h * size + met, J.h * noise
+
+    def find(self, meets: bool = False) -> None:
+        """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
+        J, (F, size, noise), best, stalled = self.joints, self.left(), np.inf, 0
+        for _ in range(ROUNDS):
+            share = float(np.max(np.abs(F) / (max(1e-14, 4 * J.eps) * size + noise)))
+            stalled = 0 if share < 0.5 * best else stalled + 1
+            if share <= 1 or (stalled > 3 and np.all(np.abs(F) <= J.loose * size + noise)) or stalled > 20:
+                break
+            best = min(best, share)
+            step = -np.linalg.solve(self.slope(meets), F)
+            if not step @ F < 0:  # which friction alone can do
+                step = -np.linalg.solve(self.slope(), F)
+            w, slope, t = J.w, step @ F, 1.0
+            while True:
+                self.go(w + t * step)
+                if meets:
+                    self.launch("press")
+                    self.look()
+                F, size, noise = self.left()
+                if step @ F <= -J.falls * slope or t < 1e-12:
+                    break
+                t *= 0.5
+        share = float(np.max(np.abs(F) / (size + noise / J.loose)))
+        if not share <= J.loose:
+            error = NotConverged(f"joints of robots are out of balance by {share:.2g}: take smaller steps", [share])
+            raise self.ws.dated(error, self.at.j, self.at.num_passes)
+        J.w = J.w - np.linalg.solve(self.slope(), F)  # so that momentum is kept to round-off
+        J.q = J.q_n + J.h * J.w
+
+    def slope(self, meets: bool = False) -> np.ndarray:
+        """Derivative of the equation by w, or of its part without contact."""
+        J = self.joints
+        own = J.M + J.h**2 * np.diag(J.yielding)
+        return own + self.weighed(self.answers()) if meets else own
+
+    def rebound(self) -> np.ndarray:
+        """(1 - b) A^-1 J^T P"""
+        return (1 - self.blend) * np.linalg.solve(self.inertia, self.felt(self.wrenches)[0])
+
+    def answers(self) -> np.ndarray:
+        """Changes of what joints feel by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
+        displacements, velocities and impulses of the vertices that are near."""
+        J, change = self.joints, self.change
+        out = np.zeros((2, J.count, J.count))
+        touched = self.wrenches.any((1, 2))
+        self.moves = []
+        for b in np.flatnonzero(self.carried[touched].any(0)):
+            rows = np.zeros_like(self.rows)
+            J.put_rates(rows, np.eye(J.count)[b])
+            runtime.fill(change.offsets, rows)
+            runtime.clear([change.u, change.v, change.impulse])
+            self.launch("press_jvp", rate_dot=0.0)
+            du, dv = (runtime.fetch_row(x, 0)[self.near] for x in (change.u, change.v))
+            given = runtime.look(change.impulse)[:, self.near].astype(np.float64)
+            out[:, :, b] = self.felt(self.wrenches_of(given))
+            self.moves.append((b, du, dv, given))
+        return out
+
+    # ---- what derivatives need -----------------------------------------------------------------------------------------
+
+    def reopen(self, at: Passes) -> bool:
+        """Stand in a recorded pass; whether links touched in it, of which all is noted then."""
+        self.begin(at)
+        J, (w, touches) = self.joints, self.met[at.end]
+        self.go(w)
+        J.S = J.kinematics(J.q)[1]
+        if not touches:
+            return False
+        for slot, to in ((at.slot, 0), (at.end, 1)):
+            at.history.copy(slot, self.pair, to)
+        copy_slot(at.history.f, at.slot, self.pair.f, 0)
+        self.launch("press")
+        return self.look()
+
+    def mass_derivatives(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of M y by joint positions and by masses, a column each."""
+        J, m = self.joints, len(y)
+        by_q, by_m = np.zeros((2, m, m))
+        for robot, own in zip(J.robots.terms, J.slices):
+            found = robot.model.derivatives(
+                J.q_n[own], np.zeros(own.stop - own.start), y[own], J.masses[own], np.zeros(3)
+            )
+            by_q[own, own], by_m[own, own] = found[0], found[2]
+        return by_q, by_m
+
+
+class JointStageTangent(Stage):
+    """Its tangent along a run; `joints`: changes of them."""
+
+    def __init__(self, stage: JointStage, run):
+        self.stage, self.joints = stage, JointTangent(run.ws, run.tangent)
+
+    @contextmanager
+    def tangent(self, at: Passes):
+        stage, own, run = self.stage, self.joints, at.run
+        J, ws = own.joints, own.ws
+        if ws.solver.schedule.shown(at.j, at.save_every) >= 0:
+            own.note()
+        if not at.now.alpha > 0:
+            yield
+            return
+        touches, h = stage.reopen(at), at.now.h
+        du_n = runtime.fetch_row(run.u, 0)
+        if stage.own.size:
+            runtime.fill(run.offsets, own.rows_jvp(own.dq, own.dq))
+            runtime.clear([run.impulses.impulse])
+        yield
+        dF = stage.slope() @ own.dq / h - h * own.force()  # for w as it is
+        if touches:
+            near, answers, z = stage.near, stage.answers(), stage.rebound()
+            given = runtime.fetch(run.impulses.impulse).astype(np.float64)
+            wrenches = stage.wrenches_of(given[:, near])
+            dx = (du_n + own.tangent.rest)[near]
+            wrenches[..., 3:] += np.cross(dx, stage.given[stage.own]).sum(1).reshape(-1, 2, 3)
+            felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
+            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers), dF + stage.weighed(felt))
+            felt = felt[0] + answers[0] @ dw
+            _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
+            by_q, by_m = stage.mass_derivatives(z)
+            dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
+            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * felt - dA)
+            u, v = runtime.fetch(run.u), runtime.fetch(run.v)
+            for b, du_b, dv_b, given_b in stage.moves:
+                u[0, near] += du_b * dw[b]
+                v[0, near] += dv_b * dw[b]
+                given[:, near] += given_b * dw[b]
+            runtime.fill(run.u, u)
+            runtime.fill(run.v, v)
+            runtime.fill(run.impulses.impulse, given)
+        else:
+            dw = dv = -np.linalg.solve(stage.slope(), dF)
+        if stage.own.size:
+            run.impulses.note_pass(at.numbers["counted"])
+        own.step(own.dq + h * dw)
+        own.dv = dv
+
+
+class JointStageAdjoint(JointAdjoint):
+    """Its adjoint."""
+
+    in_kicks = False
+
+    def __init__(self, stage: JointStage, run):
+        JointSweep.__init__(self, run.ws)
+        self.stage = stage
+
+    def seed_frames(self, seeds):
+        super().seed_frames(seeds)
+        if not self.ws.solver.last_frame_is_state:  # its last pass shows the last frame
+            self.clear()
+        a = self.ws.arrays
+        self.by_rest, self.by_gravity = np.zeros((a.num_vertices, 3)), np.zeros(3)
+        self.by_steps = SimpleNamespace(joints=np.zeros_like(a.rows["joints"]))
+
+    @contextmanager
+    def adjoint(self, at: Passes):
+        stage, J, ws, run = self.stage, self.joints, self.ws, at.run
+        frame = int(ws.solver.schedule.shown(at.j, at.save_every))
+        if not at.now.alpha > 0:
+            yield
+            if frame >= 0:
+                self.add_frame(frame)
+            return
+        touches, h, rows = stage.reopen(at), at.now.h, np.zeros_like(stage.rows)
+        seeds = run.impulses.of_frame(at.numbers["counted"]) if stage.own.size else 0.0
+        by_w, K = h * (self.by_q - J.yielding * self.by_effort) + self.by_v, stage.slope()
+        if touches:
+            run.complete()
+            near, answers, z = stage.near, stage.answers(), stage.rebound()
+            K = K + stage.weighed(answers)
+            eased = np.linalg.solve(stage.inertia, self.by_v)
+            by_push = (stage.blend - 1) * eased
+            by_w = by_w + by_push @ answers[0]
+            p, q = runtime.fetch_row(run.u, 0)[near], runtime.fetch_row(run.v, 0)[near]
+            seeded = seeds[:, near] if np.ndim(seeds) else 0.0
+            for b, du_b, dv_b, given_b in stage.moves:
+                by_w[b] += (p * du_b).sum() + (q * dv_b).sum() + (seeded * given_b).sum()
+        w = np.linalg.solve(K.T, by_w)
+        self.w, self._to_q_n, by_x = h * w, np.zeros(len(w)), np.zeros_like(self.by_rest)
+        if touches:
+            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what joints feel
+            seeds = self._with(seeds, by)
+            own = stage.carried[:, None] * by  # (links, 2, joints)
+            turn = np.repeat((own @ J.S_n[:, 3:]).reshape(-1, 1, 3), len(near), 1)
+            by_x[near] = np.cross(stage.given[stage.own], turn).sum(0)
+            by_q, by_m = stage.mass_derivatives(z)
+            self._to_q_n = np.einsum("kba,ka->b", stage.bent(), by) + eased @ by_q
+            self.numbers[4] += eased @ by_m
+            self.numbers[3] += h * eased * z
+            self.numbers[2] += np.where(J.robots.prescribed, 0.0, h**2 * eased * z)
+        if stage.own.size:
+            runtime.fill(run.impulses.impulse, seeds)
+            runtime.clear([run.offsets])
+        yield
+        if stage.own.size:
+            rows = runtime.look(run.offsets).sum(1, dtype=np.float64)
+            runtime.fill(run.u, runtime.fetch(run.u) + by_x)
+            self.by_rest += by_x
+        self.by_gravity += self.end(rows, self.by_steps)
+        if frame >= 0:
+            self.add_frame(frame)
+
+    def _with(self, seeds, by: np.ndarray) -> np.ndarray:
+        """Adjoints of all impulses, with those by what joints feel."""
+        stage, J = self.stage, self.joints
+        out = np.zeros((2 * len(stage.ws.arrays.obstacles), *self.by_rest.shape)) + seeds
+        arms = moved(J.S_n, J.places(J.u_n)[1][stage.near])  # (near, joints, 3)
+        for link, k in enumerate(stage.own[::2] // 2):
+            for side in range(2):
+                out[2 * k + side, stage.near] += np.einsum("a,iad->id", stage.carried[link] * by[side], arms)
+        return out
+
+    def collect(self, out) -> None:
+        """Add what was summed up."""
+        super().collect(out)
+        at = self.ws.arrays.features().gravity
+        if at >= 0:
+            out.parameters[at : at + 3] += self.by_gravity
+        out.joints += self.by_steps.joints
+        if out.rest is not None:
+            out.rest = out.rest + self.by_rest
