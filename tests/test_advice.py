@@ -124,6 +124,11 @@ def globe(precision: str, radius: float) -> None:
     ds.Scene(CUBE, LAW, terms=[ball], precision=precision)
 
 
+def weighed(output=None) -> None:
+    asked = dict(gradients=False, elements=False, output=output, weights=(0, 1, 0))
+    recommend(scene(terms=[ds.Gravity()], fixed="ymin"), 0.0, **asked)
+
+
 def recommended(tolerance: float) -> None:
     recommend(scene(terms=[ds.Gravity()], fixed="ymin"), 0.01, tolerance, gradients=False, budget=0.5, elements=False)
 
@@ -279,6 +284,7 @@ FOLLOWED = {
     ("monitor/stability.py", "in this precision"): (lambda: rigid("f32"), lambda: rigid("f64")),
     ("state/bending.py", "refine the mesh, or take a width of"): (lambda: bent(5e-5), lambda: bent(9.8e-5)),
     ("study/trials.py", "nothing tried meets"): (lambda: recommended(1e-7), lambda: recommended(0.05)),
+    ("study/trials.py", "pass output="): (lambda: weighed(), lambda: weighed(ds.MaterialPoints([[0, 0, 0]]))),
     ("common/origin.py", "of the barrier's width"): (
         lambda: globe("f32", 1e7),
         lambda: (globe("f64", 1e7), globe("f32", 10.0)),
