@@ -156,7 +156,7 @@ def why_not(solver) -> str | None:
     scene = solver.scene
     if solver.explicit and runtime.runs_on_cpu() and not scene.law.lanes:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
-    terms = dict(self_contact=scene.term(SelfContact))
+    terms = dict(self_contact=scene.term(SelfContact), robots=scene.terms_of(Robot))
     terms |= {x.name: True for x in scene.interactions if solver.explicit and x.apart}
     terms |= dict(contact_by_pairs=any(term.primitives is not None for term in scene.terms))
     terms |= dict(mesh_obstacles=any(term.table.size for term in scene.ordered_terms if term.acts_on_surface))
@@ -164,7 +164,6 @@ def why_not(solver) -> str | None:
         terms |= dict(reduced_sets=scene.reduced)
     else:
         terms |= dict(reduced_sets_or_ties=scene.reduced, chambers_of_given_volume=scene.holds_volumes)
-        terms |= dict(robots=scene.terms_of(Robot))
     if there := [name.replace("_", " ") for name, some in terms.items() if some]:
         return f"it has {' and '.join(there)}"
     return None if solver.explicit else _why_not_joined(solver)
