@@ -10,6 +10,7 @@ from gradient_fuzz.loads import load, over_time
 from gradient_fuzz.ties import tie
 
 import diffsim_ti as ds
+from diffsim_ti import runtime
 from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_scene import JoinedArrays
 from diffsim_ti.diff_simulator import rollout_frames
@@ -65,6 +66,7 @@ def drawn(seed: int) -> tuple[ds.Batch, dict]:
     scene = ds.Scene(MESH, law(2e4, 0.3), 1000.0, terms=terms, precision=precision, **options)
     solver = EXPLICIT[rng.integers(2)](scene, dt=2e-3, substeps=int(rng.integers(2, 6)))
     more = dict(save_every=1 if few(0.5) else None, memory=0.3 * B if few(0.4) else None)
+    more["outputs"] = [ds.ContactForce(term, per_vertex=True) for term in scene.obstacles]
     batch = ds.Batch(solver, steps, B, gradients="all", lanes=True, **more)
     own["youngs_modulus"] = rng.uniform(1e4, 3e4, (B,) if few(0.6) else (B, MESH.num_tetrahedra))
     own["density"] = rng.uniform(800, 1200, B)
@@ -201,7 +203,8 @@ def push(t):
 def test_backends(law):
     """Scenes side by side, in lanes or innermost, with what kernels of a vertex have; float32, which Vulkan has alone.
 
-    Given forces are in other tests: with them a tangent takes more arrays than lavapipe lends a kernel, 32.
+    Given forces are in other tests, and contact forces are not asked for on Vulkan: with them a tangent takes more arrays
+    than lavapipe lends a kernel, 32.
     """
     wall = ds.HalfSpace((0, LOW - 0.008, 0), (0.1, 1, 0), path=push, friction=0.2, stiffness_per_area=2e5, width=0.01)
     elastic = law == "elastic"
@@ -209,7 +212,10 @@ def test_backends(law):
     material = ELASTIC if elastic else ds.Prony(ELASTIC, [0.3, 0.2], [1e-2, 1e-1])
     held = dict(fixed={"xmin": "x", "xmax": "xyz"}, motion=lambda t: np.array([0.1 * t, 0.0, 0.0])) if elastic else {}
     scene = ds.Scene(MESH, material, 1000.0, terms=terms, precision="f32", **held)
-    batch = ds.Batch(ds.VelocityVerletSolver(scene, dt=2e-3, substeps=4), 3, 5, gradients="all", lanes=True)
+    obstacles = () if runtime.arch_name() == "vulkan" else scene.obstacles
+    outputs = [ds.ContactForce(term, per_vertex=True) for term in obstacles]
+    solver = ds.VelocityVerletSolver(scene, dt=2e-3, substeps=4)
+    batch = ds.Batch(solver, 3, 5, gradients="all", lanes=True, outputs=outputs)
     rng = np.random.default_rng(0)
     own = dict(youngs_modulus=rng.uniform(1e4, 3e4, 5), drag_rate=rng.uniform(0.1, 1, 5))
     own["initial_velocities"] = 0.1 * rng.normal(size=(5, MESH.num_vertices, 3)) + [0, -1, 0]
@@ -223,16 +229,18 @@ def check(batch, own, rng, tangents: bool):
     B = batch.num_scenes
     frames = batch.forward(**own)
     assert frames.alive.all()
-    seeds = [rng.normal(size=frames.positions.shape), 0.01 * rng.normal(size=frames.positions.shape)]
-    gradients, total = batch.vjp(frames, *seeds), {}
-    for name, again in batch.vjp(frames, *seeds).items():
+    seeds = dict(positions=rng.normal(size=frames.positions.shape))
+    seeds |= {name: 0.01 * rng.normal(size=frames[name].shape) for name in batch.outputs if name != "positions"}
+    gradients, total = batch.vjp(frames, **seeds), {}
+    for name, again in batch.vjp(frames, **seeds).items():
         np.testing.assert_array_equal(gradients[name], again, err_msg=name)
     for b in range(B):
         alone = batch.one.forward(**{name: x[b] for name, x in own.items()})
         np.testing.assert_array_equal(frames.displacements[b], alone.displacements)
-        np.testing.assert_array_equal(frames.velocities[b], alone.velocities)
+        for name in seeds:
+            np.testing.assert_array_equal(frames[name][b], alone[name], err_msg=name)
         assert str(frames.contact_resolution[b]) == str(alone.contact_resolution)
-        for name, by in batch.one.vjp(alone, *(x[b] for x in seeds)).items():
+        for name, by in batch.one.vjp(alone, **{name: x[b] for name, x in seeds.items()}).items():
             if name not in own:
                 total[name] = total.get(name, 0) + by
                 continue
@@ -252,7 +260,7 @@ def _check_dot_product(batch, frames, own, seeds, gradients, rng):
         value = batch.one.sweep.values[name]
         along[name] = 0.01 * np.abs(value) * rng.normal(size=value.shape)
     changes = batch.tangents(frames, **along)
-    parts = [(changes[name] * seed).ravel() for name, seed in zip(("positions", "velocities"), seeds)]
+    parts = [(changes[name] * seed).ravel() for name, seed in seeds.items()]
     there = sum(part.sum() for part in parts)
     here = sum((gradients[name] * dot).sum() for name, dot in along.items())
     size = sum(np.abs(part).sum() for part in parts) + sum(np.abs(gradients[n] * dot).sum() for n, dot in along.items())
@@ -425,7 +433,9 @@ def implicit(kind: str, **options) -> tuple[ds.Batch, dict]:
     law, own = ds.StableNeoHookean(1e5, 0.3), dict(youngs_modulus=[6e4, 1e5, 1.7e5])
     exact = dict(tolerance=1e-9)
     if kind in ("Euler", "as on a card", "midpoint", "slapped"):
-        scene = ds.Scene(MESH, law, terms=[ds.Gravity(), ds.Ground(LOW - 1e-3, friction=0.4)], precision="f64")
+        floor = ds.Ground(LOW - 1e-3, friction=0.4, path=lambda t: (t, 0.1 * t, 0))
+        scene = ds.Scene(MESH, law, terms=[ds.Gravity(), floor], precision="f64")
+        options["outputs"] = [ds.ContactForce(floor, per_vertex=True)]
         start = np.broadcast_to([0.3, -0.3, 0.0], SLAP.shape) if kind != "slapped" else SLAP
         own |= dict(
             friction=[0.1, 0.4, 0.0], ground_height=LOW - np.array([1e-3, 2e-3, 5e-4]), initial_velocities=start
@@ -448,15 +458,19 @@ def test_implicit_scenes_are_solved_together(kind, monkeypatch):
     """As one by one, to the tolerance of the solver; of a scene that fails, its error, and nothing in the others."""
     if kind == "as on a card":
         monkeypatch.setattr(JoinedArrays, "by_scene", False)
-    found, seeds = [], np.random.default_rng(0).normal(size=(2, 3, 2, len(MESH.vertices), 3))
+    found, seeds = [], np.random.default_rng(0).normal(size=(3, 3, 2, len(MESH.vertices), 3))
     for lanes in (True, False):
         batch, own = implicit(kind, lanes=lanes)
         frames = batch.forward(**own)
         alive = kind != "slapped" or np.array([True, False, True])
         assert (frames.alive == alive).all() and frames.alone == ((1,) if kind == "slapped" and lanes else ())
         with pytest.warns(UserWarning, match="gradients are zero") if kind == "slapped" else warnings.catch_warnings():
-            found.append((frames, batch.vjp(frames, *seeds)))
+            names = [*batch.outputs]
+            found.append((frames, batch.vjp(frames, **dict(zip(names, seeds)))))
     (together, gradients), (by_turns, expected) = found
+    for name in names:
+        bound = 1e-7 * np.abs(by_turns[name]).max()
+        np.testing.assert_allclose(together[name], by_turns[name], rtol=0, atol=bound, err_msg=name)
     np.testing.assert_allclose(together.displacements, by_turns.displacements, rtol=0, atol=1e-9)
     for name, gradient in gradients.items():
         np.testing.assert_allclose(

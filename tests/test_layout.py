@@ -141,6 +141,7 @@ DEEP = {  # classes that may stand more than three deep, and why
     "HeldPressure": "of the pressures in chambers those that are found with a volume, told apart by their class",
     "PressedFace": "a curved face stores and sums what a flat one does",
     "JoinedWorkspace": "the scenes of a batch, solved together, are a run of an implicit solver",
+    "SharesOfScenes": "obstacles of a batch are those of one scene with other places of their numbers",
     "Muscle": "to users a muscle is a cable, and a cable a spring",
     "_AtStart": "a solver of users that checks less",
 }

@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.batch.layouts import growths_placed, in_slots, placed
+from diffsim_ti.batch.workspace import BatchImpulses
 from diffsim_ti.inputs import Derived
 
 OF_STEPS = "forces", "motion", "path"
@@ -38,6 +39,9 @@ class BatchAdjoint:
             arrays[name] = runtime.array(layout.vector, *getattr(ws.numbers, name).shape)
         if self.features.growing:
             arrays["growths"] = runtime.array(layout.number, *ws.numbers.growths.shape)
+        self.impulses = BatchImpulses(ws) if ws.impulses else None
+        if self.impulses:
+            arrays["impulse"] = self.impulses.impulse
         self._arrays, self.made_for = arrays, self._shapes()
         vars(self).update(arrays)
         frames = ws.room_for_frames(ws.frames.frames_u.shape[0])
@@ -68,6 +72,11 @@ class BatchAdjoint:
             runtime.fill(target, layout.pack_vectors(adjoint))
             if last_frame_is_input:
                 runtime.fill(state, layout.pack_vectors(adjoint[:, -1:]))
+
+    def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: np.ndarray) -> None:
+        """Set the adjoints of the frames' contact forces, (scenes, frames, ...) (None: zero)."""
+        if forces_adj is not None:
+            self.impulses.put(forces_adj / frame_time)
 
     def reverse(
         self, base: int, last: int, num_passes: int, save_every: int, stop: int, to_state: bool = False
@@ -176,6 +185,9 @@ class BatchTangent:
             setattr(self, name, runtime.upload(layout.pack_vectors(in_slots(rows)), layout.vector))
         frames = ws.room_for_frames(ws.frames.frames_u.shape[0])
         self.frames_u, self.frames_v = frames.frames_u, frames.frames_v
+        self.impulses = BatchImpulses(ws) if ws.impulses else None
+        if self.impulses:
+            self.impulse = self.impulses.impulse
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangents of passes first .. last - 1, recorded from slot 0."""
@@ -183,6 +195,10 @@ class BatchTangent:
         launch = ws.bound(ws.kernels(self.features).step_jvp, state=(ws.record, ws.frames, ws.met), tangent=self)
         for numbers in ws.launches(first, last, num_passes, save_every):
             launch(**numbers, base=first, rate_dot=0.0)  # each scene has its own
+
+    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
+        """Changes of the frames' contact forces."""
+        return self.impulses.collect() / frame_time
 
     def save_frame(self, frame: int) -> None:
         """Copy the current change to a frame."""

@@ -23,7 +23,7 @@ from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.outputs import Change, Output
 from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.rollout import Rollout
-from diffsim_ti.rollout.run import Run, check_finite, warn_of_large_stretch
+from diffsim_ti.rollout.run import HostSeed, Run, check_finite, warn_of_large_stretch
 from diffsim_ti.rollout.set_values import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FAR, FacesBend
@@ -89,13 +89,12 @@ class Batch(metaclass=Public):
         self.gradients: dict[str, np.ndarray] = {}
         self.tape_face = BatchTapeAdapter(self, runs)
         self.steps, self.save_every, self.num_frames = self.one.steps, self.one.save_every, self.one.num_frames
-        self.why_not = why_not(self.solver) or (
-            f"an output reads {' and '.join(self.one.sweep.noted)} of frames" if self.one.sweep.noted else None
-        )
+        alone = [name for name in self.one.sweep.noted if name != "contact_forces"]
+        self.why_not = why_not(self.solver) or (f"an output reads {' and '.join(alone)} of frames" if alone else None)
         if lanes and self.why_not:
             raise ValueError(f"scenes cannot be computed side by side: {self.why_not}; leave out lanes=True")
         self.lanes = self.why_not is None if lanes is None else bool(lanes)
-        kind = BatchSweep if self.solver.explicit else JoinedSweep
+        kind, options["contacts"] = BatchSweep if self.solver.explicit else JoinedSweep, self.one.sweep.contacts
         self.sweep = kind(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
         if self.sweep:
             self.sweep.run_substeps = self.one.sweep.run_substeps
@@ -172,8 +171,10 @@ class Batch(metaclass=Public):
             if b in crossed:
                 good[crossed[b] // self.save_every + 1 :] = False
             last_good[b] = max(0, int(np.argmin(good)) - 1) if not good.all() else last_good[b]
+        noted = self.sweep.noted_values()
         for b in np.flatnonzero(last_good < self.num_frames - 1):
-            u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
+            for x in (u, v, *noted.values()):
+                x[b, last_good[b] + 1 :] = x[b, last_good[b]]
         alone, errors = {}, {}
         for b in self.sweep.left:  # which the solves of all together gave up
             alone[b], error = self._one_by_one(values, b)
@@ -181,7 +182,7 @@ class Batch(metaclass=Public):
             u[b], v[b], last_good[b] = alone[b].displacements, alone[b].velocities, self._last_good(error)
         resolution = self.sweep.resolutions()
         states = self._positions(values, u), v, u
-        make = lambda b: alone.get(b) or self._frames_of(values, b, states, times, resolution(b))  # noqa: E731
+        make = lambda b: alone.get(b) or self._frames_of(values, b, states, noted, times, resolution(b))  # noqa: E731
         frames = LazyFrames(self.num_scenes, make)
         if np.isfinite(self.scene.material.valid_to):
             any(warn_of_large_stretch(frames[b]) for b in range(self.num_scenes))
@@ -215,9 +216,11 @@ class Batch(metaclass=Public):
             spread = np.ptp(v, axis=1).max(1) * self.solver.substep
             return np.isfinite(u.sum((1, 2))) & (spread <= 2 * np.ptp(self.scene.mesh.vertices, axis=0).max())
 
-    def _frames_of(self, values: dict, b: int, states: tuple, times, resolution) -> Frames:
+    def _frames_of(self, values: dict, b: int, states: tuple, noted: dict, times, resolution) -> Frames:
         own = self.sweep.values_of(values, b)
-        frames = Frames(*(x[b] for x in states), times, own, resolution, run=Run(own))
+        frames = Frames(
+            *(x[b] for x in states), times, own, resolution, run=Run(own), **{n: x[b] for n, x in noted.items()}
+        )
         frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
         frames.scene = self.scene
         for name, output in self.one.computed.items():
@@ -290,7 +293,7 @@ class Batch(metaclass=Public):
     def _vjp_side_by_side(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
         shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive.copy()
         alive[list(frames.alone)] = False
-        by_u, by_v, direct = np.zeros(shape), np.zeros(shape), []
+        by_u, by_v, direct, by_noted = np.zeros(shape), np.zeros(shape), [], dict.fromkeys(self.sweep.noted)
         of_states = given.keys() <= {"positions", "velocities"}  # which say nothing of inputs but by the states
         if of_states:
             for name, target in (("positions", by_u), ("velocities", by_v)):
@@ -299,10 +302,15 @@ class Batch(metaclass=Public):
         for b in () if of_states else np.flatnonzero(alive):
             change = self.one.pulled_to_frames(frames[b], {name: x[b] for name, x in given.items()})
             direct.append((b, change.inputs))
+            for name in by_noted:
+                if (part := getattr(change, name)) is not None:
+                    if by_noted[name] is None:
+                        by_noted[name] = np.zeros((self.num_scenes, *part.shape))
+                    by_noted[name][b] = part
             for target, part in ((by_u, change.positions), (by_v, change.velocities)):
                 if part is not None:
                     target[b] = part
-        derived = self.sweep.pull_back(frames.run, by_u, by_v)
+        derived = self.sweep.pull_back(frames.run, HostSeed(by_u, by_v, by_noted))
         alone = {*frames.alone, *self.sweep.left}  # the second: whose linear solve did not come to its end
         alive[list(alone)] = False
         for part in derived.parts().values():
@@ -372,10 +380,13 @@ class Batch(metaclass=Public):
             inputs = self.scene.inputs
             derived = [inputs.derive_jvp(frames[b].inputs, own[b]) for b in range(self.num_scenes)]
             du, dv = self.sweep.push_forward(frames.run, derived)
+            noted = self.sweep.noted_changes
         by_one = not self.lanes or not self.solver.explicit
         for b in np.flatnonzero(frames.alive):
             changes = self.one.tangents(frames[b], **own[b]) if by_one else None
-            changes = changes or self.one.changes_of(frames[b], Change(du[b], dv[b], own[b]))
+            if not by_one:
+                change = Change(du[b], dv[b], own[b], **{n: x[b] for n, x in noted.items()})
+                changes = self.one.changes_of(frames[b], change)
             for name, change in changes.items():
                 out[name][b] = change
         return out

@@ -81,6 +81,14 @@ class BlockViews:
     def with_state(self, arrays: dict) -> dict:
         return arrays | dict(z="blocks2") if self.law.state_names else arrays
 
+    @property
+    def recorded(self) -> dict:
+        return dict(impulse="blocks2") if self.features.recorded else {}
+
+    def with_record(self, arrays: dict) -> dict:
+        """The same, with the impulses of obstacles where they are recorded."""
+        return self.with_state(arrays) | self.recorded
+
     # ---- what a kernel hands to functions ----------------------------------------------------------------------------
 
     @traced
@@ -143,7 +151,7 @@ class BlockViews:
 
     @traced
     def state_of(self, b, lane, state, plan):
-        out = self.states_of(("u", "v", "f", "frames_u", "frames_v"), b, lane, state, plan)
+        out = self.states_of(("u", "v", "f", "frames_u", "frames_v", *self.recorded), b, lane, state, plan)
         seen = View(state.seen, let(b * plan.num_vertices), lane)
         return Bundle(seen=seen, stage=Scratch(state.stage, b), work=Scratch(state.work, b), **out)
 
@@ -154,14 +162,14 @@ class BlockViews:
         own = {name: View(getattr(tangent, name), n, lane) for name in ("mass", "surface")}
         own["parameters"] = View(tangent.parameters, let(b * plan.num_parameters), lane)
         own["rest"] = self.vectors(tangent.rest, n, lane)
-        states = self.states_of(("u", "v", "frames_u", "frames_v"), b, lane, tangent, plan)
+        states = self.states_of(("u", "v", "frames_u", "frames_v", *self.recorded), b, lane, tangent, plan)
         own |= self.numbers_of(b, lane, tangent, plan)
         return Bundle(**own, **states, **self.of_steps(b, lane, tangent, plan))
 
     @traced
     def adjoint_of(self, b, lane, adjoint, plan):
         """The adjoints of scene `lane`."""
-        names = ("u", "v", "w", "frames_u", "frames_v", "path_adjoint", "corner")
+        names = ("u", "v", "w", "frames_u", "frames_v", "path_adjoint", "corner", *self.recorded)
         names += ("rate_corner",) if self.vertex.reads_rates else ()
         states = self.states_of(names, b, lane, adjoint, plan)
         own = self.numbers_of(b, lane, adjoint, plan)

@@ -13,6 +13,7 @@ from diffsim_ti.mechanics.energy.kernels import PotentialKernels
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mechanics.obstacles.collision_detection import CollisionDetection
 from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
+from diffsim_ti.mechanics.obstacles.obstacle_shares import ObstacleShares
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
 from diffsim_ti.mechanics.obstacles.swept import SweptKernels
 from diffsim_ti.runtime import Bundle, Kernel, Piecewise, at, kernels_of, let, traced
@@ -131,6 +132,16 @@ class SweptOfScenes(SeesOneScene, SweptKernels):
     def gap(self, g, k, i, t, scene, way, at):
         scene, way = self.seen_at(i, scene, way)
         return self.one.gap(g, k, i, t, scene, way, at)
+
+
+@dataclass(frozen=True)
+class SharesOfScenes(SeesOneScene, ObstacleShares):
+    """What each obstacle of its scene does to a vertex."""
+
+    def _kernel(self, name, body, **arrays):
+        kernel = super()._kernel(name, body, **arrays)
+        own = kernel.arrays | dict(scene=kernel.arrays["scene"] | dict(scene_of="ints"))
+        return Kernel(name, body, self.precision, own, {n: kernel.kinds[n] for n in kernel.numbers})
 
 
 class JoinedPotential(Potential):

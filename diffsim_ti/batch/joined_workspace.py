@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.batch.joined_newton import JoinedNewton
-from diffsim_ti.batch.joined_potential import JoinedCollisions, JoinedPotential, JoinedPreconditioners
+from diffsim_ti.batch.joined_potential import JoinedCollisions, JoinedPotential, JoinedPreconditioners, SharesOfScenes
 from diffsim_ti.batch.joined_scene import JoinedArrays, joined_derived, joined_hosts, joined_scene, of_each, of_scenes
 from diffsim_ti.batch.sweep import BatchSweep
 from diffsim_ti.inputs import Derived
@@ -23,7 +23,7 @@ class JoinedWorkspace(ImplicitWorkspace):
     """left: (scenes,), those that are to be run alone, for they left the usual course of a solve (joined_newton.py)."""
 
     arrays_kind, potential_kind, newton_kind = JoinedArrays, JoinedPotential, JoinedNewton
-    collisions_kind, preconditioners_kind = JoinedCollisions, JoinedPreconditioners
+    collisions_kind, preconditioners_kind, shares_kind = JoinedCollisions, JoinedPreconditioners, SharesOfScenes
 
     def __init__(self, solver, each: list[Derived]):
         self.num_scenes, self.left = len(each), np.zeros(len(each), bool)
@@ -59,6 +59,10 @@ class JoinedWorkspace(ImplicitWorkspace):
 
     def balance(self):
         return None
+
+    def contact_forces(self, frame_time):
+        """The scenes are the first axis."""
+        return of_scenes(self.impulses.forces, self.num_scenes, axis=3).copy()
 
     # ---- what passes are told ----------------------------------------------------------------------------------------
 
@@ -179,6 +183,12 @@ class JoinedAdjoint(ImplicitAdjoint):
         joined = (np.moveaxis(x, 0, 1).reshape(x.shape[1], -1, 3) for x in (positions_adj, velocities_adj))
         super().start(*joined, last_frame_is_input)
         self.by_hosts = of_each([d.zeros() for d in self.ws.each])
+
+    def seed_contacts(self, forces_adj, frame_time) -> None:
+        if forces_adj is not None:
+            joined = np.moveaxis(forces_adj, 0, 3)
+            forces_adj = joined.reshape(*joined.shape[:3], -1, 3)
+        super().seed_contacts(forces_adj, frame_time)
 
     def solve(self, b):
         ws, newton = self.ws, self.ws.newton

@@ -35,9 +35,9 @@ class BatchKernels(BlockViews):
     @traced
     def one(self, now, lane):
         """A pass as one of the scenes has it."""
-        if "table" not in self.own:
-            return now
-        return Bundle(**{n: let(at(x, lane)) if in_lanes(x) else x for n, x in vars(now).items()})
+        if "table" in self.own:
+            now = Bundle(**{n: let(at(x, lane)) if in_lanes(x) else x for n, x in vars(now).items()})
+        return self.vertex.obstacles.counted(now)
 
     # ---- forward -----------------------------------------------------------------------------------------------------
 
@@ -77,7 +77,7 @@ class BatchKernels(BlockViews):
     @cached_property
     def step(self) -> Kernel:
         """`count` passes from pass `first` on."""
-        return self._kernel("step", self.passes, dict(state=self.with_state(STATE)), stride="int")
+        return self._kernel("step", self.passes, dict(state=self.with_record(STATE)), stride="int")
 
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
@@ -128,8 +128,8 @@ class BatchKernels(BlockViews):
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | self.alone | self.growing
-        return self._kernel("step_jvp", self.passes_jvp, dict(state=self.with_state(STATE), tangent=tangent))
+        tangent = self.with_record(CHANGE) | CHANGED | OF_STEPS | self.alone | self.growing
+        return self._kernel("step_jvp", self.passes_jvp, dict(state=self.with_record(STATE), tangent=tangent))
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
@@ -187,8 +187,8 @@ class BatchKernels(BlockViews):
     def step_vjp(self) -> Kernel:
         """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
         numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
-        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.items.adjoint) | self.growing
-        arrays = dict(state=self.with_state(STATE), adjoint=adjoint)
+        adjoint = self.with_record(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.items.adjoint) | self.growing
+        arrays = dict(state=self.with_record(STATE), adjoint=adjoint)
         return self._kernel("step_vjp", self.passes_vjp, arrays, **numbers)
 
     def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:

@@ -156,13 +156,12 @@ def why_not(solver) -> str | None:
     scene = solver.scene
     if solver.explicit and runtime.runs_on_cpu() and not scene.law.lanes:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
-    terms = dict(self_contact=scene.term(SelfContact))
+    terms = dict(self_contact=scene.term(SelfContact), robots=scene.terms_of(Robot))
     terms |= {x.name: True for x in scene.interactions if solver.explicit and x.apart}
     terms |= dict(contact_by_pairs=any(term.primitives is not None for term in scene.terms))
     values = scene.inputs.values
     terms |= dict(numbers_at_points=any(values[x].ndim == 2 for x in scene.material.at_points if x in values))
     terms |= dict(mesh_obstacles=any(term.table.size for term in scene.ordered_terms if term.acts_on_surface))
-    terms |= dict(robots=scene.terms_of(Robot))
     if solver.explicit:
         terms |= dict(reduced_sets=scene.reduced)
     else:

@@ -8,7 +8,7 @@ from diffsim_ti import runtime
 from diffsim_ti.batch.adjoint import BatchAdjoint, BatchTangent
 from diffsim_ti.batch.workspace import BatchWorkspace
 from diffsim_ti.inputs import Derived
-from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.run import HostSeed, Run
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.state.watch import ContactResolution, ContactWatch, limits, worst
 
@@ -150,20 +150,14 @@ class BatchSweep(Sweep):
 
         return of
 
-    def pull_back(self, run: Run, positions_adj: np.ndarray, velocities_adj: np.ndarray) -> Derived:
+    def pull_back(self, run: Run, seed: HostSeed) -> Derived:
         """Adjoints, from those of the frames, of what kernels read at the start; the scenes are their first axis."""
         self.bring_back(run)
-        self._seed = positions_adj, velocities_adj
-        self._reverse(self, False)
+        self._reverse(seed, False)
         out = self._adjoint.collect()
         if self.truncates:
             out.displacement[:], out.velocity[:] = 0, 0
         return out
-
-    def put(self, adjoint: BatchAdjoint, last_frame_is_state: bool) -> tuple[float, float]:
-        """Set the adjoint to the seed."""
-        adjoint.start(*self._seed, last_frame_is_state)
-        return 0.0, 0.0
 
     def push_forward(self, run: Run, change: list[Derived]) -> tuple[np.ndarray, np.ndarray]:
         du, dv = super().push_forward(run, change)

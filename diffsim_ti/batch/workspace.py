@@ -16,6 +16,7 @@ from diffsim_ti.batch.kernels import BatchKernels
 from diffsim_ti.batch.layouts import Innermost, Lanes, growths_placed, in_slots, placed
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
+from diffsim_ti.mechanics.obstacles.impulse_record import check_staged
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.pass_table import FLOATS, INTS, PassTable
@@ -36,6 +37,29 @@ class BatchHistory:
     def copy(self, slot: int, target: "BatchHistory", to: int) -> None:
         for name in ("u", "v") if self.z is None else ("u", "v", "z"):
             copy_slot(getattr(self, name), slot, getattr(target, name), to)
+
+
+class BatchImpulses:
+    """As ImpulseRecord, of all scenes: what obstacles gave vertices in each frame [N s], or changes or adjoints of it."""
+
+    def __init__(self, workspace):
+        a, self._layout = workspace.arrays, workspace.layout
+        self._shape = workspace.frames.frames_u.shape[0], len(a.obstacles), 2
+        self.impulse = self._layout.vectors(int(np.prod(self._shape)), a.num_vertices)
+        self.clear()
+
+    def clear(self) -> None:
+        runtime.fill(self.impulse, 0)
+
+    def put(self, impulses: np.ndarray) -> None:
+        """Set them; shape as `collect` gives."""
+        rows = impulses.reshape(len(impulses), -1, *impulses.shape[-2:])
+        runtime.fill(self.impulse, self._layout.pack_vectors(rows))
+
+    def collect(self) -> np.ndarray:
+        """Shape (scenes, frames, obstacles, 2: by push and by friction, num_vertices, 3), float64."""
+        rows = self._layout.unpack_vectors(self.impulse).astype(np.float64)
+        return rows.reshape(len(rows), *self._shape, *rows.shape[2:])
 
 
 class ScenesTable(PassTable):
@@ -66,7 +90,7 @@ class ScenesTable(PassTable):
 class BatchWorkspace:
     """Scenes of one mesh, law and list of terms, side by side in a layout; numbers may differ from scene to scene."""
 
-    first_step = 0
+    first_step, impulses = 0, None
 
     def __init__(self, solver, derived: list[Derived]):
         self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
@@ -282,6 +306,19 @@ class BatchWorkspace:
     def room_for_frames(self, count: int) -> SimpleNamespace:
         u, v = (self.layout.vectors(count, self.arrays.num_vertices) for _ in range(2))
         return SimpleNamespace(frames_u=u, frames_v=v)
+
+    def record_contacts(self, wanted: frozenset) -> None:
+        check_staged(self.arrays.features())
+        self.arrays.record_contacts()
+        self._launches.clear()
+        self.impulses = BatchImpulses(self)
+        self.met.impulse = self.impulses.impulse
+
+    def forget_contacts(self) -> None:
+        self.impulses.clear()
+
+    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
+        return self.impulses.collect() / frame_time
 
     def make_record(self, num_slots: int) -> BatchHistory:
         if self.record is None or self.record.num_slots < num_slots:

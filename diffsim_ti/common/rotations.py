@@ -61,9 +61,9 @@ def turned(q: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def skew(a: np.ndarray) -> np.ndarray:
     """[a]x, shape (..., 3, 3)"""
-    x, y, z = np.moveaxis(a, -1, 0)
-    o = 0 * x
-    return np.stack([np.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+    out = np.zeros((*a.shape, 3), a.dtype)
+    out[..., [2, 0, 1], [1, 2, 0]], out[..., [1, 2, 0], [2, 0, 1]] = a, -a
+    return out
 
 
 def left_jacobian(a: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ class Shares:
     def __init__(self, workspace, features=None):
         self.p, self.a = workspace.potential, workspace.arrays
         a, features = self.a, workspace.arrays.features() if features is None else features
-        self.kernels = share_kernels(features, a.precision, workspace.parallel)
+        self.kernels = share_kernels(workspace.shares_kind, features, a.precision, workspace.parallel)
         self.num_obstacles = len(a.obstacles)
         self.force = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
         self.y = runtime.array(a.vector, 1, a.num_vertices)
@@ -77,13 +77,13 @@ class SharesAdjoint(Shares):
         self.poses = runtime.array(a.vector, a.poses.size, a.num_vertices)
         self.numbers = SimpleNamespace(lag=self.lag, poses=self.poses), numbers
 
-    def pull_back(self, seed: np.ndarray) -> tuple[np.ndarray, ...]:
+    def pull_back(self, seed: np.ndarray, summed=lambda rows: rows.sum(1)) -> tuple[np.ndarray, ...]:
         """(adjoint of u*, of the two rows of lag, of the rows of obstacle poses) in float64; adds those
-        of the scene's numbers."""
+        of the scene's numbers. summed: what adds up the last over vertices."""
         runtime.fill(self.seed, seed.reshape(-1, *seed.shape[2:]))
         for target in (self.lag, self.poses):
             runtime.fill(target, 0)
         self.run("vjp", adjoint=self.numbers)
         by_u = runtime.fetch_row(self.y, 0)
         by_lag, by_poses = (runtime.fetch(x).astype(np.float64) for x in (self.lag, self.poses))
-        return by_u, by_lag, by_poses.sum(1)
+        return by_u, by_lag, summed(by_poses)

@@ -5,6 +5,15 @@ import numpy as np
 from diffsim_ti import runtime
 
 
+def check_staged(features) -> None:
+    """Raise ValueError where obstacles act as forces, whose impulses are not noted."""
+    if len(features.staged) < len(features.groups):
+        raise ValueError(
+            "explicit solvers note what obstacles with a distance do, and one of this scene is a force alone: take an "
+            "implicit solver for ContactForce and ContactTraction"
+        )
+
+
 class ImpulseRecord:
     """Impulses [N s] on vertices: those of obstacles in the contact stage in `impulse` (contact_impulses.py), on the device,
     and those of pairs in `of_pairs`, shape (frames, contacts by pairs, 2: by push and by friction, num_vertices, 3), whose
@@ -18,11 +27,8 @@ class ImpulseRecord:
     def __init__(self, workspace, wanted: frozenset):
         self.arrays, a, features = workspace.arrays, workspace.arrays, workspace.arrays.features()
         self.wanted, of_obstacles, self.in_passes = wanted, True in wanted, features.led
-        if of_obstacles and len(features.staged) < len(features.groups):
-            raise ValueError(
-                "explicit solvers note what obstacles with a distance do, and one of this scene is a force alone: take an "
-                "implicit solver for ContactForce and ContactTraction"
-            )
+        if of_obstacles:
+            check_staged(features)
         obstacles = workspace.pairs.obstacles if workspace.pairs and of_obstacles else None
         self.rows = [part.k for part in obstacles.corners.parts] if obstacles else []
         self.contacts = [*range(1, 1 + len(self.rows))]

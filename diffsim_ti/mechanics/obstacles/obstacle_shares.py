@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed
 
@@ -25,6 +25,11 @@ class ObstacleShares(ObstaclePotential):
 
     parallel: bool
 
+    @traced
+    def seen_at(self, i, scene, pass_):
+        """What vertex i sees of them (batch/joined_potential.py)."""
+        return scene, pass_
+
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         own = dict(scene=needed(SCENE, self.features), pass_=PASS) | arrays
         return Kernel(name, body, self.precision, own, NUMBERS)
@@ -33,15 +38,16 @@ class ObstacleShares(ObstaclePotential):
     def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
+            own, told = self.seen_at(i, scene, pass_)
             for g in ti.static(self.features.groups):
                 for k in range(g.count):
                     row, f, drag = 2 * (g.number + k), self.vector(0), self.vector(0)
                     if scene.surface[i] > 0:
-                        f = self.push(g, k, i, at.u[0, i], scene, pass_)
+                        f = self.push(g, k, i, at.u[0, i], own, told)
                         if ti.static(g.force.friction):
-                            if self.has_friction_at(g, k, i, scene, pass_):
-                                drag = self.drag(g, k, i, at.u[0, i], scene, pass_, plan)
-                                drag = self.on_area(g, i, drag, scene)
+                            if self.has_friction_at(g, k, i, own, told):
+                                drag = self.drag(g, k, i, at.u[0, i], own, told, plan)
+                                drag = self.on_area(g, i, drag, own)
                     out.force[row, i] = f
                     out.force[row + 1, i] = drag
 
@@ -75,17 +81,16 @@ class ObstacleShares(ObstaclePotential):
     def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
+            own, told = self.seen_at(i, scene, pass_)
             y = self.vector(0)
             for g in ti.static(self.features.groups):
                 for k in range(g.count):
                     row = 2 * (g.number + k)
                     if scene.surface[i] > 0:
-                        y += self.push_vjp(g, k, i, at.u[0, i], at.seed[row, i], scene, pass_, adjoint)
+                        y += self.push_vjp(g, k, i, at.u[0, i], at.seed[row, i], own, told, adjoint)
                         if ti.static(g.force.friction):
-                            if self.has_friction_at(g, k, i, scene, pass_):
-                                y += self.drag_vjp(
-                                    g, k, i, at.u[0, i], at.seed[row + 1, i], scene, pass_, adjoint, plan
-                                )
+                            if self.has_friction_at(g, k, i, own, told):
+                                y += self.drag_vjp(g, k, i, at.u[0, i], at.seed[row + 1, i], own, told, adjoint, plan)
             out.y[0, i] = y
 
     @cached_property
@@ -98,6 +103,6 @@ class ObstacleShares(ObstaclePotential):
 
 
 @lru_cache(maxsize=None)
-def share_kernels(features: Features, precision: str, parallel: bool) -> ObstacleShares:
+def share_kernels(kind: type[ObstacleShares], features: Features, precision: str, parallel: bool) -> ObstacleShares:
     """Kernels for a scene's features."""
-    return ObstacleShares(features, precision, parallel)
+    return kind(features, precision, parallel)

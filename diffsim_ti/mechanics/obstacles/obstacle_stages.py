@@ -206,6 +206,15 @@ class ObstacleStages(ObstacleFunctions):
     # ---- adjoints of paths -------------------------------------------------------------------------------------------
 
     @traced
+    def counted(self, now):
+        """A pass with `into`: the first row of `impulse` of the frame that it leads to, -1 if none counts it."""
+        if not self.features.recorded:
+            return now
+        if self.features.led:  # which are noted pass by pass
+            return Bundle(**vars(now), into=let(0 * now.counted))
+        return Bundle(**vars(now), into=let(ti.select(now.counted >= 0, 2 * self.num_obstacles * now.counted, -1)))
+
+    @traced
     def noting(self, now, plan):
         """A pass on the way back with `felt`: where vertices accumulate adjoints of paths in its step."""
         moving = self.features.moving

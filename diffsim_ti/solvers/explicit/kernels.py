@@ -85,16 +85,6 @@ class ExplicitKernels:
         has, short = self.vertex.features, self.vertex.law.short and self.vertex.lanes
         return short and has.order == 1 and not (has.groups or has.reduced or self.items.any)
 
-    @traced
-    def counted(self, now):
-        """A pass with `into`: the first row of `impulse` of the frame that it leads to, -1 if none counts it."""
-        if not self.vertex.features.recorded:
-            return now
-        rows = 2 * self.vertex.obstacles.num_obstacles
-        if self.vertex.features.led:  # which are noted pass by pass
-            return Bundle(**vars(now), into=let(0 * now.counted))
-        return Bundle(**vars(now), into=let(ti.select(now.counted >= 0, now.counted * rows, -1)))
-
     # ---- which scene a loop's item or vertex k is of, where they are of many (batch/innermost_kernels.py) ---------------
 
     @traced
@@ -149,12 +139,12 @@ class ExplicitKernels:
     @traced
     def on(self, now, scene):
         """A pass at vertices on the way forward."""
-        return with_drag(self.vertex, self.counted(now), scene)
+        return with_drag(self.vertex, self.vertex.obstacles.counted(now), scene)
 
     @traced
     def back(self, now, j, plan):
         """The same on the way back."""
-        return self.counted(self.vertex.obstacles.noting(reversed_pass(now, j, plan), plan))
+        return self.vertex.obstacles.counted(self.vertex.obstacles.noting(reversed_pass(now, j, plan), plan))
 
     @traced
     def after(self, plan):
@@ -282,17 +272,17 @@ class ExplicitKernels:
                     j = plan.first + turn
                     i, b, now, own, at_ = self.scene_at(k, j, scene, state, table, plan)
                     change, rated = self.record_of(b, tangent, plan), self.rated(b, tangent, plan)
-                    self.vertex.step_jvp(i, j, self.counted(now), own, at_, change, rated)
+                    self.vertex.step_jvp(i, j, self.vertex.obstacles.counted(now), own, at_, change, rated)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
-                    now = self.counted(self.numbers_of(0, plan.first, table, plan))
+                    now = self.vertex.obstacles.counted(self.numbers_of(0, plan.first, table, plan))
                     self.bodies.step_jvp(b, plan.first, now, scene, state, tangent, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
                 for e in range(self.items.after(plan)):
                     self.elements_jvp(e, j, scene, state, tangent, table, plan)
-                now = self.counted(self.numbers_of(0, j, table, plan))
+                now = self.vertex.obstacles.counted(self.numbers_of(0, j, table, plan))
                 for i in range(plan.num_vertices):
                     self.vertex.step_jvp(i, j, now, scene, state, tangent, plan)
                 if ti.static(self.reduced):
@@ -313,7 +303,7 @@ class ExplicitKernels:
         num_vertices = self.num_vertices(plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(num_vertices):
-            now = self.counted(self.numbers_of(0, plan.first, table, plan))
+            now = self.vertex.obstacles.counted(self.numbers_of(0, plan.first, table, plan))
             self.vertex.press(i, now, scene, state, plan)
 
     @cached_property
@@ -325,7 +315,7 @@ class ExplicitKernels:
         num_vertices = self.num_vertices(plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(num_vertices):
-            now = unseen(self.counted(self.numbers_of(0, plan.first, table, plan)))
+            now = unseen(self.vertex.obstacles.counted(self.numbers_of(0, plan.first, table, plan)))
             self.vertex.go_on_jvp(i, plan.base, self.vertex.vector(0), now, scene, state, tangent, plan)
 
     @cached_property

@@ -127,7 +127,7 @@ class ImplicitAdjoint(RecordedPasses):
         seed = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else None
         seen = by_pairs = None
         if seed is not None and self._shares:
-            seen = self._shares.pull_back(seed[: self._shares.num_obstacles])
+            seen = self._shares.pull_back(seed[: self._shares.num_obstacles], self._sum_of_poses)
         if seed is not None and self.ws.pair_shares:
             by_pairs = tuple(self.ws.pair_shares.vjp(seed))
             self.potential.place(self.u_star)

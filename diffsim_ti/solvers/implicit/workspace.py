@@ -14,6 +14,7 @@ from diffsim_ti.mechanics.joints.joints import Joints
 from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.mechanics.obstacles.obstacle_collisions import ObstacleCollisions
+from diffsim_ti.mechanics.obstacles.obstacle_shares import ObstacleShares
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.mechanics.stress.frozen_strains import FrozenStrains
@@ -51,7 +52,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind, potential_kind, newton_kind = ImplicitPairs, Potential, Newton
-    collisions_kind, preconditioners_kind = ObstacleCollisions, Preconditioners
+    collisions_kind, preconditioners_kind, shares_kind = ObstacleCollisions, Preconditioners, ObstacleShares
     enough = 20  # rounds with which a solution that was not found is found by load stepping
 
     def __init__(self, solver, derived, bend=0.0):
