@@ -229,7 +229,7 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     nodal, rounding, carried_value, linear = np.zeros(mesh.num_vertices), eps * abs(value), value, number.linear
     unplaced = ""
     if solver.explicit or scene.has_multipliers:  # of whose equations `Replay` has no residual, or only a part
-        unplaced = "explicit steps and held volumes have no residual by vertices on the finer mesh"
+        unplaced = "explicit steps and what is held exactly have no residual by vertices on the finer mesh"
         rounding, linear, of_solver = rounding * own.rollout.sweep.num_passes, False, 0.0
         if tight:
             of_solver = number.of(own.rollout.on(solver.for_scene(scene, **tight)).forward(**values))[0] - value

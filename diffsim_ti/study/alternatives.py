@@ -129,7 +129,8 @@ def _affine_run(trials, scene, option) -> Rollout:
 def _adaptive(trials, best, scene, share):
     """A run over steps that are found by looking."""
     solver = best.solver(scene, dt=trials.span / trials.frames, **_unchecked(best))
-    moved = Rollout(solver, trials.frames, save_every=1).forward().displacements
+    base = trials.rollout(best.solver, best.precision, best.substeps, scene, **_unchecked(best))
+    moved = base.forward().displacements
     size = np.linalg.norm(moved - moved[0], axis=-1).max()
     tolerance = float(f"{share * trials.tolerance * size * trials.span / trials.duration:.2g}")
     begin = time.perf_counter()

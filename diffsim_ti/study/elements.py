@@ -75,10 +75,8 @@ def on_coarser(scene: Scene, mesh: TetrahedralMesh) -> Scene:
     return Scene(**given | dict(mesh=nodes, volume="tetrahedra"))
 
 
-STEP, MOST_SUBSTEPS = (
-    0.1,
-    64,
-)  # of a number's change: what steps may make wrong where its error by the mesh is asked for
+STEP = 0.1  # of a number's change: what steps may make wrong where its error by the mesh is asked for
+MOST_SUBSTEPS = 64
 
 
 @dataclass
@@ -179,18 +177,14 @@ class ElementTrials:
         for name, made in scenes.items():
             seconds = self._timed(self._implicit(made, substeps))[1]
             error, doubts = np.nan, ()
-            if (
-                made.mesh.order == 1 or 40 * seconds <= self.budget
-            ):  # of ten nodes the finer mesh has eight times as many
+            if made.mesh.order == 1 or 40 * seconds <= self.budget:  # of ten nodes the finer mesh has more
                 try:
                     bar = self.quantity.accuracy(self._implicit(made, substeps))
                     while not abs(bar.step) <= STEP * bar.size and substeps < MOST_SUBSTEPS:
                         substeps *= 2
                         bar = self.quantity.accuracy(self._implicit(made, substeps))
                     error = abs(bar.mesh) / bar.size
-                    doubts = (
-                        bar.notes if error < 0.5 else ()
-                    )  # others are out of the question, whatever they are exactly
+                    doubts = bar.notes if error < 0.5 else ()  # others are out of the question anyway
                 except (ValueError, FloatingPointError) as problem:
                     doubts = (str(problem),)
             if doubts:
