@@ -67,9 +67,9 @@ class Accuracy(metaclass=Public):
 
     @property
     def bar(self) -> float:
-        """How far the truth may be from the value: |mesh + step| / 0.7 + |solver| + |rounding|, for estimates were at least
-        0.7 times the error wherever this was known."""
-        return abs(self.mesh + self.step) / LEAST + abs(self.solver) + abs(self.rounding)
+        """How far the truth may be from the value: (|mesh| + |step|) / 0.7 + |solver| + |rounding|, for estimates were at
+        least 0.7 times the error of problems with known answers (examples/benchmarks/error_bars.py)."""
+        return (abs(self.mesh) + abs(self.step)) / LEAST + abs(self.solver) + abs(self.rounding)
 
     @property
     def corrected(self) -> float:

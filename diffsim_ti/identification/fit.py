@@ -56,8 +56,9 @@ def identify(
     unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
     max_iterations: steps, after which it stops as it is. tolerance: stop when a step promises less than this share of
     a standard error per unknown. covariance: default up to 20 unknowns; costs a tangent run each. callback(report of the
-    iteration, frames of each experiment), first of the start as iteration 0: return True to stop. progress: a bar in a
-    terminal; without one the logger "diffsim_ti" says every five seconds, at level INFO, how far it is.
+    iteration, frames of each experiment), first of the start as iteration 0, and not of what early data lead to: return True to
+    stop. progress: a bar in a terminal; without one the logger "diffsim_ti" says every five seconds, at level INFO, how
+    far it is.
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
     method: "Levenberg-Marquardt", which takes the fewest simulations; "L-BFGS-B" (SciPy's) needs gradients alone, so serves
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as
@@ -108,7 +109,11 @@ def identify(
                 raise Ended(SET_ASIDE)
 
         try:
-            if callback is not None and not one.is_resumed and callback(one.row(0), one.point.frames) is True:
+            if (
+                callback is not None
+                and not (one.is_resumed or one.report)
+                and callback(one.row(0), one.point.frames) is True
+            ):
                 raise Ended(STOPPED)
             if len(one.report) >= most:
                 raise Ended(f"stopped after {most} iterations")
@@ -123,7 +128,10 @@ def identify(
         first, why, _ = searches[0]
         ways = further
         if not isinstance(further, list):
-            early, late = searching.grown(problem, priors, go_on, most), searching.around(problem, priors, further)
+            early, late = (
+                searching.grown(problem, priors, go_on, most, show),
+                searching.around(problem, priors, further),
+            )
             ways = (
                 chain(early, [first] * (why == SET_ASIDE), late)
                 if starts is None
@@ -137,7 +145,8 @@ def identify(
                 else:
                     with suppress(*FAILURES):  # numbers that end its first run
                         more = search(Search(problem, priors, None, start, len(searches)), show)
-                if not more or (starts is None and not _is_far(searches[-1][0], 1.0)):
+                latest = searches[0 if start is first else -1][0]
+                if not more or (starts is None and not _is_far(latest, 1.0)):
                     break
     best = min(range(len(searches)), key=lambda k: searches[k][0].cost)
     if best > 0:

@@ -289,7 +289,7 @@ def torch_descent(make: Callable, search: Search, record: Callable, tolerance: f
 EARLY = 1 / 16, 1 / 8, 1 / 4, 1 / 2  # of a run
 
 
-def grown(problem: Problem, priors: Priors, go_on: Callable, most: int) -> Iterator[np.ndarray]:
+def grown(problem: Problem, priors: Priors, go_on: Callable, most: int, show: Callable) -> Iterator[np.ndarray]:
     """The start that is found from the unknowns' own by the data of the first part of each run, then of longer ones: late
     data of a motion fit many periods, early ones fit one. None where all data are of one instant.
 
@@ -298,17 +298,13 @@ def grown(problem: Problem, priors: Priors, go_on: Callable, most: int) -> Itera
     t = np.zeros(problem.size)
     for share in EARLY if np.any(problem.when > EARLY[-1]) else ():
         with problem.until(share) as count, suppress(*FAILURES):
-            if count > problem.size:
+            if count > problem.size and np.any((problem.when > 0) & (problem.when <= share)):
                 one = Search(problem, priors, start=t)
                 with suppress(Ended):
-                    go_on(one, partial(one.record, most, _silent, None), 1.0)
+                    go_on(one, partial(one.record, most, show, None), 1.0)
                 t = one.point.t
     if np.any(t):
         yield t
-
-
-def _silent(*_) -> None:
-    """Show nothing."""
 
 
 EACH = 16  # points whose cost is asked for, for each start: a run each, where a search takes dozens

@@ -1,8 +1,6 @@
-"""Linear relations between displacements: in implicit steps and statics held by a penalty,
-
-    E = sum of stiffness / 2 g^2,    g = sum c . u - value,
-
-in explicit steps exactly, by a stage."""
+"""Linear relations between displacements, g = sum c . u - value = 0: held exactly, in implicit steps and statics by
+multipliers as volumes are (chambers/multipliers.py), in explicit steps by a stage; or, with a stiffness, by a penalty in
+implicit steps and statics, E = sum of stiffness / 2 g^2."""
 
 import weakref
 from dataclasses import dataclass

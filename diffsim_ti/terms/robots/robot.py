@@ -116,7 +116,8 @@ class Robot(GivenOverTime, Term):
         links: whose collision geometry acts on the body; None: all. contact: of all links, as of an `Obstacle`; they act on
         vertices by their distance. Meshes are taken from beside the file.
         attached: {link: vertices that it holds}, by a vertex set's name, indices, a mask or a list of names, free ones of
-        the scene that are outside of the links' own geometry. limits: whether those of joints in the file hold.
+        the scene that are outside of the links' own geometry; in `ImplicitEulerSolver` alone, and not beside `SelfContact`,
+        `FilledChamber` or obstacles that act by pairs. limits: whether those of joints in the file hold.
 
         Raises ValueError for joints of other kinds, mimic joints, closed loops, dry friction, joints that carry no mass or
         start beyond their limits, and files that cannot be read; ImportError without Pinocchio.

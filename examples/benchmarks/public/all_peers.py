@@ -190,9 +190,9 @@ def table_of(rows: list) -> tuple[list, str]:
         own = [row for row in rows if who is None or row[1] == who]
         if own:
             mean, spread = mean_of(own)
-            named = who or "all pairs of task and peer"
-            said.append(f"{named} {number(mean)} times as long, times or over {spread:.1f}, of {len(own)}")
-    return cells, "Geometric means: " + "; ".join(said) + "." if said else ""
+            named = f"{who} {number(mean)}" if who else f"all pairs {number(mean)}"
+            said.append(f"{named} ({len(own)} tasks, spread {spread:.1f})" if len(own) > 1 else f"{named} (one task)")
+    return cells, "Times as long as diffsim_ti, geometric means: " + "; ".join(said) + "." if said else ""
 
 
 def main() -> None:

@@ -99,7 +99,11 @@ class Watch:
 
     def told(self) -> tuple:
         """(whether it arrived, simulations, seconds)"""
-        return self.task.is_near(self.x), self.simulations, time.perf_counter() - self.begin
+        return (
+            self.task.is_near(self.x) and self.simulations <= MOST + 1,
+            self.simulations,
+            time.perf_counter() - self.begin,
+        )
 
 
 def by_identify(task: Task, start) -> tuple:
