@@ -68,7 +68,8 @@ def refine(
 ) -> Refined:
     """Refine the mesh of a run where a number's error comes from, until this is below a tolerance.
 
-    problem: a Rollout of equilibria or implicit steps, without volumes and relations that are held exactly. output, weights: the number, as in `Rollout.accuracy`.
+    problem: a Rollout of equilibria or implicit steps, without volumes and relations that are held exactly. output,
+    weights: the number, as in `Rollout.accuracy`.
     tolerance: of the estimated error over the number's change since the first frame, `Accuracy.relative`.
     rounds: of refinement at most. most: unknowns of the finer mesh that says the error, beyond which no round begins.
     onto: as in `TetrahedralMesh.refined`. values: of inputs, as in `Rollout.forward`.
@@ -84,8 +85,8 @@ def refine(
     if problem.solver.explicit or problem.scene.has_multipliers:
         raise ValueError(
             "refine needs the error of each tetrahedron, which accuracy does not have of explicit steps and of what is held "
-            "exactly (volumes, relations): take BDF2Solver or StaticSolver and relations with a stiffness, or refine by hand "
-            "with mesh.refined()"
+            "exactly (volumes, relations): take BDF2Solver or StaticSolver and relations with a stiffness, or refine by "
+            "hand with mesh.refined()"
         )
     wanted, values, given, history = Number(problem, output, weights), dict(values or {}), None, []
     while True:

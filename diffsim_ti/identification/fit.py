@@ -56,9 +56,9 @@ def identify(
     unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
     max_iterations: steps, after which it stops as it is. tolerance: stop when a step promises less than this share of
     a standard error per unknown. covariance: default up to 20 unknowns; costs a tangent run each. callback(report of the
-    iteration, frames of each experiment), first of the start as iteration 0, and not of what early data lead to: return True to
-    stop. progress: a bar in a terminal; without one the logger "diffsim_ti" says every five seconds, at level INFO, how
-    far it is.
+    iteration, frames of each experiment), first of the start as iteration 0, and not of searches by early data: return
+    True to stop. progress: a bar in a terminal; without one the logger "diffsim_ti" says every five seconds, at level INFO,
+    how far it is.
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
     method: "Levenberg-Marquardt", which takes the fewest simulations; "L-BFGS-B" (SciPy's) needs gradients alone, so serves
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as

@@ -1,7 +1,7 @@
 """Error bars against true errors: `Rollout.accuracy` on problems with known answers, each on three coarse meshes.
 
-Effectivity is the estimated error over the true one: 1 is perfect. Where the mesh has no error, the estimate is to be as small as
-the solver's tolerance.
+Effectivity is the estimated error over the true one: 1 is perfect. Where the mesh has no error, the estimate is to be as
+small as the solver's tolerance.
 
     python examples/benchmarks/error_bars.py [names of problems]
     python examples/benchmarks/error_bars.py refine     # meshes refined by the estimate, and uniformly
