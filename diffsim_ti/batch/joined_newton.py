@@ -63,6 +63,7 @@ class JoinedNewton(Newton):
         state[goes_on, STOPPED] = 1
         lost = odd & ~goes_on
         state[lost, nk.PHASE], state[lost, nk.NORM], state[lost, nk.SOLVED] = nk.TROUBLE, np.inf, 0
+        state[lost, STOPPED] = nk.WAITS
 
     def system(self) -> tuple:
         """(diagonal mass, matrix of blocks or None) that join the potential's Hessian."""

@@ -143,9 +143,10 @@ class Grown(Around):
 
     growth [-], > -1: growth or swelling (shrinkage below zero) as strain along each edge; of heat alpha (T - T_0). One
     number, one for each tetrahedron, or by named sets as all numbers of materials; of ten nodes also one at each of the four
-    points of the stresses, shape (num_tetrahedra, 4), such as `mesh.at_stress_points(x)` of a field x at vertices. An input
-    with gradient, "growth". A free body with uniform growth takes its new size without stress, and one of ten nodes with
-    growth that is linear in space its curved one. Mass stays that of the rest shape.
+    points of the stresses, shape (num_tetrahedra, 4), such as `mesh.at_stress_points(x)` of a field x at vertices (not
+    where another material, such as KelvinVoigt, is around this one). An input with gradient, "growth". A
+    free body with uniform growth takes its new size without stress, and one of ten nodes with growth that is linear in
+    space its curved one. Mass stays that of the rest shape.
     `Grown(material, strain=e)`: a stretch at rest that has directions, such as of wood that swells or a membrane that was
     stretched before it was glued: F_g = 1 + e, e = (xx, yy, zz, yz, xz, xy) [-], shear as half the angle; shape (6,),
     (num_tetrahedra, 6) or by sets; input "growth_strain". Matter that was stretched to its rest shape by U has e = U^-1 - 1.

@@ -15,6 +15,7 @@ from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.pressure.follower_pressure import pressures_at
 from diffsim_ti.terms.multi_point_constraint import MultiPointConstraint
+from diffsim_ti.terms.robots.robot import Robot
 
 
 def rows_of(coefficients: list[np.ndarray], vertices: list[np.ndarray], num_vertices: int):
@@ -176,15 +177,24 @@ class Constraints(Interaction):
             return
         coefficients = [term.described[1].value for term in exact]
         indices, free = [term.indices(self.mesh) for term in exact], self.scene.supports.freedom(self.mesh.num_vertices)
+        for robot in self.scene.terms_of(Robot):
+            for _, vertices in robot.holds:
+                free[vertices] = 0.0
         held = [c - np.einsum("kij,kj->ki", free[at], c) for c, at in zip(coefficients, indices)]
         C = rows_of(coefficients, indices, self.mesh.num_vertices)
         size = np.sqrt(np.asarray(C.power(2).sum(1)))
         if max(np.abs(x).max() for x in held) > 1e-12 * size.max():
             raise ValueError(
-                "MultiPointConstraint: what is held exactly names no vertices along directions in which they are fixed: "
-                "leave them out, and what they are moved by comes to the value"
+                "MultiPointConstraint: what is held exactly names no vertices that links of robots hold, or along "
+                "directions in which they are fixed: leave them out and take c . u of them off the value, or with an "
+                "implicit or static solver give it a stiffness="
             )
-        if np.linalg.matrix_rank((C @ C.T).toarray() / (size @ size.T), tol=1e-9) < len(exact):
+        left = C.toarray().reshape(len(exact), -1, 3)
+        for body in self.scene.reduced.bodies:  # what vertices that are glued, or in sets, can do of them
+            for row in left:
+                row[body.vertices] = body.motion(body.numbers(row))
+        left = left.reshape(len(exact), -1) / size
+        if np.linalg.matrix_rank(left @ left.T, tol=1e-9) < len(exact):
             raise ValueError(
                 "MultiPointConstraint: relations that are held exactly follow from each other: leave one out"
             )

@@ -83,7 +83,7 @@ MOST_SUBSTEPS = 64
 class ElementTrial:
     """A kind of element (ELEMENTS) on a scene's own mesh, or a coarser one: the largest distance of its motion from that of
     finer elements at the scene's vertices over the largest displacement, or the error of a number over its change (NaN: not
-    known), and the wall time [s] of the run. bar: whether it is that of the number's error bar.
+    known), and the wall time [s] of the run. bar: whether it is the estimate of `Rollout.accuracy`.
     """
 
     element: str
@@ -92,8 +92,9 @@ class ElementTrial:
     bar: bool = False
 
     def __str__(self) -> str:
-        error = "error not known" if np.isnan(self.error) else f"error {self.error:.2g}"
-        return f"{self.element} {error}{' by its bar' if self.bar else ''} in {self.seconds:.2g} s"
+        how = " as estimated" if self.bar else ""
+        error = "error not known" if np.isnan(self.error) else f"error {self.error:.2g}{how}"
+        return f"{self.element} {error} in {self.seconds:.2g} s"
 
 
 def own_element(scene: Scene) -> str:
@@ -123,8 +124,8 @@ class ElementTrials:
     time.
 
     coarser: another mesh for those of ten nodes; None: a grid of half the cells, where the scene's mesh is a grid.
-    quantity: what errors are of. Those of a number are its error bars, in equilibria and steps of BDF2, if all of these can
-    be trusted; else runs of all kinds are compared with one of the finest elements, as those of motion are.
+    quantity: what errors are of. Those of a number are its estimates by `Rollout.accuracy`, in equilibria and
+    steps of BDF2, if all of these can be trusted; else runs of all kinds are compared with one of the finest elements, as those of motion are.
     """
 
     def __init__(

@@ -96,11 +96,11 @@ class VolumeConstraints:
         """Targets less volumes where `place` was."""
         return np.array([law.target - law.volume for law in self.laws])
 
-    def met(self, u: np.ndarray) -> bool:
-        """Whether volumes are as asked for, to tolerance and rounding."""
+    def met(self, u: np.ndarray, times: float = 1.0) -> bool:
+        """Whether volumes are as asked for, to so many times tolerance and rounding."""
         for law, left, g in zip(self.laws, self.missing, self.gradients(u)):
             noise = 4 * self.eps * float((np.abs(g) * np.abs(u)).sum()) + 1e-14 * abs(law.target)
-            if abs(left) > self.tolerance * abs(law.target) + noise:
+            if abs(left) > times * (self.tolerance * abs(law.target) + noise):
                 return False
         return True
 

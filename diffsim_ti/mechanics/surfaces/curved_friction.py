@@ -14,7 +14,7 @@ class CurvedLaggedFriction:
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, presses: bool) -> None:
         """With obstacles where the pass begins; their corners have x = g - v / per_gamma, g where forces are taken."""
-        self.began = u, x, per_gamma
+        self.began = u, x, per_gamma, presses
         self.given, there = 0.0, self.C @ x
         if self.pairs.obstacles:
             obstacles, first = self.pairs.obstacles, self.pairs.finer.mesh.first

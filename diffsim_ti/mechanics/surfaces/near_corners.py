@@ -1,5 +1,5 @@
-"""Which points and edges of obstacles a run has: of an obstacle with many those that are near bodies, so that what a step
-costs does not depend on others."""
+"""Which points and edges of obstacles a run has: of an obstacle with many those that are near bodies, in explicit steps
+near where bodies have been, so that what a step costs does not depend on others."""
 
 from functools import reduce
 from itertools import product

@@ -18,6 +18,9 @@ class NearbyContact(Stage):
     def __init__(self, make: Callable[[], PairContact]):
         self.make, self.now = make, make()
         self.by_end: dict[int, PairContact] = {}
+        self.went_back: dict[PairContact, None] = {}  # all that have adjoints
+        nearby = self.now.pairs.nearby  # where obstacles turn, those at hand say nothing of how far others go
+        self.turning = any(nearby.all.row_of(part, AT_BEGIN) is not None for part in nearby.many)
 
     @property
     def work(self) -> float:
@@ -44,7 +47,7 @@ class NearbyContact(Stage):
     @contextmanager
     def do(self, at: Passes):
         u, slot, anew = at.history.u, at.slot, at.launch is None
-        stage = self._cover(at, u, slot) if anew else self._stage()
+        stage = self._cover(at, u, slot) if anew or self.turning else self._stage()
         stage.prepare(at, u, slot, anew or not stage.inner.fresh)
         if not at.stride:
             copy_slot(u, slot, stage.begin, 0)
@@ -64,15 +67,18 @@ class NearbyContact(Stage):
         return self.by_end.get(at.end, self.now).tangent(at)
 
     def adjoint(self, at: Passes):
-        return self.by_end.get(at.end, self.now).adjoint(at)
+        stage = self.by_end.get(at.end, self.now)
+        self.went_back[stage] = None
+        return stage.adjoint(at)
 
     @property
     def _all(self) -> list[PairContact]:
-        return list(dict.fromkeys([self.now, *self.by_end.values()]))
+        return list(dict.fromkeys([self.now, *self.by_end.values(), *self.went_back]))
 
     def clear(self) -> None:
         for stage in self._all:
             stage.clear()
+        self.went_back = {}
 
     def collect(self, out: Derived) -> None:
         for stage in self._all:

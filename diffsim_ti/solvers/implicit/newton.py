@@ -21,7 +21,6 @@ import numpy as np
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import diagonal_of
 from diffsim_ti.mechanics.host_force import NONE, HostForces
-from diffsim_ti.mechanics.obstacles.collision_detection import Met
 from diffsim_ti.mechanics.stress.projection import Projection
 from diffsim_ti.mechanics.supports.free import Free, cleaned, linear_of, mask_of
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
@@ -32,8 +31,8 @@ from diffsim_ti.solvers.implicit.rounds import Rounds
 @dataclass
 class NewtonReport:
     """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
-    Hessian, saddles that were left, evaluations of the energy, halvings in line searches; directions that an obstacle, or
-    the surface itself, cut short, and which obstacle cut the last one (mechanics/obstacles/collision_detection.py)."""
+    Hessian, saddles that were left, evaluations of the energy, halvings in line searches, directions that an obstacle, or
+    the surface itself, cut short."""
 
     residuals: list = field(default_factory=list)
     products: int = 0
@@ -41,7 +40,6 @@ class NewtonReport:
     saddles: int = 0
     trials: int = 0
     halvings: int = 0
-    met: Met | None = None
     cuts: int = 0
     place: np.ndarray | None = None  # where a solve that failed ended
 
@@ -141,7 +139,8 @@ class Newton:
             elif not np.isfinite(norm) or not self.volumes or not here.stiffen():
                 break
         u = here.end()
-        if solved or norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
+        near = norm <= 100 * floor and (not self.volumes or self.volumes.met(u, 100.0))
+        if solved or near or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
             return u
         report.place = u
         raise NotConverged(self._why(done), done)

@@ -34,13 +34,13 @@ def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
     from scipy.sparse.linalg import splu
 
     pairs, potential, free = workspace.pairs, workspace.potential, workspace.free
+    with potential.at_rest():
+        potential.blocks()
+        K = assemble(potential, np.zeros((len(u), 1)), free)[0].tocsr()
     inner, C = (pairs.inner, pairs.matrix) if isinstance(pairs, CurvedPairs) else (pairs, identity(len(u)))
     spread = pairs.spread if isinstance(pairs, CurvedPairs) else lambda u: u
     rest, gap = runtime.fetch(inner.a.rest)[: inner.mesh.num_vertices].astype(np.float64), GAP * inner.width
     moves = kron(C, identity(3)).tocsr() @ block_diag(projectors_of(free)).tocsr()
-    with potential.at_rest():
-        potential.blocks()
-        K = assemble(potential, np.zeros((len(u), 1)), free)[0].tocsr()
     K, stiff, deepest, place = K + SOFT * diags(K.diagonal()), STIFF * K.diagonal().max(), 0.0, u
     for _ in range(ROUNDS):
         x = rest + spread(place)
@@ -49,9 +49,10 @@ def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
         if missing.max(initial=0.0) < 0.5 * gap:  # vertices are apart: are edges?
             rows, missing = _crossed(inner, x, gap, max(deepest, gap))
         if missing.max(initial=0.0) < 0.5 * gap:
-            pairs.begin(place)
+            pairs.begin(place, np.zeros_like(place))
+            runtime.fill(potential.u, place[None])
             try:
-                pairs.check_apart(pairs.next)
+                pairs.check_apart(potential.u)
             except Overlap:
                 raise error from None
             if not np.all((workspace.volume_ratios(place) > 0) | (workspace.volume_ratios(u) <= 0)):

@@ -45,7 +45,8 @@ class Rounds:
         self.beside = beside = bool(by_host or potential.pairs or potential.hosts or consistent)
         self.solves_on_host = newton.system() is None
         self.contact = contact = bool(a.contacts or potential.pairs or potential.hosts)
-        how = a.precision, cg.precision, cg.parallel, isinstance(free, FreeDirections)
+        slides = isinstance(free, FreeDirections) and not potential.joints  # whose directions are the host's
+        how = a.precision, cg.precision, cg.parallel, slides
         kernels = kernels_of(NewtonKernels, *how, contact, beside, self.several)
         fp, vector = runtime.PRECISIONS[cg.precision], runtime.array_types(cg.precision)["vectors"].dtype
         self.u, self.d, self.R, self.inertial, self.loads = (runtime.array(vector, n) for _ in range(5))
@@ -167,6 +168,8 @@ class Rounds:
         for name, place in nk.COUNTED.items():
             setattr(report, name, getattr(report, name) + int(state[place]))
         self.newton.upright = state[nk.UPRIGHT] == 1
+        if state[nk.PHASE] == nk.DONE:
+            self._here()
         return int(state[nk.PHASE]), float(state[nk.NORM]), float(state[nk.FLOOR]), state[nk.SOLVED] == 1
 
     def go_on(self) -> None:
@@ -186,7 +189,7 @@ class Rounds:
         if not self.newton.volumes.can_stiffen():
             return False
         self.potential.place(self._base)
-        self.state[0, nk.PHASE], self.state[0, STOPPED] = nk.START, nk.WAITS
+        self.state[0, nk.PHASE], self.state[0, STOPPED], self.state[0, nk.FRACTION] = nk.START, nk.WAITS, 1.0
         return True
 
     def end(self) -> np.ndarray:
@@ -387,13 +390,14 @@ class Rounds:
         potential, newton, u = self.potential, self.newton, self.potential.held_at
         potential.only(self.state[:, nk.PHASE] == nk.JUDGE)
         if newton.volumes and not self.state[0, nk.DOUBTED]:
-            shift = 0.0  # of the energy, where it counts from what is held at u
-            if self._direction is not None:
-                counts = newton.volumes.have_energy
-                before = potential.energies_beside().sum() if counts else 0.0
+            counts = newton.volumes.have_energy
+            before = potential.energies_beside().sum() if counts else 0.0
+            if self._direction is None:  # of a start, or out of a saddle
+                newton.volumes.place(u)
+            else:
                 newton.recount(self._base, u - self._base, self._direction)
-                shift = potential.energies_beside().sum() - before if counts else 0.0
-                self._direction = None
+            shift = potential.energies_beside().sum() - before if counts else 0.0  # of the energy, which counts from u
+            self._direction = None
             self._set({nk.UNMET: not newton.volumes.met(u), nk.E_TRIED: self.state[0, nk.E_TRIED] + shift})
         if self.beside:
             runtime.fill(self.R, np.column_stack(newton.residual(u)))

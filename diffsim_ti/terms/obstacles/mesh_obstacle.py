@@ -25,7 +25,7 @@ from diffsim_ti.terms.obstacles.turning import rotation_matrix
 from diffsim_ti.terms.pose import brought_back
 from diffsim_ti.terms.term import place
 
-MANY = 256  # edges and points that act by pairs, from which on a run has those near bodies alone
+MOST_HELD = 256  # edges and points that act by pairs, from which on a run has those near bodies alone
 
 
 class MeshObstacle(Obstacle):
@@ -185,7 +185,7 @@ class MeshPrimitives(Primitives):
 
     @property
     def many(self):
-        return len(self.points) + len(self.edges) > MANY
+        return len(self.points) + len(self.edges) > MOST_HELD
 
     def of_some(self, points: np.ndarray, edges: np.ndarray) -> "MeshPrimitives":
         """These points and edges alone, by their places among all."""
