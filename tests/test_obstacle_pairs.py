@@ -164,8 +164,8 @@ def land(long: int, **options) -> ds.MeshObstacle:
 
 @pytest.mark.parametrize("solver, dt, steps", [(ds.ImplicitEulerSolver, 5e-3, 4), (ds.SemiImplicitSolver, 1e-3, 50)])
 def test_a_run_has_what_is_near_alone_and_finds_what_it_would_find_with_all(solver, dt, steps, monkeypatch):
-    """A cube goes over rough land that rises and turns: the same frames, and gradients, as with all of its edges. In implicit
-    steps it is drawn so that it leaves what is near within a solve."""
+    """A cube goes over rough land that rises and turns: the same frames, and gradients, as with all of its edges. In
+    implicit steps it is drawn so that it leaves what is near within a solve."""
     rise = lambda t: (0, 0.2 * t, 0, 0, 0.4 * t, 0)  # noqa: E731
     options, rough = ({}, {}) if solver.explicit else (dict(tolerance=1e-10), dict(friction=0.2, friction_speed=0.05))
     drawn = [] if solver.explicit else [ds.Gravity((3000.0, -100.0, 0.0))]

@@ -124,8 +124,9 @@ class ElementTrials:
     time.
 
     coarser: another mesh for those of ten nodes; None: a grid of half the cells, where the scene's mesh is a grid.
-    quantity: what errors are of. Those of a number are its estimates by `Rollout.accuracy`, in equilibria and
-    steps of BDF2, if all of these can be trusted; else runs of all kinds are compared with one of the finest elements, as those of motion are.
+    quantity: what errors are of. Those of a number are its estimates by `Rollout.accuracy`, in equilibria and steps of BDF2,
+    if all of these can be trusted; else runs of all kinds are compared with one of the finest elements, as those of motion
+    are.
     """
 
     def __init__(
