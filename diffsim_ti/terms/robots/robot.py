@@ -54,8 +54,8 @@ class Robot(GivenOverTime, Term):
     Links touch the body alone: not one another, the ground, or other obstacles. `Simulator.set_state` leaves the joints
     where they are. `compute_energy` and the guard of the energy are those of the body; `LinkEnergy` is that of links.
     Vertices that are `attached` move exactly as their links do, from where they and the joints are as a run starts: they are
-    no unknowns of their own, and what acts on them acts on the joints, inertia included. `Reaction` of their set is the force
-    of the link on them, or its moment. Give the body `initial_velocities` that go with those of the joints.
+    no unknowns of their own, and what acts on them acts on the joints, inertia included. `Reaction` of their set is the
+    force of the link on them, or its moment. Give the body `initial_velocities` that go with those of the joints.
     Limits of joints hold by the one-sided potential E_limit = k d^3 / (6 w) of what is beyond them by d < w, 1e-4 of the
     range, and of constant stiffness k = 10^6 M / h^2 beyond: joints stop there without rebound. Limits of effort and
     velocity in the file have no effect; nor have limits of prescribed joints, but where they start.
