@@ -357,6 +357,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("terms/robots/robot.py", "beyond its limits"): "test_robots.py",
     ("terms/robots/urdf.py", "has dry friction"): "test_robots.py",
     ("rollout/adaptive_steps.py", "errors of robots' joints"): "test_robots.py",
+    ("rollout/simulator.py", "hold some vertices"): "test_robots.py",
     ("monitor/guard.py", "has gained {} J"): "test_energy_watch.py",
     ("monitor/guard.py", "reduce the substep to {} s"): "test_contact_crossing.py, battery_of_impacts.py",
     ("monitor/guard.py", "the barrier cannot stop it"): "test_contact_crossing.py, battery_of_impacts.py",

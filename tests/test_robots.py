@@ -7,6 +7,7 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti.common import rotations
+from diffsim_ti.study import recommend
 
 MASS = (
     '<inertial><origin xyz="{at} 0 0"/><mass value="{m}"/>'
@@ -119,6 +120,15 @@ def test_values_by_names_come_in_the_order_of_the_joints():
     for wrong in (dict(links="tip"), dict(prescribed="elbow")):
         with pytest.raises(ValueError, match="must be one or several (links|joints) by name"):
             ds.Robot.from_urdf(ARM, **wrong)
+    for wrong, message in (
+        (dict(limits=(-1, 1)), r"limits must be True or False, their numbers being the file's <limit>, got \(-1, 1\)"),
+        (dict(attached="xmin"), "attached must be {link: vertices}, got 'xmin'"),
+        (dict(attached=["b"]), r"attached must be {link: vertices}, got \['b'\]"),
+        (dict(torques=lambda t: [0, 0]), "torques of joints are numbers, not functions: give a value for each step"),
+        (dict(positions=dict(shoulder=np.sin, elbow=0)), "positions of joints are numbers, not functions"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ds.Robot.from_urdf(ARM, **wrong)
     with pytest.raises(ValueError, match="there is no file 'xxx"):
         ds.Robot.from_urdf(300 * "x")
 
@@ -228,6 +238,8 @@ def test_other_solvers_refuse_and_say_which_takes_robots(monkeypatch):
     for solver in (ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver):
         with pytest.raises(ValueError, match="take ImplicitEulerSolver, SemiImplicitSolver or VelocityVerletSolver"):
             solver(scene)
+    with pytest.raises(ValueError, match="recommend takes no robots"):
+        recommend(scene, 0.01)
     monkeypatch.setitem(sys.modules, "pinocchio", None)
     with pytest.raises(ImportError, match=r'pip install "diffsim-ti\[robots\]"'):
         ds.Robot.from_urdf(ARM)
@@ -589,6 +601,55 @@ def test_a_joint_stops_at_its_limit_and_says_what_that_takes(kind):
     moves = rollout.tangents(frames, **{"robot.torques": [1.0]})
     assert moves["joint_positions"][-1, 0] == pytest.approx(h**2 * steps * (steps + 1) / 2 / 2.0)
     assert moves["joint_efforts"][-1, 0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_a_prescribed_joint_follows_its_target_beyond_its_limits(kind):
+    text = urdf(link("a"), link("b", 2.0), joint("j", "prismatic", "a", "b", "0 5 0", "0 1 0"))
+    text = text.replace('lower="-3"', 'lower="-0.01"')
+    robot = ds.Robot.from_urdf(text, links=(), targets=lambda t: [-10 * t], prescribed=["j"])
+    rollout = ds.Rollout(kind(scene_of(robot, fixed="ymin"), dt=1e-3), 3, outputs=[ds.JointPositions()])
+    assert rollout.forward()["joint_positions"][-1, 0] == pytest.approx(-0.03, rel=1e-5)
+
+
+def test_a_link_that_starts_in_the_body_or_meets_fixed_vertices_gets_advice_that_works():
+    text = urdf(
+        link("a"),
+        link("b", 1.0, 0.0, shape='<sphere radius="0.02"/>'),
+        joint("j", "prismatic", "a", "b", "-0.0225 0.03 0.03", "1 0 0"),
+    )
+    given = dict(velocities=[1.0], width=2e-3, stiffness_per_area=3e7)
+    scene = scene_of(ds.Robot.from_urdf(text, **given), fixed="xmin")
+    with pytest.raises(FloatingPointError, match="let links through vertices that are fixed: take Impl") as error:
+        ds.Simulator(ds.SemiImplicitSolver(scene, dt=4e-3)).run(4)
+    assert error.value.enough is None and error.value.stiffness is None
+    simulator = ds.Simulator(ds.ImplicitEulerSolver(scene, dt=4e-3))
+    simulator.run(4)
+    assert simulator.joint_states[0, 0] < 2.5e-3
+    inside = dict(given, positions=[0.01])
+    with pytest.raises(
+        ValueError, match="starts on or in .*: vertex .*move the body or the robot, or leave the link out"
+    ):
+        ds.Simulator(ds.ImplicitEulerSolver(scene_of(ds.Robot.from_urdf(text, **inside)), dt=1e-3))
+    ds.Simulator(ds.ImplicitEulerSolver(scene_of(ds.Robot.from_urdf(text, links=[], **inside)), dt=1e-3))
+    ds.Simulator(ds.ImplicitEulerSolver(scene_of(ds.Robot.from_urdf(text, base=[-0.02, 0, 0], **inside)), dt=1e-3))
+
+
+def test_vertices_that_links_hold_are_set_where_links_have_them():
+    arm = ds.Robot.from_urdf(ARM, attached=dict(tip="xmin"), velocities=1.0, links=())
+    simulator, held = ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm), dt=1e-3)), MESH.vertex_indices("xmin")
+    simulator.step()
+    x = simulator.positions
+    with pytest.raises(
+        ValueError, match="hold some vertices 0.01 m elsewhere: leave those of attached= where they are"
+    ):
+        simulator.set_state(positions=x + [0.01, 0.0, 0.0])
+    np.testing.assert_array_equal(simulator.positions, x)
+    there = x + [1e-4, 0.0, 0.0]
+    there[held] = x[held]
+    simulator.set_state(positions=there)
+    simulator.step()
+    assert np.abs(simulator.positions[held] - x[held]).max() < 2e-3
 
 
 def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works(monkeypatch):

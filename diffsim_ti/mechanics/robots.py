@@ -40,7 +40,7 @@ class Robots(Interaction):
         if not solver.moves_robots:
             raise ValueError(
                 f"{type(solver).__name__}: robots move in backward Euler and explicit steps: take ImplicitEulerSolver, "
-                "SemiImplicitSolver or VelocityVerletSolver; recommend takes no robots"
+                "SemiImplicitSolver or VelocityVerletSolver"
             )
         if solver.explicit and solver.contact == "force" and any(term.companions for term in self.terms):
             raise ValueError('links of robots act in a stage of explicit steps: leave out contact="force"')

@@ -38,7 +38,7 @@ class Crossing(Divergence):
 
     stable_dt [s] is a substep that resolves the barrier at this speed, or that is stable in this state where the present
     one is not: the speed is of its own making then.
-    stiffness is what stops the vertex, or None where the barrier's own would do.
+    stiffness is what stops the vertex, or None where the barrier's own would do, or where none does.
     """
 
     def __init__(
@@ -345,7 +345,13 @@ class Guard:
                 f"the substep has outgrown the stable step {stable:.3g} s of this state, whose elements are squeezed: "
                 f"reduce the substep to {enough:.3g} s"
             )
-        raise Crossing(
+        through = term.led is not None and vertex in ws.scene.fixed
+        if through:
+            stiffness, enough = None, self.ws.substep
+            remedy = (
+                "explicit steps let links through vertices that are fixed: take ImplicitEulerSolver, or keep links away"
+            )
+        error = Crossing(
             f"{self.ws.when(step)}: vertex {vertex} gets {depth:.3g} m behind {term!r} within a "
             f"substep of {self.ws.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",
             step,
@@ -355,6 +361,8 @@ class Guard:
             speed,
             stiffness,
         )
+        error.enough = None if through else error.enough
+        raise error
 
     def _stiffness_needed(self, k: int, vertex: int, speed: float) -> float | None:
         """Stiffness [N/m] whose barrier, alone, stops the vertex at a fiftieth of the width; None if the present one can.

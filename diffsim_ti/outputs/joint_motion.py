@@ -52,8 +52,8 @@ class JointPositions(Output):
 
 
 class JointVelocities(JointPositions):
-    """Joint velocities [rad/s or m/s], as `JointPositions`: of the step that ends in the frame, (q_n+1 - q_n) / h, of
-    explicit steps of the last substep."""
+    """Joint velocities [rad/s or m/s], as `JointPositions`: of the last substep that ends in the frame,
+    (q_n+1 - q_n) / h there; explicit steps add what a contact that keeps its energy gives back."""
 
     column = 1
 
@@ -62,13 +62,13 @@ class JointVelocities(JointPositions):
 
 
 class JointEfforts(JointPositions):
-    """Joint efforts [N m or N], as `JointPositions`: what torques, drives, damping and limits did in the step that ends in
-    the frame, zero in the first,
+    """Joint efforts [N m or N], as `JointPositions`: what torques, drives, damping and limits did in the last substep that
+    ends in the frame, zero in the first,
 
         tau + k (q_target - q) - c (q - q_n) / h - dE_limit/dq,
 
-    so of a prescribed joint what it takes to move it; of explicit steps what they did in the last substep. With save_every=1
-    and one substep in each step, effort times (q - q_n) is the work on the joints.
+    so of a prescribed joint what it takes to move it. With save_every=1 and one substep in each step, effort times (q - q_n)
+    is the work on the joints.
     Featherstone 2008, Rigid Body Dynamics Algorithms, sec. 3.
     """
 
@@ -82,8 +82,7 @@ class LinkMotion(JointPositions):
     """Where a link of a robot is and how it moves, shape (frames, 13): position of its origin [m], unit quaternion
     (w, x, y, z) with w >= 0, velocity of the origin [m/s] and angular velocity [rad/s], in space.
 
-    Velocities are those of the step, in explicit steps of the substep, that ends in the frame, (q_n+1 - q_n) / h, at the
-    joint positions there.
+    Velocities are those of the substep that ends in the frame, by `JointVelocities`, at the joint positions there.
     link: its name in the file. robot, name: as of `JointPositions`. The gradient is exact by all inputs.
     Raises ValueError, when a Rollout is made, for a robot or a link that is not there.
     Featherstone 2008, Rigid Body Dynamics Algorithms, sec. 4.

@@ -283,8 +283,8 @@ class Simulator(metaclass=Public):
     def state(self) -> dict[str, np.ndarray]:
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
         two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps and what
-        multigrid has learned there, what steps were given over time, and substeps where more were taken than at the start.
-        `np.savez(file, **simulator.state)` keeps it, to the bit."""
+        multigrid has learned there, joint_states of robots, what steps were given over time, and substeps where more were
+        taken than at the start. `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:
@@ -423,8 +423,9 @@ class Simulator(metaclass=Public):
         """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3), and what the law remembers, in
         the shape of `law_state`; None leaves a part as it is.
 
-        Fixed vertices keep no velocity; of sets that are `reduced` what they can do is taken. `reset` goes back to the
-        start; a run that was saved goes on by `resume`.
+        Fixed vertices keep no velocity; of sets that are `reduced` what they can do is taken. Joints of robots stay where
+        they are. `reset` goes back to the start; a run that was saved goes on by `resume`.
+        Raises ValueError for other shapes, and for positions of vertices that links hold elsewhere.
         """
         law_state = None if law_state is None else self.workspace.checked_law_state(law_state)
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
@@ -437,6 +438,7 @@ class Simulator(metaclass=Public):
                 if value.shape != shape or not np.all(np.isfinite(value)):
                     raise ValueError(f"{name}: expected finite numbers of shape {shape}, got shape {value.shape}")
                 if name == "positions":
+                    self._check_held(value)
                     runtime.fill(state.u, displaced.value(value, self._start.rest)[0][None])
                 else:
                     given = dict(initial_velocities=value, rest=self._start.rest)
@@ -445,6 +447,16 @@ class Simulator(metaclass=Public):
         if law_state is not None:
             self.workspace.set_law_state(law_state)
         self.workspace.forget()
+
+    def _check_held(self, positions: np.ndarray) -> None:
+        joints = self.workspace.joints
+        if joints and len(joints.at):
+            off = np.abs(positions[joints.at] - joints.carried(self.workspace.state.joints[0][0])).max()
+            if off > 1e-5 * np.ptp(self.scene.mesh.vertices, 0).max():
+                raise ValueError(
+                    f"positions: links of a robot hold some vertices {off:.3g} m elsewhere: leave those of attached= where "
+                    "they are"
+                )
 
     def set_forces(self, forces: ArrayLike) -> None:
         """Other external forces [N] from now on, in the shape of the scene's constant ExternalForce, until a reset."""

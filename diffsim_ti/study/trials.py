@@ -25,7 +25,7 @@ from diffsim_ti.study.elements import ElementTrial, ElementTrials, advised
 from diffsim_ti.study.executors import each
 from diffsim_ti.study.problem import Problem, distance
 from diffsim_ti.study.quantity import Quantity
-from diffsim_ti.terms import Drag
+from diffsim_ti.terms import Drag, Robot
 
 
 @dataclass
@@ -458,8 +458,11 @@ def recommend(
     executor: any `concurrent.futures.Executor`, which takes a solver at a time, each with the budget, and the elements;
     those near the best are timed again here.
 
-    Raises ValueError for a duration or tolerance that is no such thing, FloatingPointError if nothing meets the tolerance.
+    Raises ValueError for a duration or tolerance that is no such thing and for scenes with robots, FloatingPointError if
+    nothing meets the tolerance.
     """
+    if scene.terms_of(Robot):
+        raise ValueError("recommend takes no robots: compare Rollouts of ImplicitEulerSolver and explicit solvers")
     if not (duration >= 0 and np.isfinite(duration)):
         raise ValueError(f"duration must be > 0 [s], or 0 for an equilibrium, got {duration:g}")
     if output is None and weights is not None:

@@ -7,7 +7,7 @@ each w anew: vertices are eliminated. With Phi of the joints alone (terms/robots
     h dPhi/dq(q + h w) + J^T (b P(w) + F(w)) = 0,    v' = w - (1 - b) A^-1 J^T P,    A = M + h c + h^2 k,
 
 is solved for w by Newton's method: links move by J A^-1 J^T times what vertices do to them in the same pass. What one gets
-the other loses, to round-off, whatever is left of this equation. Fixed vertices do nothing to links.
+the other loses, to round-off, whatever is left of this equation. Fixed vertices do not stop links.
 """
 
 import weakref
@@ -183,7 +183,8 @@ class JointStage(Stage):
                 t *= 0.5
         share = float(np.max(np.abs(F) / (size + noise / J.loose)))
         if not share <= J.loose:
-            error = NotConverged(f"joints of robots are out of balance by {share:.2g}: take smaller steps", [share])
+            remedy = "take smaller steps, or begin with links outside of the body"
+            error = NotConverged(f"joints of robots are out of balance by {share:.2g}: {remedy}", [share])
             raise self.ws.dated(error, self.at.j, self.at.num_passes)
         J.w = J.w - np.linalg.solve(self.slope(), F)  # so that momentum is kept to round-off
         J.q = J.q_n + J.h * J.w

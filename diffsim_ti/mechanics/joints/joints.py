@@ -249,8 +249,8 @@ class Joints:
 
     def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Energies of the limits of joints, and their first two derivatives: k d^3 / (6 w) of what is beyond by d < w, and
-        beyond w with the constant stiffness k."""
-        k, w = STIFF * self.robots.typical / self.h**2, self.robots.soft
+        beyond w with the constant stiffness k; prescribed joints have none."""
+        k, w = np.where(self.robots.prescribed, 0.0, STIFF * self.robots.typical / self.h**2), self.robots.soft
         past = np.maximum(self.q - self.robots.upper, 0) - np.maximum(self.robots.lower - self.q, 0)
         s = np.abs(past) / w
         c = np.minimum(s, 1.0)

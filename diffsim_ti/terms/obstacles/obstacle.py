@@ -272,9 +272,10 @@ class Obstacle(Term):
         inside = np.flatnonzero(gap <= 0)
         deepest = inside[np.argsort(gap[inside], kind="stable")][:5]
         named = ", ".join(f"vertex {surface[k]} by {0.0 - gap[k]:.3g} m" for k in deepest)
-        raise ValueError(
-            f"the body starts on or in {self!r}: {named} ({len(inside)} vertices); move the body or the obstacle"
-        )
+        remedy = "move the body or the obstacle"
+        if self.led is not None:
+            remedy = "move the body or the robot, or leave the link out of links= of from_urdf"
+        raise ValueError(f"the body starts on or in {self!r}: {named} ({len(inside)} vertices); {remedy}")
 
     def surface(self, size: float) -> Triangles | None:
         """(points [m], shape (k, 3), triangles that face outwards) to draw, where the obstacle was made; None: not drawn.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
 from diffsim_ti.common import rotations
-from diffsim_ti.common.checked import listed
+from diffsim_ti.common.checked import instance, listed
 from diffsim_ti.inputs import NOT_NEGATIVE, POSITIVE, Input
 from diffsim_ti.inputs.description import Range
 from diffsim_ti.inputs.links import Joined
@@ -48,16 +48,17 @@ class Robot(GivenOverTime, Term):
     M(q_n), the bias b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and arms and normal forces of friction, as
     of every obstacle, are those where the step begins: they change by O(h) within it, which keeps the first order of
     backward Euler. Action is reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
-    In explicit steps joints take substeps of backward Euler, which drives do not limit, and links are obstacles of the
-    contact stage: what vertices do to them turns joints in the same substep, by J M^-1 J^T. Fixed vertices do nothing there.
+    In explicit steps joints take substeps of backward Euler, whose length stiff drives do not limit, and links are obstacles
+    of the contact stage: what vertices do to them turns joints in the same substep, by J M^-1 J^T. Fixed vertices do not
+    stop links there.
     Links touch the body alone: not one another, the ground, or other obstacles. `Simulator.set_state` leaves the joints
     where they are. `compute_energy` and the guard of the energy are those of the body; `LinkEnergy` is that of links.
     Vertices that are `attached` move exactly as their links do, from where they and the joints are as a run starts: they are
-    no unknowns of their own, and the joints feel what acts on them, inertia included. `Reaction` of their set is the force
-    of the link on them, or its moment.
+    no unknowns of their own, and what acts on them acts on the joints, inertia included. `Reaction` of their set is the
+    force of the link on them, or its moment. Give the body `initial_velocities` that go with those of the joints.
     Limits of joints hold by the one-sided potential E_limit = k d^3 / (6 w) of what is beyond them by d < w, 1e-4 of the
     range, and of constant stiffness k = 10^6 M / h^2 beyond: joints stop there without rebound. Limits of effort and
-    velocity in the file have no effect.
+    velocity in the file have no effect; nor have limits of prescribed joints, but where they start.
 
     All inputs have a gradient, by names that begin with the robot's: "positions", "velocities", shape (joints,), where a
     run starts [rad or m, per s]; "torques", (joints,) or (steps, joints) [N m or N]; "targets", of shape (joints,),
@@ -124,6 +125,8 @@ class Robot(GivenOverTime, Term):
         """
         prescribed = tuple(listed("Robot.from_urdf: prescribed", prescribed, "joints by name"))
         links = None if links is None else tuple(listed("Robot.from_urdf: links", links, "links by name"))
+        instance("Robot.from_urdf", "limits", limits, bool, "True or False, their numbers being the file's <limit>")
+        instance("Robot.from_urdf", "attached", attached, (Mapping, type(None)), "{link: vertices}")
         urdf, pose, known = Urdf(path), np.asarray(base, np.float64), LinkContact.__annotations__
         if pose.shape not in ((3,), (6,), (7,)) or not np.isfinite(pose).all():
             raise ValueError(f"Robot.from_urdf: base must be 3, 6 or 7 finite numbers, got {base}")
@@ -246,6 +249,9 @@ class Robot(GivenOverTime, Term):
 
 def each(joints: tuple[str, ...], name: str, given: OfJoints) -> ArrayLike:
     """What is given of joints, in their order."""
+    if any(map(callable, given.values() if isinstance(given, Mapping) else [given])):
+        remedy = ": give a value for each step" if name in ("torques", "targets") else ""
+        raise ValueError(f"Robot.from_urdf: {name} of joints are numbers, not functions{remedy}")
     if isinstance(given, Mapping):
         if given.keys() != set(joints):
             raise ValueError(f"Robot.from_urdf: {name} must name {', '.join(joints)}, got {', '.join(given)}")
