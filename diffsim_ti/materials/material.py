@@ -141,7 +141,7 @@ class Material(metaclass=Public):
         return [Input(name, value, shapes[name], self.unit_of(name)) for name, value in self.values(mesh).items()]
 
     def _is_at_points(self, name: str, number) -> bool:
-        return name in self.at_points and not isinstance(number, Mapping) and np.ndim(number) == 2
+        return name in self.at_points and not isinstance(number, Mapping) and len(shape_of(name, number)) == 2
 
     def links(self) -> list[Link]:
         """From the inputs to what the law's kernels read: the links that write "coefficients"."""

@@ -23,10 +23,10 @@ class MultiPointConstraint(GivenOverTime, Term):
         g = sum_j c_j . u_j - value = 0,
 
     such as equal motion of two places, the mean motion of a face, or a lever, exactly by the forces f_j = p c_j: in implicit
-    steps and statics p is a Lagrange multiplier at the end of each substep (the midpoint rule in the middle of it, so that
-    what does not fit at the start swings about the value), in explicit ones it leads there in each substep (SHAKE) and
-    velocities follow value (RATTLE). With a stiffness implicit steps and statics have the penalty E = stiffness / 2 g^2
-    instead, for vertices that are fixed too, and for `modes`, `load_path` and `refine`.
+    steps and equilibria p is a Lagrange multiplier at the end of each substep (the midpoint rule in the middle of it, so
+    that what does not fit at the start swings about the value), in explicit ones it leads there in each substep (SHAKE) and
+    velocities follow value (RATTLE). With a stiffness implicit steps and equilibria have the penalty
+    E = stiffness / 2 g^2 instead, for vertices that are fixed too, and for `modes`, `load_path` and `refine`.
 
     vertices: a vertex set's name, several, indices or a mask; coefficients c_j [-]: shape (k, 3), in the order of the
         indices, of sets and masks in that of ascending indices.

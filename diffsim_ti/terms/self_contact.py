@@ -59,7 +59,7 @@ class SelfContact(Term):
 
     Raises ValueError for stiffness, width or friction_speed <= 0, friction < 0, names that are no sets, sets of a dict that
     share a vertex, and, when a run starts, for a width beyond four mean edges of the surface, for primitives that touch at
-    rest, and for surfaces that touch or pass through each other, which statics press apart (`StaticSolver`). An explicit
+    rest, and for surfaces that touch or pass through each other, which `StaticSolver` presses apart. An explicit
     substep whose parts cannot be short enough to keep surfaces apart raises Tunnelling.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
