@@ -323,8 +323,8 @@ def test_advice_on_a_number_is_by_its_error_bar_where_it_has_one():
     each = ElementTrials(scene, 0.0, 1, 60.0, None, Quantity(ds.Stress(at="vertices"), np.ones((3, 3))))
     assert not each._by_bars({"quadratic": scene}) and "runs of the finest elements were" in each.notes[0]
     advice = recommend(scene, 0.0, 0.4, gradients=False, output=middle, weights=down, elements=False)
-    assert advice.solver is ds.StaticSolver and advice.error < 1e-6 and "of the change of middle" in str(advice)
-    assert advice.rollout(scene, outputs=middle).forward()["middle"][-1, 0, 2] == pytest.approx(y[-1], rel=1e-6)
+    assert advice.solver is ds.StaticSolver and advice.error < 1e-3 and "of the change of middle" in str(advice)
+    assert advice.rollout(scene, outputs=middle).forward()["middle"][-1, 0, 2] == pytest.approx(y[-1], rel=1e-5)
 
 
 def test_ten_nodes_are_tried_on_half_the_cells():
