@@ -305,6 +305,10 @@ FOLLOWED = {
         lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0)]), 1, outputs=ds.Length("rope")),
         lambda: ds.Rollout(verlet(terms=[ds.Spring(0, 1, 9.0, name="rope")]), 1, outputs=ds.Length("rope")),
     ),
+    ("mechanics/constraints.py", "give it a stiffness="): (
+        lambda: ds.StaticSolver(scene(terms=[ds.MultiPointConstraint([0], [[1, 0, 0]])], fixed="xmin")),
+        lambda: ds.StaticSolver(scene(terms=[ds.MultiPointConstraint([0], [[1, 0, 0]], stiffness=1e9)], fixed="xmin")),
+    ),
     ("outputs/modes.py", "give it a stiffness="): (
         lambda: ds.modes(scene(terms=[ds.MultiPointConstraint([7], [[1, 0, 0]])], fixed="xmin"), 1),
         lambda: ds.modes(scene(terms=[ds.MultiPointConstraint([7], [[1, 0, 0]], stiffness=1e11)], fixed="xmin"), 1),
