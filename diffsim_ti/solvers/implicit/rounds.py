@@ -31,7 +31,7 @@ class Rounds:
     """
 
     small, many = 300, 200  # vertices up to which a solve on one thread is one kernel; phases in a launch of it
-    short = 600  # variables of a law's longest kernel up to which one kernel of all compiles soon
+    short = 800  # variables of a law's longest kernel up to which one kernel of all compiles soon
     most_rounds = 64  # before the host looks at their residuals
 
     def __init__(self, newton, preconditioner):
