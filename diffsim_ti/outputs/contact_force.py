@@ -6,8 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.output import Frames, Output, force_or_moment
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Term
 
@@ -81,31 +80,6 @@ class ContactForce(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames, self.num_vertices, 3) if self.per_vertex else (num_frames, 3)
 
-    def _of(self, forces: np.ndarray) -> np.ndarray:
-        """On each vertex that counts."""
-        return forces[:, self.place, self.sides].sum(1)[:, self.vertices]
-
     def value(self, frames: Frames) -> np.ndarray:
-        f = self._of(frames.contact_forces)
-        if self.about is not None:
-            return moments(frames.positions[:, self.vertices], self.about, f)
-        return f if self.per_vertex else f.sum(1)
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        x, dx = frames.positions[:, self.vertices], change.positions
-        df = np.zeros(x.shape) if change.contact_forces is None else self._of(change.contact_forces)
-        if self.about is not None:
-            dx = None if dx is None else dx[:, self.vertices]
-            return moments_jvp(x, self.about, self._of(frames.contact_forces), dx, df)
-        return df if self.per_vertex else df.sum(1)
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        by_forces, positions = np.zeros(frames.contact_forces.shape), None
-        by_vertex = np.zeros(frames.positions.shape)
-        by_vertex[:, self.vertices] = seed if self.per_vertex else seed[:, None]
-        if self.about is not None:
-            positions, x = np.zeros(by_vertex.shape), frames.positions[:, self.vertices]
-            own = moments_vjp(x, self.about, self._of(frames.contact_forces), seed)
-            positions[:, self.vertices], by_vertex[:, self.vertices] = own
-        by_forces[:, self.place, self.sides] = by_vertex[:, None]
-        return Change(positions=positions, contact_forces=by_forces)
+        forces = frames.contact_forces[:, self.place, self.sides].sum(1)[:, self.vertices]
+        return forces if self.per_vertex else force_or_moment(forces, frames.positions[:, self.vertices], self.about)
