@@ -166,7 +166,7 @@ def forward(y, changes: Iterable[tuple[Node, object]]):
             total = sum(terms[1:], terms[0]) if terms else None
             known[id(node)] = np.broadcast_to(total, node.shape) if terms and isinstance(node, Recorded) else total
     change = known.get(id(y))
-    return np.zeros(np.shape(value_of(y))) if change is None else change
+    return np.zeros(np.shape(value_of(y))) if change is None else np.array(change)
 
 
 def reverse(y, seed, leaves: Iterable[Node]) -> list:
@@ -193,7 +193,7 @@ def _add(known: dict, node: Node, more) -> None:
     if callable(more):
         more(into)
     else:
-        known[id(node)] = into + more
+        into += more
 
 
 def _unspread(x: np.ndarray, shape: tuple) -> np.ndarray:
@@ -304,6 +304,7 @@ PARTIALS = {
     np.multiply: (lambda y, a, b: b, lambda y, a, b: a),
     np.divide: (lambda y, a, b: 1 / b, lambda y, a, b: -y / b),
     np.power: (lambda y, a, n: n * a ** (n - 1), lambda y, a, n: y * np.log(a)),
+    np.arctan2: (lambda y, a, b: b / (a * a + b * b), lambda y, a, b: -a / (a * a + b * b)),
     np.maximum: (lambda y, a, b: (a >= b) * 1.0, lambda y, a, b: (a < b) * 1.0),
     np.negative: (lambda y, a: -1.0,),
     np.absolute: (lambda y, a: np.sign(a),),
@@ -325,6 +326,7 @@ FUNCTIONS = {
     np.clip: lambda x, low, high: _where((x > low) & (x < high), x, np.clip(x.value, low, high)),
     np.linalg.norm: lambda x, axis=None, keepdims=False: np.sqrt((x * x).sum(axis, keepdims)),
     np.linalg.inv: _inv,
+    np.linalg.solve: lambda A, b: np.linalg.inv(A) @ b,
     np.linalg.det: _det,
     np.linalg.eigvalsh: _eigvalsh,
 }

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Analytic, Linear, Link
+from diffsim_ti.differentiation.arrays import summed_at
+from diffsim_ti.inputs.chain import Linear, Link, Recording
 from diffsim_ti.inputs.loads import _Together
 from diffsim_ti.mesh.face_points import face_points
 from diffsim_ti.mesh.paths import Paths
@@ -136,7 +137,7 @@ def directions(segments: np.ndarray) -> np.ndarray:
     return np.divide(segments, lengths, out=np.zeros_like(segments), where=lengths > 0)
 
 
-class FoundationStiffness(Analytic, Link):
+class FoundationStiffness(Recording, Link):
     """K_i [N/m] of each of some vertices, shape (k, 3, 3): the sum over the triangles around of
 
         A / 3 [t I + (c - t) N N^T]
@@ -150,46 +151,12 @@ class FoundationStiffness(Analytic, Link):
         self.points, self.count = face_points(faces), len(vertices)
         self.nodes = np.searchsorted(vertices, faces)
 
-    def _to_vertices(self, of_each):
-        out, by_nodes = np.zeros((self.count, 3, 3), of_each.dtype), self.points.to_nodes(of_each)
-        for a in range(self.nodes.shape[1]):
-            np.add.at(out, self.nodes[:, a], by_nodes[:, a])
-        return out
-
-    def _at_points(self, x):
-        """Of each point what its face has."""
-        return np.repeat(x, self.points.points) if x.ndim else x
-
-    def _of_faces(self, by_points, x):
-        """Adjoint of what faces have, or all of them."""
-        return by_points.reshape(-1, self.points.points).sum(1) if x.ndim else by_points.sum()
-
-    @staticmethod
-    def _parts(n):
-        """(A, n n^T / A) of normals as long as the area."""
-        A = np.sqrt((n * n).sum(1))[:, None, None]
-        return A, n[:, :, None] * n[:, None, :] / A
-
     def value(self, X, c, t):
-        c, t = (self._at_points(x)[..., None, None] for x in (c, t))
-        A, across = self._parts(self.points.normals(X))
-        return (self._to_vertices(t * A * np.eye(3) + (c - t) * across),)
-
-    def vjp(self, x, y_adj):
-        X, c, t = x
-        Y = self.points.from_nodes(y_adj[0][self.nodes])
+        c, t = (np.repeat(x, self.points.points)[:, None, None] if x.ndim else x for x in (c, t))
         n = self.points.normals(X)
-        A, across = self._parts(n)
-        trace, along = np.trace(Y, axis1=1, axis2=2), (Y * across).sum((1, 2))
-        by_c, by_t = along, A[:, 0, 0] * trace - along
-        soft = self._at_points(t)
-        by_across = self._at_points(c) - soft
-        by_across = by_across[..., None] if by_across.ndim else by_across
-        twice = np.einsum("tij,tj->ti", Y + np.swapaxes(Y, 1, 2), n)
-        size = A[:, :, 0]
-        n_adj = by_across * (twice / size - along[:, None] * n / size**2)
-        n_adj += (soft[..., None] if soft.ndim else soft) * trace[:, None] * n / size
-        return self.points.normals_vjp(X, n_adj), self._of_faces(by_c, c), self._of_faces(by_t, t)
+        A = np.sqrt((n * n).sum(1))[:, None, None]
+        of_each = self.points.to_nodes(t * A * np.eye(3) + (c - t) * (n[:, :, None] * n[:, None, :] / A))
+        return (summed_at(self.nodes.T, np.moveaxis(of_each, 1, 0), self.count),)
 
 
 class FoundationRows(Linear, Link):

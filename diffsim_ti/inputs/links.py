@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Analytic, Linear, Link
+from diffsim_ti.inputs.chain import Linear, Link, Recording
 from diffsim_ti.inputs.loads import VertexShares
 
 
@@ -48,7 +48,7 @@ class Same(Link):
         return y_adj
 
 
-class PerStep(Link):
+class PerStep(Recording, Link):
     """What holds during each step, as a list: what is given for all steps is a list of one."""
 
     def __init__(self, reads: str, writes: str, ndim: int):
@@ -57,14 +57,8 @@ class PerStep(Link):
     def value(self, x):
         return (x[None] if x.ndim < self.ndim else x,)
 
-    def jvp(self, x, dx):
-        return self.value(np.array(dx[0]))
 
-    def vjp(self, x, y_adj):
-        return (y_adj[0][0] if x[0].ndim < self.ndim else y_adj[0],)
-
-
-class NearestPoint(Analytic, Link):
+class NearestPoint(Recording, Link):
     """The point of a plane that is nearest to o, of any of its points p and a normal n of any length:
 
     q = o + s n,    s = n . (p - o) / n . n
@@ -76,13 +70,8 @@ class NearestPoint(Analytic, Link):
     def value(self, p, n):
         return (self.near + n * (n @ (p - self.near)) / (n @ n),)
 
-    def vjp(self, x, y_adj):
-        (p, n), (q_adj,) = x, y_adj
-        s, along = n @ (p - self.near) / (n @ n), (q_adj @ n) / (n @ n)
-        return along * n, s * q_adj + along * (p - self.near - 2 * s * n)
 
-
-class Joined(Linear, Link):
+class Joined(Recording, Link):
     """The numbers of several inputs in one row, or, with the `tail` of their shapes, rows of such a shape."""
 
     def __init__(self, reads: Sequence[str], writes: str, tail: tuple = ()):
@@ -90,10 +79,6 @@ class Joined(Linear, Link):
 
     def value(self, *x):
         return (np.concatenate([part.reshape(-1, *self.tail) for part in x]),)
-
-    def vjp(self, x, y_adj):
-        ends = np.cumsum([part.size for part in x])[:-1] // int(np.prod(self.tail))
-        return [row.reshape(part.shape) for row, part in zip(np.split(y_adj[0], ends), x)]
 
 
 class Placed(Link):
