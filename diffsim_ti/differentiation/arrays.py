@@ -147,6 +147,12 @@ def summed_at(places: np.ndarray, x, count: int):
     return linear(x, add, lambda seed: seed[places])
 
 
+def replaced(x, places: np.ndarray, rows):
+    """x with other rows in some places."""
+    chosen = np.isin(np.arange(len(x)), places).reshape(-1, *[1] * (np.ndim(x) - 1))
+    return np.where(chosen, summed_at(places, rows, len(x)), x)
+
+
 def ratio(a, b):
     """a / b, 0 where b is not above zero."""
     positive = value_of(b) > 0

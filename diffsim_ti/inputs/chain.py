@@ -35,24 +35,6 @@ class Link(ABC):
         """Adjoints of x, f'(x)^T y_adj, each of its x's shape."""
 
 
-class Linear:
-    """The part of a link whose change is its value of the changes."""
-
-    def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
-        return self.value(*dx)
-
-
-class Analytic:
-    """The part of a link whose value takes complex numbers too: its change is that of a step into the complex plane, exact
-    to round-off.
-
-    Squire, Trapp 1998, Using complex variables to estimate derivatives of real functions, doi:10.1137/S003614459631241X.
-    """
-
-    def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
-        return [y.imag / 1e-30 for y in self.value(*(part + 1e-30j * change for part, change in zip(x, dx)))]
-
-
 class Recording:
     """The part of a link of one array whose value takes arrays that record, from which its derivatives are found
     (differentiation/arrays.py)."""

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import summed_at
-from diffsim_ti.inputs.chain import Linear, Link, Recording
+from diffsim_ti.differentiation.arrays import summed_at, value_of, with_slopes
+from diffsim_ti.inputs.chain import Link, Recording
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.face_points import face_points
 
@@ -82,63 +82,38 @@ class Spread(Recording, Link):
         return (vectors[:, :, None] * weights[:, None],)
 
 
-class _Together(Linear, Link):
-    """Several loads in time, each of shape (2, rows, ...); those of one row hold in all steps."""
-
-    def __init__(self, reads: Sequence[str], writes: str):
-        self.reads, self.writes = tuple(reads), (writes,)
-
-    @staticmethod
-    def rows(x) -> int:
-        """The steps that all are given for, 1 if all are constant."""
-        return min((part.shape[1] for part in x if part.shape[1] > 1), default=1)
-
-    @staticmethod
-    def _pulled(part: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
-        """The adjoint of one of them, from that of its share in all rows."""
-        if part.shape[1] == 1:
-            return adjoint.sum(1, keepdims=True)
-        out = np.zeros_like(part)
-        out[:, : adjoint.shape[1]] = adjoint
-        return out
+def rows_of(x: Sequence[np.ndarray]) -> int:
+    """The steps that loads in time, each of shape (2, rows, ...), are given for; those of one row hold in all steps."""
+    return min((part.shape[1] for part in x if part.shape[1] > 1), default=1)
 
 
-class SumOfForces(_Together):
+class SumOfForces(Recording, Link):
     """Forces [N] of all dead loads, shape (rows, k, 3) for the k vertices that any of them acts on; with `keyed`, where some
     change within steps, (rows, 2 k, 3): at the beginning of each step in even columns, at its end in odd ones."""
 
     def __init__(self, reads: Sequence[str], vertices: Sequence[np.ndarray], keyed: bool, writes: str):
-        super().__init__(reads, writes)
+        self.reads, self.writes = tuple(reads), (writes,)
         self.vertices = np.unique(np.concatenate(vertices))
         self.columns, self.keyed = [np.searchsorted(self.vertices, own) for own in vertices], keyed
 
     def value(self, *x):
-        rows, k = self.rows(x), len(self.vertices)
-        out = np.zeros((2, rows, k, 3))
+        rows, k = rows_of(x), len(self.vertices)
+        out = np.zeros((k, 2, rows, 3))
         for columns, part in zip(self.columns, x):
-            out[:, :, columns] += part[:, :rows]
-        return (np.moveaxis(out, 0, 2).reshape(rows, 2 * k, 3) if self.keyed else out[0],)
-
-    def vjp(self, x, y_adj):
-        if self.keyed:
-            adjoint = np.stack([y_adj[0][:, 0::2], y_adj[0][:, 1::2]])
-        else:
-            adjoint = np.stack([y_adj[0], np.zeros_like(y_adj[0])])
-        return [self._pulled(part, adjoint[:, :, columns]) for columns, part in zip(self.columns, x)]
+            out = out + summed_at(columns, np.moveaxis(part[:, :rows], 2, 0), k)
+        return (np.moveaxis(out, 2, 0).reshape(rows, 2 * k, 3) if self.keyed else np.moveaxis(out[:, 0], 1, 0).copy(),)
 
 
-class PressureRows(_Together):
+class PressureRows(Recording, Link):
     """Pressures [Pa] of all loads, then numbers of chambers, shape (rows, k, 3): as each step begins, as it ends, zero."""
 
-    def value(self, *x):
-        rows = self.rows(x)
-        out = np.zeros((rows, len(x), 3))
-        for k, part in enumerate(x):
-            out[:, k, :2] = part[:, :rows].T
-        return (out,)
+    def __init__(self, reads: Sequence[str], writes: str):
+        self.reads, self.writes = tuple(reads), (writes,)
 
-    def vjp(self, x, y_adj):
-        return [self._pulled(part, y_adj[0][:, k, :2].T) for k, part in enumerate(x)]
+    def value(self, *x):
+        rows = rows_of(x)
+        parts = [np.broadcast_to(part[:, :rows], (2, rows)).T for part in x]
+        return (np.stack([np.concatenate([part, np.zeros((rows, 1))], 1) for part in parts], 1),)
 
 
 class RemoteForces(Recording, Link):
@@ -162,39 +137,29 @@ class RemoteForces(Recording, Link):
         return (a[:, None] * (F[..., None, :] / A + np.cross(omega[..., None, :], r)),)
 
 
-class GrowthRows(_Together):
+class GrowthRows(Recording, Link):
     """Sum of all growths in time, shape (rows, 2, m): as each step begins and ends, of each tetrahedron, or m = 1 where all
     grow alike. Each part has shape (2, rows) or (2, rows, groups); chosen: its tetrahedra, None for all; group: which
     number each of these has."""
 
+    writes = ("growths",)
+
     def __init__(self, reads: Sequence[str], chosen: Sequence, group: Sequence, num_tetrahedra: int):
-        super().__init__(reads, "growths")
-        self.chosen, self.group = chosen, group
+        self.reads, self.chosen, self.group = tuple(reads), chosen, group
         self.count = 1 if all(own is None for own in chosen) else num_tetrahedra
 
     def value(self, *x):
-        rows = self.rows(x)
-        out = np.zeros((rows, 2, self.count))
+        rows = rows_of(x)
+        out = np.zeros((self.count, rows, 2))
         for part, chosen, group in zip(x, self.chosen, self.group):
-            by_time = np.moveaxis(part[:, :rows], 0, 1)
-            spread = by_time[..., None] if part.ndim == 2 else by_time[..., group]
-            out[..., slice(None) if chosen is None else chosen] += spread
-        return (out,)
-
-    def vjp(self, x, y_adj):
-        out = []
-        for part, chosen, group in zip(x, self.chosen, self.group):
-            own = np.moveaxis(y_adj[0][..., slice(None) if chosen is None else chosen], 1, 0)
-            if part.ndim == 2:
-                out.append(self._pulled(part, own.sum(-1)))
-                continue
-            by_group = np.zeros((part.shape[2], *own.shape[:2]))
-            np.add.at(by_group, group, np.moveaxis(own, -1, 0))
-            out.append(self._pulled(part, np.moveaxis(by_group, 0, -1)))
-        return out
+            chosen = np.arange(self.count) if chosen is None else chosen
+            by_time = np.swapaxes(part[:, :rows], 0, 1)
+            spread = by_time[None] if part.ndim == 2 else np.moveaxis(by_time[..., group], 2, 0)
+            out = out + summed_at(chosen, np.broadcast_to(spread, (len(chosen), *spread.shape[1:])), self.count)
+        return (np.moveaxis(out, 0, 2).copy(),)
 
 
-class RestVolume(Link):
+class RestVolume(Recording, Link):
     """Of rest positions the volume [m^3] of a chamber."""
 
     reads = ("rest",)
@@ -203,13 +168,8 @@ class RestVolume(Link):
         self.enclosure, self.writes = enclosure, (writes,)
 
     def value(self, X):
-        return (self.enclosure.volume(X),)
-
-    def jvp(self, x, dx):
-        return ((self.enclosure.gradient(x[0]) * dx[0]).sum(),)
-
-    def vjp(self, x, y_adj):
-        return (self.enclosure.gradient(x[0]) * y_adj[0],)
+        places = value_of(X)
+        return (with_slopes(self.enclosure.volume(places), (X, lambda: self.enclosure.gradient(places))),)
 
 
 class MuscleTension(Recording, Link):
