@@ -103,6 +103,11 @@ def value_of(x):
     return x.value if isinstance(x, Node) else x
 
 
+def as_array(x):
+    """A float64 array, or the one that records."""
+    return x if isinstance(x, Node) else np.asarray(x, np.float64)
+
+
 def made(value, *parents):
     """A value made of arrays, with parents as of `Node`; of those that do not record it has no derivatives."""
     own = [parent for parent in parents if isinstance(parent[0], Node)]

@@ -5,6 +5,8 @@ nearest to A = sum y D^T = R S (polar decomposition), which is that of the least
 doi:10.1107/S0567739476001873). Of velocities v: v' = mean v + omega x R D, I omega = sum R D x v, likewise.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from diffsim_ti.differentiation.arrays import linear, made, replaced, value_of
@@ -26,20 +28,29 @@ def inertia(y: np.ndarray) -> np.ndarray:
     return (y * y).sum() * np.eye(3) - y.T @ y
 
 
-def nearest(y: np.ndarray, D: np.ndarray) -> np.ndarray:
-    """The rotation R nearest to A = sum y D^T. It changes by R [delta]x, where (tr S - S) delta is the axial vector of
-    R^T dA."""
-    A = y.T @ D
-    U, s, Vt = np.linalg.svd(value_of(A))
-    s[-1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt)) or 1.0
-    R = U @ np.diag([1, 1, np.sign(s[-1]) or 1.0]) @ Vt
-    S = R.T @ value_of(A)
-    lever = np.trace(S) * np.eye(3) - 0.5 * (S + S.T)
+@dataclass
+class Nearest:
+    """The rotation R nearest to sum y D^T, and its derivatives."""
 
-    def turn(dA):
-        return R @ cross_matrix(np.linalg.solve(lever, axial(R.T @ dA)))
+    y: np.ndarray
+    D: np.ndarray
 
-    return made(R, (A, turn, turn))
+    def __post_init__(self):
+        U, s, Vt = np.linalg.svd(self.y.T @ self.D)
+        s[-1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt)) or 1.0
+        self.R = U @ np.diag([1, 1, np.sign(s[-1]) or 1.0]) @ Vt
+        S = self.R.T @ (self.y.T @ self.D)
+        # R changes by R [delta]x, where (tr S - S) delta is the axial vector of R^T dA
+        self._lever = np.trace(S) * np.eye(3) - 0.5 * (S + S.T)
+
+    def jvp(self, dy: np.ndarray, dD: np.ndarray) -> np.ndarray:
+        dA = dy.T @ self.D + self.y.T @ dD
+        return self.R @ cross_matrix(np.linalg.solve(self._lever, axial(self.R.T @ dA)))
+
+    def vjp(self, R_adj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of y and D."""
+        A_adj = self.R @ cross_matrix(np.linalg.solve(self._lever, axial(self.R.T @ R_adj)))
+        return self.D @ A_adj.T, self.y @ A_adj
 
 
 class Displacement(Recording, Link):
@@ -54,8 +65,11 @@ class Displacement(Recording, Link):
     def value(self, x, X):
         out = linear(x - X, self.of, self.of)
         for body in self.bodies:
-            at, D = body.vertices, body.apart(X)
-            moved = x[at].mean(0) - X[at].mean(0) + D @ (nearest(body.apart(x), D).T - np.eye(3))
+            at, y, D = body.vertices, body.apart(x), body.apart(X)
+            near, none = Nearest(value_of(y), value_of(D)), np.zeros((len(at), 3))
+            by_y = y, lambda dy, near=near: near.jvp(dy, none), lambda seed, near=near: near.vjp(seed)[0]
+            by_D = D, lambda dD, near=near: near.jvp(none, dD), lambda seed, near=near: near.vjp(seed)[1]
+            moved = x[at].mean(0) - X[at].mean(0) + D @ (made(near.R, by_y, by_D).T - np.eye(3))
             out = replaced(out, at, moved)
         return (out,)
 
