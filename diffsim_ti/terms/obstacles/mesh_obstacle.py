@@ -194,17 +194,7 @@ class MeshPrimitives(Primitives):
 
     def at(self, p):
         vertices = p[4:].reshape(-1, 3)[self.own] if len(p) > 4 else self.vertices
-        return vertices + p[:3], float(p[3])
-
-    def jvp(self, p, dp):
-        moved = dp[4:].reshape(-1, 3)[self.own] if len(p) > 4 else np.zeros_like(self.vertices)
-        return moved + dp[:3], float(dp[3])
-
-    def vjp(self, p, by_corners, by_radius):
-        by_vertices = np.zeros((len(p[4:]) // 3, 3))
-        if len(p) > 4:
-            by_vertices[self.own] = by_corners
-        return np.concatenate([by_corners.sum(0), [by_radius], by_vertices.ravel()])
+        return vertices + p[:3], p[3]
 
 
 @dataclass(frozen=True)
