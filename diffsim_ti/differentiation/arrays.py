@@ -32,7 +32,9 @@ class Recorded(Node, NDArrayOperatorsMixin):
     T = property(lambda self: linear(self, np.transpose, np.transpose))
 
     def __array__(self, *_, **__):
-        raise TypeError("an array whose derivatives are asked for cannot be made a plain one: leave np.array out, or write jvp and vjp")
+        raise TypeError(
+            "an array whose derivatives are asked for cannot be made a plain one: leave np.array out, or write jvp and vjp"
+        )
 
     def __array_ufunc__(self, ufunc, method, *x, **how):
         if ufunc is np.matmul:

@@ -29,13 +29,10 @@ class ChamberPressure(Output):
     doi:10.1017/CBO9780511755446.
     """
 
-    reads_chamber_pressures = True
+    reads_chamber_pressures, _shown = True, ("chamber",)
 
     def __init__(self, chamber: Chamber | str, name: str = "chamber_pressure"):
         self.chamber, self.name = chamber, name
-
-    def __repr__(self) -> str:
-        return f"ChamberPressure({self.chamber!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "ChamberPressure":
         out = copy(self)

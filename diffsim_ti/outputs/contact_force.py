@@ -38,7 +38,7 @@ class ContactForce(Output):
     Wriggers, Computational Contact Mechanics, 2nd ed., 2006, sec. 5 and 8, doi:10.1007/978-3-540-32609-0.
     """
 
-    reads_contact_forces, unit = True, "N"
+    reads_contact_forces, unit, _shown = True, "N", ("obstacle", "part")
 
     def __init__(
         self,
@@ -61,9 +61,6 @@ class ContactForce(Output):
         self.about = None if about is None else np.array(about, np.float64)
         if self.about is not None and (self.about.shape != (3,) or not np.all(np.isfinite(self.about))):
             raise ValueError(f"{said}: about must be 3 finite numbers [m], got {about!r}")
-
-    def __repr__(self) -> str:
-        return f"ContactForce({self.obstacle!r}, {self.part!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "ContactForce":
         out = copy(self)

@@ -22,13 +22,10 @@ class JointPositions(Output):
     Raises ValueError, when a Rollout is made, for a robot that the scene has not.
     """
 
-    reads_joint_states, column = True, 0
+    reads_joint_states, _shown, column = True, ("robot",), 0
 
     def __init__(self, robot: Robot | str = "robot", name: str = "joint_positions"):
         self.robot, self.name = robot, name
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.robot!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "JointPositions":
         out, robots = copy(self), scene.terms_of(Robot)
@@ -107,9 +104,9 @@ class LinkMotion(JointPositions):
         return turn if turn[0] >= 0 else -turn, t, J, v, bent
 
     def value(self, frames: Frames) -> np.ndarray:
-        return np.stack([self._shown(states[self.own, :2]) for states in frames.joint_states])
+        return np.stack([self._motion(states[self.own, :2]) for states in frames.joint_states])
 
-    def _shown(self, states: np.ndarray) -> np.ndarray:
+    def _motion(self, states: np.ndarray) -> np.ndarray:
         turn, t, J, v, bent = self._stand(*value_of(states).T)
 
         def push(change):

@@ -211,6 +211,7 @@ class Output(metaclass=Public):
     """
 
     name: str
+    _shown: tuple[str, ...] = ()  # arguments that `repr` shows, beside the name
     unit = ""  # for pictures
     linear = False  # whether it is linear in positions and velocities
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
@@ -219,6 +220,10 @@ class Output(metaclass=Public):
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
     reads_law_state = False  # the same of frames.law_state, where the law remembers
     reads_joint_states = False  # whether it reads frames.joint_states, which runs of robots note
+
+    def __repr__(self) -> str:
+        given = [repr(getattr(self, argument)) for argument in self._shown]
+        return f"{type(self).__name__}({', '.join([*given, f'name={self.name!r}'])})"
 
     @staticmethod
     def refuse_growth(output: str, scene: Scene) -> None:
@@ -265,25 +270,26 @@ class Output(metaclass=Public):
         at = _Recording(frames)
         return at.adjoint(self.value(at), seed)
 
-    def taken_from(self, frames: Frames) -> np.ndarray:
-        """y for another output, also where this one has derivatives of its own."""
-        if not isinstance(frames, _Recording) or type(self).vjp is Output.vjp:
-            return self.value(frames)
-        plain, leaves, found = frames.frames, frames.leaves, []
 
-        def push(name):
-            return lambda change: self.jvp(plain, Change(**{name: change}))
+def taken_from(output: Output, frames: "Frames | _Recording") -> np.ndarray:
+    """The value of an output for another one, also where it has derivatives of its own."""
+    if not isinstance(frames, _Recording) or type(output).vjp is Output.vjp:
+        return output.value(frames)
+    plain, found = frames.frames, []
 
-        def pull(name):
-            return lambda seed: getattr(adjoint(seed), name)
+    def push(name):
+        return lambda change: output.jvp(plain, Change(**{name: change}))
 
-        def adjoint(seed):  # asked for once for each leaf
-            found.extend(() if found else [self.vjp(plain, seed)])
-            return found[0]
+    def pull(name):
+        return lambda seed: getattr(adjoint(seed), name)
 
-        states = [(leaf, push(name), pull(name)) for name, leaf in leaves.items()]
-        by_inputs = lambda seed: lambda into: _add_to(into, adjoint(seed).inputs)  # noqa: E731
-        return made(self.value(plain), *states, (frames.numbers, push("inputs"), by_inputs))
+    def adjoint(seed):  # asked for once for each leaf
+        found.extend(() if found else [output.vjp(plain, seed)])
+        return found[0]
+
+    states = [(leaf, push(name), pull(name)) for name, leaf in frames.leaves.items()]
+    by_inputs = lambda seed: lambda into: _add_to(into, adjoint(seed).inputs)  # noqa: E731
+    return made(output.value(plain), *states, (frames.numbers, push("inputs"), by_inputs))
 
 
 def force_or_moment(forces: np.ndarray, places: np.ndarray, about: np.ndarray | None) -> np.ndarray:

@@ -98,15 +98,10 @@ class CenterOfMass(Output):
     [2.5, 0.5, 0.5]
     """
 
-    unit = "m"
-
-    linear = True
+    unit, linear, _shown = "m", True, ("of",)
 
     def __init__(self, of: str | ArrayLike | None = None, name: str = "center_of_mass"):
         self.of, self.name = of, name
-
-    def __repr__(self) -> str:
-        return f"CenterOfMass({self.of!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "CenterOfMass":
         out, mesh = copy(self), scene.mesh

@@ -10,7 +10,7 @@ from diffsim_ti.differentiation.arrays import summed_at
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import displacement_gradients
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads, BodyForces
-from diffsim_ti.outputs.output import Change, Frames, Output, derived, force_or_moment
+from diffsim_ti.outputs.output import Change, Frames, Output, derived, force_or_moment, taken_from
 from diffsim_ti.outputs.tensors import Stress
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Robot, Tie
@@ -49,7 +49,7 @@ class Reaction(Output):
     9810.000 N
     """
 
-    unit, reads_chamber_pressures, reads_law_state = "N", True, True
+    unit, reads_chamber_pressures, reads_law_state, _shown = "N", True, True, ("support",)
 
     def __init__(
         self,
@@ -64,9 +64,6 @@ class Reaction(Output):
         self.about = None if about is None else numbers("Reaction: about [m]", about)
         if self.about is not None and (self.about.shape != (3,) or not np.all(np.isfinite(self.about))):
             raise ValueError(f"Reaction: about must be 3 finite numbers [m], got {about!r}")
-
-    def __repr__(self) -> str:
-        return f"Reaction({self.support!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "Reaction":
         out = copy(self)
@@ -96,7 +93,7 @@ class Reaction(Output):
         return (num_frames, len(self.vertices), 3) if self.per_vertex else (num_frames, 3)
 
     def value(self, frames: Frames) -> np.ndarray:
-        held = self.held.taken_from(frames)
+        held = taken_from(self.held, frames)
         return held if self.per_vertex else force_or_moment(held, frames.positions[:, self.vertices], self.about)
 
 

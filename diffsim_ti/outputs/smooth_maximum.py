@@ -7,7 +7,7 @@ import numpy as np
 
 from diffsim_ti.common.checked import number
 from diffsim_ti.differentiation.arrays import value_of, with_slopes
-from diffsim_ti.outputs.output import NOTED, Frames, Output
+from diffsim_ti.outputs.output import NOTED, Frames, Output, taken_from
 from diffsim_ti.scene import Scene
 
 
@@ -69,7 +69,7 @@ class SmoothMaximum(Output):
         return (num_frames,)
 
     def value(self, frames: Frames) -> np.ndarray:
-        given = self.of.taken_from(frames)
+        given = taken_from(self.of, frames)
         shape, y, p = np.shape(given), value_of(given).reshape(len(given), -1), self.sharpness
         if self.kind == "ks":
             most = y.max(1, keepdims=True)
