@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import made, ratio, value_of
+from diffsim_ti.differentiation.arrays import ratio
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.outputs.contact_force import ContactForce
 from diffsim_ti.outputs.output import Frames, Output
@@ -79,15 +79,9 @@ class ContactSlip(Output):
         k = np.clip(frames.steps, 1, len(frames.inputs[self.path]) - 1)
         mean = np.diff(frames.times, prepend=0.0) / np.maximum(np.diff(frames.steps, prepend=0), 1)
         dt = np.where(mean > 0, mean, 1.0)[:, None]
-        columns = self._columns(frames.inputs[self.path])
+        (columns,) = PoseColumns([self.path], "path").value(frames.inputs[self.path])
         u = (columns[k, 0] - columns[k - 1, 0]) / dt
         if self.about is None:
             return v - u[:, None]
         c, w = columns[k, 0] + frames.inputs[self.about], columns[k - 1, 2] / dt
         return v - u[:, None] - np.cross(w[:, None], x - c[:, None])
-
-    def _columns(self, rows: np.ndarray) -> np.ndarray:
-        """Displacements, and of a pose rotations and how these go on, of the path's rows."""
-        link, plain = PoseColumns([self.path], "path"), value_of(rows)
-        by_rows = lambda drows: link.jvp([plain], [drows])[0]  # noqa: E731
-        return made(link.value(plain)[0], (rows, by_rows, lambda seed: link.vjp([plain], [seed])[0]))
