@@ -268,12 +268,14 @@ def _cross(a, b):
 
 
 def _einsum(letters: str, *x, optimize=False):
-    plain, (words, out) = [value_of(a) for a in x], letters.split("->")
+    plain = [value_of(a) for a in x]
+    further = [np.ndim(a) - len(word) + 3 for a, word in zip(plain, letters.split("->")[0].split(",")) if "..." in word]
+    words, out = letters.replace("...", "ABCDEF"[: max(further, default=0)]).split("->")
     words = words.split(",")
 
     def parent(k):
         others, own = words[:k] + words[k + 1 :], plain[:k] + plain[k + 1 :]
-        kept = "".join(letter for letter in words[k] if letter == "." or letter in "".join((out, *others)))
+        kept = "".join(letter for letter in words[k] if letter in "".join((out, *others)))
 
         def pull(seed):
             found = np.einsum(f"{','.join((out, *others))}->{kept}", seed, *own, optimize=optimize)
