@@ -61,10 +61,14 @@ def with_state(p: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 def stress_of(law: LawOnArrays, H: np.ndarray, p: np.ndarray) -> np.ndarray:
     """P [Pa], shape (m, 3, 3)."""
-    h, q = value_of(H), value_of(p)
-    by_H = H, lambda dH: law.jvp(h, dH, q, 0 * q), lambda seed: law.vjp(h, seed, q)[0]
-    by_p = p, lambda dp: law.jvp(h, 0 * h, q, dp), lambda seed: law.vjp(h, seed, q)[1]
-    return made(law.stress(h, q), by_H, by_p)
+    h, q, both = value_of(H), value_of(p), np.concatenate([H.reshape(-1, 9), p], 1)
+
+    def pull(seed):
+        by_H, by_p = law.vjp(h, seed, q)
+        return np.concatenate([by_H.reshape(-1, 9), by_p], 1)
+
+    push = lambda change: law.jvp(h, change[:, :9].reshape(h.shape), q, change[:, 9:])  # noqa: E731
+    return made(law.stress(h, q), (both, push, pull))
 
 
 def patch_pressure(scene, derived, H: np.ndarray) -> tuple[np.ndarray, ...]:
