@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import diffsim_ti as ds
+from diffsim_ti.differentiation.arrays import Recorded, forward
 from diffsim_ti.materials.evaluate import evaluate
 
 SPRUCE = dict(E1=11.0, E2=0.9, E3=0.5, nu12=0.4, nu23=0.5, nu13=0.35, G12=0.7, G23=0.04, G13=0.6)  # GPa
@@ -66,11 +67,9 @@ def test_moduli_bound_every_strain_and_have_derivatives(constants):
     assert 0.95 < share.max() < 1 + 1e-4
     along = {name: rng.standard_normal(np.shape(x)) * x for name, x in values.items()}
     there = [material.lame({name: x + s * along[name] for name, x in values.items()}) for s in (1e-6, -1e-6)]
-    change = material.lame_jvp(values, along)
+    leaves = {name: Recorded(x) for name, x in values.items()}
+    change = [forward(part, ((leaves[name], along[name]) for name in leaves)) for part in material.lame(leaves)]
     np.testing.assert_allclose(change, (np.array(there[0]) - there[1]) / 2e-6, rtol=1e-7)
-    back = material.lame_vjp(values, np.array(0.7), np.array(-0.2))
-    found = sum(np.sum(back[name] * along[name]) for name in back)
-    assert found == pytest.approx(0.7 * change[0] - 0.2 * change[1], rel=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -11,6 +11,7 @@ from test_gradients import free_scene, full_scene, random_mesh, rollout_of
 import diffsim_ti as ds
 from diffsim_ti import verify
 from diffsim_ti.diff_simulator import rollout_frames
+from diffsim_ti.differentiation import arrays
 from diffsim_ti.outputs import Change, Output
 from diffsim_ti.solvers.explicit.solver import ExplicitWorkspace
 
@@ -95,6 +96,53 @@ class KineticEnergy(Output):
             velocities=v * (mass * by_vertex)[:, :, None],
             inputs={"density": by_density if np.ndim(density) else by_density.sum(), "rest_positions": by_rest},
         )
+
+
+# functions of arrays that record, with the shapes of their arguments, whose numbers are above 0.5
+RECORDED = [
+    (lambda a, b: (a + b) * a / b - 2.0 * b, (4, 3), (3,)),
+    (lambda a: np.sqrt(a) + np.exp(-a) * np.log(a) + abs(a) ** 3 + np.sin(a) * np.cos(a), (4, 3)),
+    (
+        lambda a, b: np.arctan2(a, b) + np.maximum(a, b) + np.clip(a, 0.6, 1.0) + np.where(a > b, a * b, b),
+        (4, 3),
+        (4, 3),
+    ),
+    (lambda a: a[1:, [0, 2]].sum(1) + a[0, 0] + a[2].mean() + sum(k * row[0] for k, row in enumerate(a)), (4, 3)),
+    (lambda a, b, c: a @ b @ c + c @ c, (5, 4, 3), (3, 2), (2,)),
+    (lambda a, b: np.cross(a[None], b) + b.T.sum() + np.moveaxis(b, 0, 1)[0], (5, 3), (5, 5, 3)),
+    (lambda a, b: np.einsum("ij,kj->k", a, b), (2, 3), (4, 3)),
+    (lambda a: np.linalg.inv(a) + np.linalg.det(a)[:, None, None] + a.swapaxes(-1, -2), (4, 3, 3)),
+    (lambda a: np.linalg.eigvalsh(a @ a.swapaxes(-1, -2)), (4, 3, 3)),
+    (lambda a, b: np.linalg.solve(a, b[..., None])[..., 0], (3, 3), (4, 3)),
+    (lambda a, b: np.concatenate([np.stack([a, 2 * a], 1).reshape(-1, 3), b, np.ones((1, 3))]), (4, 3), (2, 3)),
+    (
+        lambda a: np.roll(a, 1, 0) + np.repeat(a[:1], 4, 0) + np.tile(a[0], (4, 1)) + np.broadcast_to(a[2], (4, 3)),
+        (4, 3),
+    ),
+    (lambda a, b: arrays.ratio(a, np.linalg.norm(b, axis=1, keepdims=True)), (4, 3), (4, 3)),
+    (lambda a, b: arrays.replaced(b, np.array([3, 1]), a) + arrays.summed_at(np.array([0, 2]), a, 4), (2, 3), (4, 3)),
+]
+
+
+@pytest.mark.parametrize("function, shapes", [(function, shapes) for function, *shapes in RECORDED])
+def test_sweeps_over_what_arrays_record(function, shapes):
+    """They are transposes of each other, and agree with differences; values are those of plain arrays."""
+    rng = np.random.default_rng(0)
+    x, dx = ([sign + rng.random(shape) for shape in shapes] for sign in (0.5, -0.5))
+    leaves = [arrays.Recorded(a) for a in x]
+    y = function(*leaves)
+    change, seed = arrays.forward(y, zip(leaves, dx)), rng.standard_normal(y.shape)
+    ahead, back = (function(*(a + h * b for a, b in zip(x, dx))) for h in (1e-6, -1e-6))
+    np.testing.assert_allclose(change, (ahead - back) / 2e-6, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(y.value, function(*x), rtol=1e-14)
+    pulled = sum((a * b).sum() for a, b in zip(arrays.reverse(y, seed, leaves), dx))
+    assert (seed * change).sum() == pytest.approx(pulled, rel=1e-12)
+
+
+@pytest.mark.parametrize("function", [np.floor, np.sort, np.array])
+def test_functions_without_a_derivative_say_so(function):
+    with pytest.raises(TypeError, match="derivative"):
+        function(arrays.Recorded(np.ones(3)))
 
 
 def outputs():

@@ -6,6 +6,7 @@ from operator import is_
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
 from diffsim_ti.inputs.description import frozen
 
 Arrays = Sequence[np.ndarray]
@@ -34,28 +35,19 @@ class Link(ABC):
         """Adjoints of x, f'(x)^T y_adj, each of its x's shape."""
 
 
-class Linear:
-    """The part of a link whose change is its value of the changes."""
+class Recording:
+    """The part of a link of one array whose value takes arrays that record, from which its derivatives are found
+    (differentiation/arrays.py)."""
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
-        return self.value(*dx)
+        leaves = [Recorded(part) for part in x]
+        return [forward(y, zip(leaves, dx)) for y in self.value(*leaves)]
 
-
-class Analytic:
-    """The part of a link whose value takes complex numbers too: its change is that of a step into the complex plane, exact
-    to round-off.
-
-    Squire, Trapp 1998, Using complex variables to estimate derivatives of real functions, doi:10.1137/S003614459631241X.
-    """
-
-    def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
-        return [y.imag / 1e-30 for y in self.value(*(part + 1e-30j * change for part, change in zip(x, dx)))]
-
-
-def summed_at(places: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
-    """np.bincount of all of x, which may be complex."""
-    parts = [np.bincount(places.ravel(), part.ravel(), count) for part in (x.real, x.imag)[: 1 + np.iscomplexobj(x)]]
-    return parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
+    def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
+        leaves = [Recorded(part) for part in x]
+        (y,) = self.value(*leaves)
+        found = reverse(y, y_adj[0], leaves)
+        return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
 
 
 class Chain:

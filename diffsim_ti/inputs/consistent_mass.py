@@ -9,12 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Analytic, Link
+from diffsim_ti.inputs.chain import Link, Recording
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.reference_element import QUADRATIC, quadrature
 
 
-class ElementMasses(Analytic, Link):
+class ElementMasses(Recording, Link):
     """Of densities and rest positions the masses M_ab of each element [kg], shape (m, 10, 10), by a rule that is exact for
     curved edges too: N_a N_b is of degree four, det dX/dxi a cubic."""
 
@@ -27,30 +27,10 @@ class ElementMasses(Analytic, Link):
         self.by_xi = QUADRATIC.derivatives(xi)
         self.products = np.einsum("q,qa,qb->qab", weights / 6, N, N).reshape(len(xi), 100)
 
-    def _edges(self, X):
-        return np.einsum("eai,qak->eqik", X[self.elements], self.by_xi, optimize=True)
-
-    def _by_volume(self, det):
-        """Integrals of N_a N_b for det dX/dxi at the points."""
-        return (det @ self.products).reshape(-1, 10, 10)
-
     def value(self, density, X):
-        return (_times(density, self._by_volume(np.linalg.det(self._edges(X)))),)
-
-    def vjp(self, x, y_adj):
-        (density, X), (adj,) = x, y_adj
-        D = self._edges(X)
-        det = np.linalg.det(D)
-        by_density = (self._by_volume(det) * adj).sum((1, 2))
-        by_det = _times(density, adj).reshape(-1, 100) @ self.products.T
-        by_D = (by_det * det)[..., None, None] * np.swapaxes(np.linalg.inv(D), 2, 3)
-        X_adj = np.zeros_like(X)
-        np.add.at(X_adj, self.elements, np.einsum("eqik,qak->eai", by_D, self.by_xi, optimize=True))
-        return by_density if density.ndim else by_density.sum(), X_adj
-
-
-def _times(density, matrices):
-    return np.broadcast_to(density, len(matrices))[:, None, None] * matrices
+        det = np.linalg.det(np.einsum("eai,qak->eqik", X[self.elements], self.by_xi, optimize=True))
+        masses = (det @ self.products).reshape(-1, 10, 10)
+        return (np.broadcast_to(density, len(masses))[:, None, None] * masses,)
 
 
 class ConsistentMass:

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Analytic, Linear, Link
-from diffsim_ti.inputs.loads import _Together
+from diffsim_ti.differentiation.arrays import summed_at, times
+from diffsim_ti.inputs.chain import Link, Recording
 from diffsim_ti.mesh.face_points import face_points
 from diffsim_ti.mesh.paths import Paths
 
 
-class Segments(Linear, Link):
+class Segments(Recording, Link):
     """Of rest positions, and of the places of anchors [m], shape (k, 3) or (3,) for one, the segments of paths."""
 
     def __init__(self, paths: Paths, num_vertices: int, anchors: str | None, writes: str):
@@ -24,27 +24,14 @@ class Segments(Linear, Link):
         self.paths, self.places = paths, paths.matrix(num_vertices)
 
     def value(self, rest, anchors=None):
-        points, starts = self.places @ rest, self.paths.starts
-        if anchors is not None:
-            points[self.paths.anchored] = anchors.reshape(-1, 3)
-        out = np.zeros_like(points)
-        out[starts] = points[starts + 1] - points[starts]
-        return (out,)
-
-    def vjp(self, x, y_adj):
-        by_points, starts = np.zeros((self.paths.num_points, 3)), self.paths.starts
-        by_points[starts] -= y_adj[0][starts]
-        by_points[starts + 1] += y_adj[0][starts]
-        rest = self.places.T @ by_points
-        if len(x) == 1:
-            return (rest,)
-        by_anchors = by_points[self.paths.anchored]
-        if x[1].size == 3:  # one may hold many
-            by_anchors = by_anchors.sum(0)
-        return rest, by_anchors.reshape(x[1].shape)
+        points, starts, anchored = times(self.places, rest), self.paths.starts, self.paths.anchored
+        if anchors is not None:  # one may hold many
+            places = np.broadcast_to(anchors.reshape(-1, 3), (len(anchored), 3))
+            points = points + summed_at(anchored, places, len(points))
+        return (summed_at(starts, points[starts + 1] - points[starts], len(points)),)
 
 
-class LineRows(Link):
+class LineRows(Recording, Link):
     """Rows of a term's line elements. stiffness [N/m]: a number, or one for each; tension [N] and length [m] without
     force in time, as `InTime` has them, of all line elements together or of each; what is None is none, of a length:
     that at rest."""
@@ -62,72 +49,32 @@ class LineRows(Link):
         self.reads = (segments, *(name for name in (stiffness, tension, length) if name is not None))
         self.writes, self.paths = (writes,), paths
 
-    def _named(self, x) -> list:
-        """(stiffness, tension, length), None where it is not given."""
-        rest = iter(x[1:])
-        return [next(rest) if given else None for given in self.given]
-
-    def _whole(self, part: np.ndarray) -> np.ndarray:
-        """Of what is given in time, shape (2, rows) or (2, rows, line elements): that of each line element."""
-        return np.broadcast_to(part.reshape(*part.shape[:2], -1), (*part.shape[:2], len(self.paths)))
-
-    def _filled(self, x, at_rest) -> np.ndarray:
-        stiffness, tension, length = self._named(x)
+    def value(self, segments, *given):
+        rest = iter(given)
+        stiffness, tension, length = (next(rest) if there else None for there in self.given)
         rows = max((part.shape[1] for part in (tension, length) if part is not None), default=1)
-        out = np.zeros((rows, len(self.paths), 2, 3))
-        if tension is not None:
-            out[:, :, 0, :2] = np.moveaxis(self._whole(tension), 0, 2)
-        if stiffness is not None:
-            out[:, :, 0, 2] = stiffness
-        if length is not None:
-            out[:, :, 1, :2] = at_rest[:, None] - np.moveaxis(self._whole(length), 0, 2)
-        return out.reshape(rows, -1, 3)
+        lengths = np.linalg.norm(segments, axis=1)[self.paths.starts]
+        zero, at_rest = np.zeros((rows, len(self.paths))), summed_at(self.paths.path_of, lengths, len(self.paths))
 
-    def _at_rest(self, of_each: np.ndarray) -> np.ndarray:
-        """Sums over the segments of each path."""
-        return np.bincount(self.paths.path_of, of_each[self.paths.starts], len(self.paths))
+        def columns(part):  # as each step begins and ends, of each line element
+            return list(part.reshape(*part.shape[:2], -1) + zero)
 
-    def value(self, *x):
-        return (self._filled(x, self._at_rest(np.linalg.norm(x[0], axis=1))),)
-
-    def jvp(self, x, dx):
-        along = (directions(x[0]) * dx[0]).sum(1)
-        return (self._filled(dx, self._at_rest(along)),)
-
-    def vjp(self, x, y_adj):
-        stiffness, tension, length = self._named(x)
-        adjoint = y_adj[0].reshape(len(y_adj[0]), len(self.paths), 2, 3)
-        out = [np.zeros_like(x[0])]
-        if stiffness is not None:
-            by = adjoint[:, :, 0, 2].sum(0)
-            out.append(by if stiffness.ndim else by.sum())
-        for part, k in ((tension, 0), (length, 1)):
-            if part is not None:
-                by = np.moveaxis(adjoint[:, :, k, :2], 2, 0) * (1 if k == 0 else -1)
-                if by.shape[1] > part.shape[1]:
-                    by = by.sum(1, keepdims=True)
-                out.append(by if part.ndim == 3 and part.shape[2] > 1 else by.sum(2).reshape(part.shape))
-        if length is not None:
-            of_path = adjoint[:, :, 1, :2].sum((0, 2))
-            starts = self.paths.starts
-            out[0][starts] = directions(x[0])[starts] * of_path[self.paths.path_of][:, None]
-        return out
+        pulls = [zero, zero] if tension is None else columns(tension)
+        slacks = [zero, zero] if length is None else [at_rest - part for part in columns(length)]
+        stiff = zero if stiffness is None else stiffness + zero
+        out = np.stack([np.stack([*pulls, stiff], -1), np.stack([*slacks, zero], -1)], 2)
+        return (out.reshape(rows, -1, 3),)
 
 
-class JoinedRows(_Together):
+class JoinedRows(Recording, Link):
     """Rows of line elements of several terms, of which those of one row hold in all steps, side by side."""
 
-    @staticmethod
-    def rows(x) -> int:
-        return min((len(part) for part in x if len(part) > 1), default=1)
+    def __init__(self, reads: Sequence[str], writes: str):
+        self.reads, self.writes = tuple(reads), (writes,)
 
     def value(self, *x):
-        rows = self.rows(x)
+        rows = min((len(part) for part in x if len(part) > 1), default=1)
         return (np.concatenate([np.broadcast_to(part[:rows], (rows, *part.shape[1:])) for part in x], 1),)
-
-    def vjp(self, x, y_adj):
-        parts = np.split(y_adj[0], np.cumsum([part.shape[1] for part in x])[:-1], 1)
-        return [self._pulled(part[None], adjoint[None])[0] for part, adjoint in zip(x, parts)]
 
 
 def directions(segments: np.ndarray) -> np.ndarray:
@@ -136,7 +83,7 @@ def directions(segments: np.ndarray) -> np.ndarray:
     return np.divide(segments, lengths, out=np.zeros_like(segments), where=lengths > 0)
 
 
-class FoundationStiffness(Analytic, Link):
+class FoundationStiffness(Recording, Link):
     """K_i [N/m] of each of some vertices, shape (k, 3, 3): the sum over the triangles around of
 
         A / 3 [t I + (c - t) N N^T]
@@ -150,62 +97,21 @@ class FoundationStiffness(Analytic, Link):
         self.points, self.count = face_points(faces), len(vertices)
         self.nodes = np.searchsorted(vertices, faces)
 
-    def _to_vertices(self, of_each):
-        out, by_nodes = np.zeros((self.count, 3, 3), of_each.dtype), self.points.to_nodes(of_each)
-        for a in range(self.nodes.shape[1]):
-            np.add.at(out, self.nodes[:, a], by_nodes[:, a])
-        return out
-
-    def _at_points(self, x):
-        """Of each point what its face has."""
-        return np.repeat(x, self.points.points) if x.ndim else x
-
-    def _of_faces(self, by_points, x):
-        """Adjoint of what faces have, or all of them."""
-        return by_points.reshape(-1, self.points.points).sum(1) if x.ndim else by_points.sum()
-
-    @staticmethod
-    def _parts(n):
-        """(A, n n^T / A) of normals as long as the area."""
-        A = np.sqrt((n * n).sum(1))[:, None, None]
-        return A, n[:, :, None] * n[:, None, :] / A
-
     def value(self, X, c, t):
-        c, t = (self._at_points(x)[..., None, None] for x in (c, t))
-        A, across = self._parts(self.points.normals(X))
-        return (self._to_vertices(t * A * np.eye(3) + (c - t) * across),)
-
-    def vjp(self, x, y_adj):
-        X, c, t = x
-        Y = self.points.from_nodes(y_adj[0][self.nodes])
+        c, t = (np.repeat(x, self.points.points)[:, None, None] if x.ndim else x for x in (c, t))
         n = self.points.normals(X)
-        A, across = self._parts(n)
-        trace, along = np.trace(Y, axis1=1, axis2=2), (Y * across).sum((1, 2))
-        by_c, by_t = along, A[:, 0, 0] * trace - along
-        soft = self._at_points(t)
-        by_across = self._at_points(c) - soft
-        by_across = by_across[..., None] if by_across.ndim else by_across
-        twice = np.einsum("tij,tj->ti", Y + np.swapaxes(Y, 1, 2), n)
-        size = A[:, :, 0]
-        n_adj = by_across * (twice / size - along[:, None] * n / size**2)
-        n_adj += (soft[..., None] if soft.ndim else soft) * trace[:, None] * n / size
-        return self.points.normals_vjp(X, n_adj), self._of_faces(by_c, c), self._of_faces(by_t, t)
+        A = np.sqrt((n * n).sum(1))[:, None, None]
+        of_each = self.points.to_nodes(t * A * np.eye(3) + (c - t) * (n[:, :, None] * n[:, None, :] / A))
+        return (summed_at(self.nodes.T, np.moveaxis(of_each, 1, 0), self.count),)
 
 
-class FoundationRows(Linear, Link):
+class FoundationRows(Recording, Link):
     """Rows of K_i of all foundations, shape (3 k, 3) for the k vertices that any of them holds."""
 
     def __init__(self, reads: Sequence[str], vertices: Sequence[np.ndarray], writes: str):
         self.reads, self.writes = tuple(reads), (writes,)
         self.vertices = np.unique(np.concatenate(vertices))
-        self.places = [np.searchsorted(self.vertices, own) for own in vertices]
+        self.places = np.concatenate([np.searchsorted(self.vertices, own) for own in vertices])
 
     def value(self, *x):
-        out = np.zeros((len(self.vertices), 3, 3))
-        for place, part in zip(self.places, x):
-            out[place] += part
-        return (out.reshape(-1, 3),)
-
-    def vjp(self, x, y_adj):
-        whole = y_adj[0].reshape(-1, 3, 3)
-        return [whole[place] for place in self.places]
+        return (summed_at(self.places, np.concatenate(x), len(self.vertices)).reshape(-1, 3),)

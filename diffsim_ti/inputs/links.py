@@ -4,11 +4,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Analytic, Linear, Link
+from diffsim_ti.differentiation.arrays import linear, summed_at
+from diffsim_ti.inputs.chain import Link, Recording
 from diffsim_ti.inputs.loads import VertexShares
 
 
-class FreeVelocity(Linear, Link):
+class FreeVelocity(Recording, Link):
     """Velocities without what is held of them: free(v), a projection."""
 
     reads, writes = ("initial_velocities",), ("velocity",)
@@ -17,10 +18,7 @@ class FreeVelocity(Linear, Link):
         self.free = free
 
     def value(self, v):
-        return (self.free(v),)
-
-    def vjp(self, x, y_adj):
-        return self.value(y_adj[0])
+        return (linear(v, self.free, self.free),)
 
 
 class LumpedMass(VertexShares):
@@ -32,7 +30,7 @@ class LumpedMass(VertexShares):
         super().__init__(mesh, *every, True, "mass", factors)
 
 
-class Same(Link):
+class Same(Recording, Link):
     """y = x, an input that kernels read as it is."""
 
     def __init__(self, reads: str, writes: str):
@@ -41,14 +39,8 @@ class Same(Link):
     def value(self, x):
         return (x,)
 
-    def jvp(self, x, dx):
-        return (np.array(dx[0]),)
 
-    def vjp(self, x, y_adj):
-        return y_adj
-
-
-class PerStep(Link):
+class PerStep(Recording, Link):
     """What holds during each step, as a list: what is given for all steps is a list of one."""
 
     def __init__(self, reads: str, writes: str, ndim: int):
@@ -57,14 +49,8 @@ class PerStep(Link):
     def value(self, x):
         return (x[None] if x.ndim < self.ndim else x,)
 
-    def jvp(self, x, dx):
-        return self.value(np.array(dx[0]))
 
-    def vjp(self, x, y_adj):
-        return (y_adj[0][0] if x[0].ndim < self.ndim else y_adj[0],)
-
-
-class NearestPoint(Analytic, Link):
+class NearestPoint(Recording, Link):
     """The point of a plane that is nearest to o, of any of its points p and a normal n of any length:
 
     q = o + s n,    s = n . (p - o) / n . n
@@ -76,13 +62,8 @@ class NearestPoint(Analytic, Link):
     def value(self, p, n):
         return (self.near + n * (n @ (p - self.near)) / (n @ n),)
 
-    def vjp(self, x, y_adj):
-        (p, n), (q_adj,) = x, y_adj
-        s, along = n @ (p - self.near) / (n @ n), (q_adj @ n) / (n @ n)
-        return along * n, s * q_adj + along * (p - self.near - 2 * s * n)
 
-
-class Joined(Linear, Link):
+class Joined(Recording, Link):
     """The numbers of several inputs in one row, or, with the `tail` of their shapes, rows of such a shape."""
 
     def __init__(self, reads: Sequence[str], writes: str, tail: tuple = ()):
@@ -91,25 +72,15 @@ class Joined(Linear, Link):
     def value(self, *x):
         return (np.concatenate([part.reshape(-1, *self.tail) for part in x]),)
 
-    def vjp(self, x, y_adj):
-        ends = np.cumsum([part.size for part in x])[:-1] // int(np.prod(self.tail))
-        return [row.reshape(part.shape) for row, part in zip(np.split(y_adj[0], ends), x)]
 
-
-class Placed(Link):
+class Placed(Recording, Link):
     """All numbers of some arrays, those of each in its range of one list, zero elsewhere, less those of `shift`."""
 
     def __init__(self, places: dict[str, slice], writes: str, shift: np.ndarray):
-        self.reads, self.places, self.writes, self.shift = tuple(places), tuple(places.values()), (writes,), shift
+        self.reads, self.writes, self.shift = tuple(places), (writes,), shift
+        ranges = [np.arange(place.start, place.stop) for place in places.values()]
+        self.places = np.concatenate([np.zeros(0, int), *ranges])
 
     def value(self, *x):
-        return (self.jvp(x, x)[0] - self.shift,)
-
-    def jvp(self, x, dx):
-        out = np.zeros(len(self.shift))
-        for place, part in zip(self.places, dx):
-            out[place] = part.ravel()
-        return (out,)
-
-    def vjp(self, x, y_adj):
-        return [y_adj[0][place].reshape(part.shape) for place, part in zip(self.places, x)]
+        numbers = np.concatenate([np.zeros(0), *(part.ravel() for part in x)])
+        return (summed_at(self.places, numbers, len(self.shift)) - self.shift,)

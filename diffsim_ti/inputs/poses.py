@@ -13,7 +13,8 @@ import numpy as np
 
 from diffsim_ti.common import rotations
 from diffsim_ti.common.checked import shown
-from diffsim_ti.inputs.chain import Link
+from diffsim_ti.differentiation.arrays import made, summed_at, value_of
+from diffsim_ti.inputs.chain import Link, Recording
 
 COLUMNS = 3  # of a pose: translation, R as modified Rodrigues parameters, phi
 ONE_AXIS = 1e-2  # sine of the angle within which two rotation vectors have one axis
@@ -79,7 +80,7 @@ def theta_vjp(rows: np.ndarray, theta: np.ndarray) -> np.ndarray:
     return 2 * rotations.product(pure, q) / (q**2).sum(1, keepdims=True)
 
 
-class PoseColumns(Link):
+class PoseColumns(Recording, Link):
     """Paths of obstacles side by side, shape (steps + 1, columns, 3): a displacement is a column, a pose three.
 
     The change of R is theta with dR = [theta]x R, in place of that of its parameters. With R' = R(phi) R,
@@ -97,51 +98,36 @@ class PoseColumns(Link):
 
     def value(self, *x):
         out = [self._columns(name, rows) for name, rows in zip(self.reads, x)]
-        for columns, away in zip(out, self.away):
-            columns[:, 0] -= away
+        for k, away in enumerate(self.away):
+            out[k] = np.concatenate([out[k][:, :1] - away, out[k][:, 1:]], 1)
         return (np.concatenate(out, 1),)
 
     @staticmethod
     def _columns(name: str, rows: np.ndarray) -> np.ndarray:
         if rows.shape[1] == 3:
-            return rows[:, None].copy()
-        phi = np.zeros((len(rows), 3))
-        phi[:-1] = between(name, rows)
+            return rows[:, None]
+        given, phi = value_of(rows), np.zeros((len(rows), 3))
+        phi[:-1] = between(name, given)
         most = np.linalg.norm(phi, axis=1).max(initial=0.0)
         if most > FULL_TURN - 1e-3:
             raise ValueError(
                 f"{name}: turns by {most:.4g} rad in one step, which must be less than a full turn; take shorter steps"
             )
-        return np.stack([rows[:, :3], rotations.rodrigues(quaternions(rows)), phi], 1)
 
-    def jvp(self, x, dx):
-        out = []
-        for name, rows, drows in zip(self.reads, x, dx):
-            if rows.shape[1] == 3:
-                out.append(drows[:, None])
-                continue
-            phi, theta = self._columns(name, rows)[:-1, 2], theta_of(rows, drows)
-            dphi = np.zeros_like(theta)
-            change = theta[1:] - rotations.turned(rotations.quaternion(phi), theta[:-1])
-            dphi[:-1] = np.einsum("kij,kj->ki", rotations.inverse_jacobian(phi), change)
-            out.append(np.stack([drows[:, :3], theta, dphi], 1))
-        return (np.concatenate(out, 1),)
+        def push(drows):
+            theta, dphi = theta_of(given, drows), np.zeros_like(phi)
+            change = theta[1:] - rotations.turned(rotations.quaternion(phi[:-1]), theta[:-1])
+            dphi[:-1] = np.einsum("kij,kj->ki", rotations.inverse_jacobian(phi[:-1]), change)
+            return np.stack([drows[:, :3], theta, dphi], 1)
 
-    def vjp(self, x, y_adj):
-        out, at = [], 0
-        for name, rows in zip(self.reads, x):
-            width = 1 if rows.shape[1] == 3 else COLUMNS
-            own = y_adj[0][:, at : at + width]
-            out.append(own[:, 0] if width == 1 else self._pose_vjp(name, rows, own))
-            at += width
-        return out
+        def pull(own):
+            theta = own[:, 1].copy()
+            change = np.einsum("kji,kj->ki", rotations.inverse_jacobian(phi[:-1]), own[:-1, 2])
+            theta[1:] += change
+            theta[:-1] -= rotations.turned(rotations.conjugate(rotations.quaternion(phi[:-1])), change)
+            return np.concatenate([own[:, 0], theta_vjp(given, theta)], 1)
 
-    def _pose_vjp(self, name: str, rows: np.ndarray, own: np.ndarray) -> np.ndarray:
-        phi, theta = self._columns(name, rows)[:-1, 2], own[:, 1].copy()
-        change = np.einsum("kji,kj->ki", rotations.inverse_jacobian(phi), own[:-1, 2])
-        theta[1:] += change
-        theta[:-1] -= rotations.turned(rotations.conjugate(rotations.quaternion(phi)), change)
-        return np.concatenate([own[:, 0], theta_vjp(rows, theta)], 1)
+        return made(np.stack([given[:, :3], rotations.rodrigues(quaternions(given)), phi], 1), (rows, push, pull))
 
 
 @dataclass(frozen=True)
@@ -156,7 +142,7 @@ class PosedSupport:
     projectors: np.ndarray
 
 
-class PosedMotion(Link):
+class PosedMotion(Recording, Link):
     """Displacements of fixed vertices from their start x, shape (rows, k, 3): P (c + t + R (x - c) - x), and those that
     `prescribed_motion` adds."""
 
@@ -168,36 +154,28 @@ class PosedMotion(Link):
         self.reads = ("initial_positions", *names, *(["prescribed_motion"] if more else []))
         self.more = more
 
-    def _each(self, x):
-        for k, support in enumerate(self.posed_supports):
-            rows, about = x[1 + 2 * k], x[2 + 2 * k]
-            yield support, rows, quaternions(rows)[:, None], (x[0][support.vertices] - about)[None]
-
     def value(self, *x):
-        out = np.array(x[-1]) if self.more else np.zeros((len(x[1]), self.num_held, 3))
-        for support, rows, q, arm in self._each(x):
-            moved = rows[:, None, :3] + rotations.turned(q, arm) - arm
-            np.add.at(out, (slice(None), support.places), np.einsum("kij,rkj->rki", support.projectors, moved))
+        out = x[-1] if self.more else np.zeros((len(x[1]), self.num_held, 3))
+        for support, rows, about in zip(self.posed_supports, x[1::2], x[2::2]):
+            arm = (x[0][support.vertices] - about)[None]
+            moved = rows[:, None, :3] + _turned(rows, arm) - arm
+            own = np.einsum("kij,rkj->kri", support.projectors, moved)
+            out = out + np.moveaxis(summed_at(support.places, own, self.num_held), 0, 1)
         return (out,)
 
-    def jvp(self, x, dx):
-        out = np.array(dx[-1]) if self.more else np.zeros((len(x[1]), self.num_held, 3))
-        changes = zip(self._each(x), dx[1::2], dx[2::2])
-        for (support, rows, q, arm), drows, dabout in changes:
-            darm, theta = (dx[0][support.vertices] - dabout)[None], theta_of(rows, drows)[:, None]
-            moved = drows[:, None, :3] + np.cross(theta, rotations.turned(q, arm)) + rotations.turned(q, darm) - darm
-            np.add.at(out, (slice(None), support.places), np.einsum("kij,rkj->rki", support.projectors, moved))
-        return (out,)
 
-    def vjp(self, x, y_adj):
-        out = [np.zeros_like(part) for part in x]
-        for k, (support, rows, q, arm) in enumerate(self._each(x)):
-            by = np.einsum("kij,rki->rkj", support.projectors, y_adj[0][:, support.places])
-            by_theta = np.cross(rotations.turned(q, arm), by).sum(1)
-            by_arm = (rotations.turned(rotations.conjugate(q), by) - by).sum(0)
-            out[0][support.vertices] += by_arm
-            out[1 + 2 * k] = np.concatenate([by.sum(1), theta_vjp(rows, by_theta)], 1)
-            out[2 + 2 * k] = -by_arm.sum(0)
-        if self.more:
-            out[-1] = y_adj[0]
-        return out
+def _turned(rows: np.ndarray, arm: np.ndarray) -> np.ndarray:
+    """R arm by the rotation of each row, shape (rows, k, 3)."""
+    given, q = value_of(rows), quaternions(value_of(rows))[:, None]
+    out = rotations.turned(q, value_of(arm))
+
+    def pull(seed):
+        return np.concatenate([np.zeros((len(given), 3)), theta_vjp(given, np.cross(out, seed).sum(1))], 1)
+
+    by_rows = rows, lambda drows: np.cross(theta_of(given, drows)[:, None], out), pull
+    by_arm = (
+        arm,
+        lambda change: rotations.turned(q, change),
+        lambda seed: rotations.turned(rotations.conjugate(q), seed),
+    )
+    return made(out, by_rows, by_arm)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Analytic, Link
+from diffsim_ti.differentiation.arrays import linear, made, replaced, value_of
+from diffsim_ti.inputs.chain import Link, Recording
 
 
 def cross_matrix(a: np.ndarray) -> np.ndarray:
@@ -52,7 +53,7 @@ class Nearest:
         return self.D @ A_adj.T, self.y @ A_adj
 
 
-class Displacement(Link):
+class Displacement(Recording, Link):
     """u = of(x - X), `of` being a symmetric projection onto what the scene can do; of `bodies`, as `Reduced.rigid` has them,
     that of the nearest rigid motion."""
 
@@ -62,37 +63,19 @@ class Displacement(Link):
         self.of, self.bodies = of, bodies
 
     def value(self, x, X):
-        out = np.array(self.of(x - X))
+        out = linear(x - X, self.of, self.of)
         for body in self.bodies:
-            at = body.vertices
-            D = body.apart(X)
-            out[at] = x[at].mean(0) - X[at].mean(0) + D @ (Nearest(body.apart(x), D).R.T - np.eye(3))
+            at, y, D = body.vertices, body.apart(x), body.apart(X)
+            near, none = Nearest(value_of(y), value_of(D)), np.zeros((len(at), 3))
+            by_y = y, lambda dy, near=near: near.jvp(dy, none), lambda seed, near=near: near.vjp(seed)[0]
+            by_D = D, lambda dD, near=near: near.jvp(none, dD), lambda seed, near=near: near.vjp(seed)[1]
+            moved = x[at].mean(0) - X[at].mean(0) + D @ (made(near.R, by_y, by_D).T - np.eye(3))
+            out = replaced(out, at, moved)
         return (out,)
 
-    def jvp(self, x, dx):
-        out = np.array(self.of(dx[0] - dx[1]))
-        for body in self.bodies:
-            at, D, dD = body.vertices, body.apart(x[1]), body.apart(dx[1])
-            near = Nearest(body.apart(x[0]), D)
-            turned = dD @ (near.R.T - np.eye(3)) + D @ near.jvp(body.apart(dx[0]), dD).T
-            out[at] = dx[0][at].mean(0) - dx[1][at].mean(0) + turned
-        return (out,)
 
-    def vjp(self, x, y_adj):
-        (u_adj,) = y_adj
-        x_adj = np.array(self.of(u_adj))
-        X_adj = -x_adj
-        for body in self.bodies:
-            at, D, own, mean = body.vertices, body.apart(x[1]), u_adj[body.vertices], u_adj[body.vertices].mean(0)
-            near = Nearest(body.apart(x[0]), D)
-            by_y, by_D = near.vjp(own.T @ D)
-            by_D = by_D + own @ (near.R - np.eye(3))
-            x_adj[at], X_adj[at] = mean + by_y - by_y.mean(0), by_D - by_D.mean(0) - mean
-        return x_adj, X_adj
-
-
-class RigidVelocity(Analytic, Link):
-    """v = free(v), and of sets that do not deform that of the nearest rigid motion."""
+class RigidVelocity(Recording, Link):
+    """v = free(v), free being a projection, and of sets that do not deform that of the nearest rigid motion."""
 
     reads, writes = ("initial_velocities", "displacement", "rest"), ("velocity",)
 
@@ -100,28 +83,9 @@ class RigidVelocity(Analytic, Link):
         self.free, self.bodies = free, bodies
 
     def value(self, v, u, X):
-        out = np.array(self.free(v))
+        out = linear(v, self.free, self.free)
         for body in self.bodies:
-            y, _, omega = self._spin(body, v, u, X)
-            out[body.vertices] = v[body.vertices].mean(0) + np.cross(omega, y)
+            y, own = body.apart(X + u), v[body.vertices]
+            omega = np.linalg.solve(inertia(y), np.cross(y, own).sum(0))
+            out = replaced(out, body.vertices, own.mean(0) + np.cross(omega, y))
         return (out,)
-
-    @staticmethod
-    def _spin(body, v, u, X):
-        """(y, I, omega)"""
-        y = body.apart(X + u)
-        inertia_of = inertia(y)
-        return y, inertia_of, np.linalg.solve(inertia_of, np.cross(y, v[body.vertices]).sum(0))
-
-    def vjp(self, x, y_adj):
-        (out_adj,) = y_adj
-        v_adj, place_adj = np.array(self.free(out_adj)), np.zeros_like(out_adj)
-        for body in self.bodies:
-            at, own = body.vertices, out_adj[body.vertices]
-            y, inertia_of, omega = self._spin(body, *x)
-            mu = np.linalg.solve(inertia_of, np.cross(y, own).sum(0))
-            v_adj[at] = own.mean(0) + np.cross(mu, y)
-            by_y = np.cross(own, omega) + np.cross(x[0][at], mu)
-            by_y += -2 * (mu @ omega) * y + np.outer(y @ omega, mu) + np.outer(y @ mu, omega)
-            place_adj[at] = by_y - by_y.mean(0)
-        return v_adj, place_adj, place_adj

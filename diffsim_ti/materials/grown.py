@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import value_of
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import PAIRS, add_to_diagonal, cofactor, inner, of_six
 from diffsim_ti.materials.law import Law, as_of
@@ -173,8 +174,8 @@ class Grown(Around):
     def _stretches(self, values) -> np.ndarray:
         """Principal stretches of F_g, along the last axis."""
         if self.own == ("growth",):
-            return np.repeat(1 + np.asarray(values["growth"])[..., None], 3, -1)
-        e, place = np.asarray(values["growth_strain"]), [[0, 5, 4], [5, 1, 3], [4, 3, 2]]
+            return np.repeat(1 + np.asarray(value_of(values["growth"]))[..., None], 3, -1)
+        e, place = np.asarray(value_of(values["growth_strain"])), [[0, 5, 4], [5, 1, 3], [4, 3, 2]]
         return 1 + np.linalg.eigvalsh(e[..., place])
 
     def check(self, values):

@@ -159,12 +159,5 @@ class KelvinVoigt(Around):
             return [own[0] * mu, own[0] * lam]
         return [own[0], own[1] - 2 / 3 * own[0]]
 
-    def own_vjp(self, numbers, by_columns):
-        *own, mu, lam = numbers
-        by_eta, by_lam = by_columns
-        if len(own) == 1:
-            return [by_eta * mu + by_lam * lam, own[0] * by_eta, own[0] * by_lam]
-        return [by_eta - 2 / 3 * by_lam, by_lam, 0 * by_eta, 0 * by_lam]
-
     def law(self, precision):
         return KelvinVoigtLaw(precision, self.material.law(precision), ViscousLaw(precision))

@@ -12,6 +12,7 @@ from diffsim_ti.common.answers import answered
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.common.names import nearest
 from diffsim_ti.common.public import Public
+from diffsim_ti.differentiation.arrays import Recorded, as_array, forward, reverse, value_of
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.materials import moduli
 from diffsim_ti.mesh import TetrahedralMesh
@@ -20,7 +21,6 @@ from diffsim_ti.mesh.sets import values_of_sets
 
 # one number, an array with one per tetrahedron, or {tetrahedron set: number}
 PerTetrahedron = TypeAliasType("PerTetrahedron", ArrayLike | Mapping[str, ArrayLike])
-TINY = 1e-100  # scale of imaginary parts, whose squares vanish: derivatives are exact to round-off
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
 
 
@@ -172,44 +172,13 @@ class Material(metaclass=Public):
             p = self.coefficients(values) @ self.to_lame.T
             return p[..., 0], p[..., 1]
         if self._begins_with_E_and_nu():
-            return moduli.lame(*(np.asarray(values[name], np.float64) for name in self.inputs[:2]))
+            return moduli.lame(*(as_array(values[name]) for name in self.inputs[:2]))
         if {"mu", "lam"} <= {*self.inputs}:
-            return tuple(np.broadcast_arrays(*(np.asarray(values[name], np.float64) for name in ("mu", "lam"))))
+            mu, lam = (as_array(values[name]) for name in ("mu", "lam"))
+            return mu + 0 * lam, lam + 0 * mu
         raise NotImplementedError(
             f"{self.name} does not say its moduli of small strains: write lame(self, values), which returns (mu, lam) [Pa]"
         )
-
-    def lame_jvp(self, values: dict, tangents: dict) -> tuple[np.ndarray, np.ndarray]:
-        """Their change for changes of the values; names left out do not change."""
-        if self.to_lame is not None:
-            dp = self.coefficients_jvp(values, tangents) @ self.to_lame.T
-            return dp[..., 0], dp[..., 1]
-        self._check_known_moduli()
-        values = stepped(values, tangents)
-        moved = [values[name] for name in self._of_lame]
-        parts = moduli.lame(*moved) if self._begins_with_E_and_nu() else np.broadcast_arrays(*moved)
-        return tuple(part.imag / TINY for part in parts)
-
-    def lame_vjp(self, values: dict, mu_adj: np.ndarray, lam_adj: np.ndarray) -> dict[str, np.ndarray]:
-        """Adjoint of each value that they depend on, from theirs, each shape () or (num_tetrahedra,)."""
-        if self.to_lame is not None:
-            return self.coefficients_vjp(values, np.stack(np.broadcast_arrays(mu_adj, lam_adj), -1) @ self.to_lame)
-        self._check_known_moduli()
-        parts = mu_adj, lam_adj
-        if self._begins_with_E_and_nu():
-            parts = moduli.lame_vjp(*(np.asarray(values[name], np.float64) for name in self._of_lame), *parts)
-        return {name: summed(part, values[name]) for name, part in zip(self._of_lame, parts)}
-
-    @property
-    def _of_lame(self) -> tuple[str, str]:
-        return self.inputs[:2] if self._begins_with_E_and_nu() else ("mu", "lam")
-
-    def _check_known_moduli(self) -> None:
-        """Raise NotImplementedError where a subclass says moduli whose derivatives it does not."""
-        if type(self).lame is not Material.lame:
-            raise NotImplementedError(
-                f"{self.name} does not say how its moduli of small strains change: write lame_jvp and lame_vjp beside lame"
-            )
 
     @property
     def isotropic(self) -> "Material":
@@ -230,25 +199,27 @@ class Material(metaclass=Public):
         columns, matrix = self._columns(values, self.inputs), self._matrix()
         if self._begins_with_E_and_nu():
             columns[:2] = moduli.lame(*columns[:2])
-        numbers = np.stack(np.broadcast_arrays(*columns), -1)
+        shape = np.broadcast_shapes(*map(np.shape, columns))
+        numbers = np.stack([np.broadcast_to(column, shape) for column in columns], -1)
         return numbers if matrix is None else numbers @ matrix.T
 
     def coefficients_jvp(self, values: dict, tangents: dict) -> np.ndarray:
         """Change of the coefficients for changes of the values; names left out do not change."""
-        return self._coefficients(stepped(values, tangents)).imag / TINY
+        leaves = {name: Recorded(x) for name, x in values.items()}
+        changes = [(leaves[name], np.broadcast_to(x, leaves[name].shape)) for name, x in tangents.items()]
+        return forward(self._coefficients(leaves), changes)
 
     def coefficients_vjp(self, values: dict, coefficients_adj: np.ndarray) -> dict[str, np.ndarray]:
         """Adjoint of each value, of its shape, from the adjoint of the coefficients, shape (num_tetrahedra, K) or (K,).
 
         A uniform value takes the sum over all tetrahedra.
         """
-        adj = np.asarray(coefficients_adj, np.float64)
-        v, matrix = self._columns(values, self.inputs), self._matrix()
-        adj = adj if matrix is None else adj @ matrix
-        parts = [adj[..., k] for k in range(adj.shape[-1])]
-        if self._begins_with_E_and_nu():
-            parts[:2] = moduli.lame_vjp(*v[:2], *parts[:2])
-        return self._columns_vjp(values, self.inputs, parts)
+        leaves = {name: Recorded(values[name]) for name in self.inputs}
+        p, adjoint = self._coefficients(leaves), np.asarray(coefficients_adj, np.float64)
+        if p.ndim < adjoint.ndim:  # of what is uniform that of each tetrahedron, or point
+            adjoint = adjoint.sum(1) if p.ndim == 2 else adjoint.reshape(-1, adjoint.shape[-1]).sum(0)
+        found = reverse(p, np.broadcast_to(adjoint, p.shape), leaves.values())
+        return {name: leaf.zeros() if x is None else x for (name, leaf), x in zip(leaves.items(), found)}
 
     def _begins_with_E_and_nu(self) -> bool:
         return self.inputs[:2] == Material.spellings[0]
@@ -260,19 +231,9 @@ class Material(metaclass=Public):
         """The components of some numbers, one after the other, each of shape () or (num_tetrahedra,)."""
         columns = []
         for name in names:
-            value, shape = np.asarray(values[name]), self.shape_of(name)
-            value = value.astype(np.result_type(value, np.float64), copy=False)
+            value, shape = as_array(values[name]), self.shape_of(name)
             columns += [value[..., k] for k in range(shape[0])] if shape else [value]
         return columns
-
-    def _columns_vjp(self, values: dict, names: tuple, by_columns: list) -> dict[str, np.ndarray]:
-        """Adjoints of these numbers from those of their components."""
-        out, rest = {}, iter(by_columns)
-        for name in names:
-            shape = self.shape_of(name)
-            own = np.stack([next(rest) for _ in range(shape[0])], -1) if shape else next(rest)
-            out[name] = summed(own, values[name], shape)
-        return out
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{name}={_short(number)}" for name, number in self._numbers.items())
@@ -306,24 +267,9 @@ def number_of_terms(kind: str, each: str, **vectors) -> int:
     return a[-1]
 
 
-def summed(adjoint: np.ndarray, value, shape: tuple = ()) -> np.ndarray:
-    """The adjoint of a number of that shape which is uniform, or one per tetrahedron, from that of each tetrahedron."""
-    adjoint, uniform = np.asarray(adjoint, np.float64), np.ndim(value) == len(shape)
-    if uniform:
-        return adjoint.reshape(-1, *shape).sum(0)
-    if adjoint.ndim > np.ndim(value):  # of points
-        adjoint = adjoint.sum(1)
-    return adjoint if adjoint.shape == np.shape(value) else np.broadcast_to(adjoint, np.shape(value))
-
-
-def stepped(values: dict, tangents: dict) -> dict:
-    """The values with their change as an imaginary part, which analytic formulas carry through."""
-    return {name: x + 1j * TINY * np.asarray(tangents.get(name, 0.0), np.float64) for name, x in values.items()}
-
-
 def check_range(name: str, value, low: float, high: float, low_included: bool, remedy: str) -> None:
     """Raise ValueError unless low < value < high (low <= value if low_included) everywhere; NaN is outside."""
-    value = np.asarray(value)
+    value = np.asarray(value_of(value))
     bad = ~(((value >= low) if low_included else (value > low)) & (value < high))
     if np.any(bad):
         first = int(np.argmax(np.ravel(bad)))

@@ -67,12 +67,6 @@ class Measured(Around):
     def lame(self, values):
         return self.material.lame(values)
 
-    def lame_jvp(self, values, tangents):
-        return self.material.lame_jvp(values, tangents)
-
-    def lame_vjp(self, values, mu_adj, lam_adj):
-        return self.material.lame_vjp(values, mu_adj, lam_adj)
-
     def nominal_stress(self, stretch, kind: str = "uniaxial") -> np.ndarray:
         """Force over the area at rest [Pa] at stretches, of the incompressible law, where the sides are free: in "uniaxial",
         "equibiaxial" or "planar" tension."""

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.differentiation import expm1_minus_x
+from diffsim_ti.differentiation.arrays import as_array
 from diffsim_ti.materials.calculus.stretches import sum_over_stretches
 from diffsim_ti.materials.calculus.tensor import invariants, isochoric
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import TINY, Material, PerTetrahedron, check_range, number_of_terms, stepped, summed
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range, number_of_terms
 
 
 @dataclass(frozen=True)
@@ -65,17 +66,8 @@ class Ogden(Material):
             )
 
     def lame(self, values):
-        mu = (np.asarray(values["moduli"]) * values["exponents"]).sum(-1) / 2
+        mu = (as_array(values["moduli"]) * values["exponents"]).sum(-1) / 2
         return mu, values["bulk_modulus"] - 2 / 3 * mu
-
-    def lame_jvp(self, values, tangents):
-        return tuple(part.imag / TINY for part in self.lame(stepped(values, tangents)))
-
-    def lame_vjp(self, values, mu_adj, lam_adj):
-        by_shear = np.asarray(mu_adj - 2 / 3 * np.asarray(lam_adj))[..., None] / 2
-        (mu, a, bulk), shape = (np.asarray(values[name]) for name in self.inputs), (self.terms,)
-        own = summed(by_shear * a, mu, shape), summed(by_shear * mu, a, shape), summed(lam_adj, bulk)
-        return dict(zip(self.inputs, own))
 
     def law(self, precision):
         return OgdenLaw(precision, terms=self.terms)

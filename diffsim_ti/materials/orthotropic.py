@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import as_array, value_of, with_slopes
 from diffsim_ti.materials.calculus.tensor import PAIRS, green_strain, six
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import TINY, Material, PerTetrahedron, check_range, stepped
+from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
 
 ROWS, COLUMNS = np.triu_indices(6)
 
@@ -101,24 +102,24 @@ class Orthotropic(Material):
 
     def _expanded(self, x: dict) -> tuple:
         """Three Young's moduli, Poisson's ratios 12, 23, 13 and shear moduli 23, 13, 12, and two directions."""
-        a = np.asarray(x["direction_1"])
+        a = as_array(x["direction_1"])
         if "E3" in x:
             E, nu, G = ([x[n] for n in names.split()] for names in ("E1 E2 E3", "nu12 nu23 nu13", "G23 G13 G12"))
-            return E, nu, G, a, np.asarray(x["direction_2"])
+            return E, nu, G, a, as_array(x["direction_2"])
         across = x["E2"] / (2 * (1 + x["nu23"]))
-        aside = np.eye(3)[np.argmin(np.abs(a), -1)]  # any direction that is not along the axis
+        aside = np.eye(3)[np.argmin(np.abs(value_of(a)), -1)]  # any direction that is not along the axis
         return [x["E1"], x["E2"], x["E2"]], [x["nu12"], x["nu23"], x["nu12"]], [across, x["G12"], x["G12"]], a, aside
 
     def _stiffness(self, x: dict) -> np.ndarray:
-        """C of (11, 22, 33, 23, 13, 12), shear strains doubled, in the material's directions; x may be complex."""
+        """C of (11, 22, 33, 23, 13, 12), shear strains doubled, in the material's directions."""
         E, nu, G, _, _ = self._expanded(x)
-        shape = np.broadcast_shapes(*(np.shape(one) for one in (*E, *nu, *G)))
-        S = np.zeros((*shape, 6, 6), np.result_type(*E, *nu, *G))
+        zero = np.zeros(np.broadcast_shapes(*map(np.shape, (*E, *nu, *G))))
+        S = [[zero] * 6 for _ in range(6)]
         for k in range(3):
-            S[..., k, k], S[..., k + 3, k + 3] = 1 / E[k], 1 / G[k]
+            S[k][k], S[k + 3][k + 3] = 1 / E[k] + zero, 1 / G[k] + zero
         for (i, j), ratio in zip(((0, 1), (1, 2), (0, 2)), nu):
-            S[..., i, j] = S[..., j, i] = -ratio / E[i]
-        return np.linalg.inv(S)
+            S[i][j] = S[j][i] = -ratio / E[i] + zero
+        return np.linalg.inv(np.stack([np.stack(row, -1) for row in S], -2))
 
     def _coefficients(self, x: dict) -> np.ndarray:
         """N C N^T along x, y, z; N turns the six numbers of a stress, the material's directions being columns of Q."""
@@ -132,46 +133,16 @@ class Orthotropic(Material):
         N = first[..., i] * second[..., j] + (i != j) * first[..., j] * second[..., i]
         return (N @ self._stiffness(x) @ np.swapaxes(N, -1, -2))[..., ROWS, COLUMNS]
 
-    def _pulled_back(self, values: dict, jvp, adjoint: np.ndarray) -> dict[str, np.ndarray]:
-        """Adjoints of the values from the change that each brings."""
-        units = ((name, unit) for name in self.inputs for unit in (np.eye(3) if self.shape_of(name) else [1.0]))
-        columns = [(adjoint * jvp(values, {name: unit})).sum(-1) for name, unit in units]
-        return self._columns_vjp(values, self.inputs, columns)
-
-    def coefficients_vjp(self, values, coefficients_adj):
-        return self._pulled_back(values, self.coefficients_jvp, np.asarray(coefficients_adj, np.float64))
-
     def lame(self, values):
+        """2 mu is the largest eigenvalue of C less lam 1 (x) 1, on strains of unit length."""
         self.check(values)
-        return tuple(np.moveaxis(self._moduli(self._stiffness(values)), -1, 0))
-
-    def _moduli(self, C, dC=None) -> np.ndarray:
-        """(mu, lam), or their change: 2 mu is the largest eigenvalue of C less lam 1 (x) 1, on strains of unit length."""
-        length = np.array([1, 1, 1, 2**0.5, 2**0.5, 2**0.5])
-
-        def parts(c):
-            lam = c[..., [0, 1, 0], [1, 2, 2]].mean(-1)
-            rest = c * np.outer(length, length)
-            rest[..., :3, :3] -= lam[..., None, None]
-            return lam, rest
-
-        lam, rest = parts(C)
-        sizes, vectors = np.linalg.eigh(rest)
-        if dC is None:
-            return np.stack([sizes[..., -1] / 2, lam], -1)
-        d_lam, d_rest = parts(dC)
+        C, length, of_normal = self._stiffness(values), np.array([1, 1, 1, 2**0.5, 2**0.5, 2**0.5]), np.zeros((6, 6))
+        of_normal[:3, :3] = 1
+        lam = C[..., [0, 1, 0], [1, 2, 2]].mean(-1)
+        rest = C * np.outer(length, length) - lam[..., None, None] * of_normal
+        sizes, vectors = np.linalg.eigh(value_of(rest))
         v = vectors[..., -1]
-        return np.stack([np.einsum("...i,...ij,...j", v, d_rest, v) / 2, d_lam], -1)
-
-    def _moduli_jvp(self, values, tangents) -> np.ndarray:
-        return self._moduli(self._stiffness(values), self._stiffness(stepped(values, tangents)).imag / TINY)
-
-    def lame_jvp(self, values, tangents):
-        return tuple(np.moveaxis(self._moduli_jvp(values, tangents), -1, 0))
-
-    def lame_vjp(self, values, mu_adj, lam_adj):
-        adjoint = np.stack(np.broadcast_arrays(mu_adj, lam_adj), -1)
-        return self._pulled_back(values, self._moduli_jvp, adjoint)
+        return with_slopes(sizes[..., -1], (rest, lambda: v[..., :, None] * v[..., None, :])) / 2, lam
 
     def law(self, precision):
         return HookeLaw(precision)

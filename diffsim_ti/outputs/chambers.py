@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import wholes
+from diffsim_ti.differentiation.arrays import value_of, with_slopes
 from diffsim_ti.mechanics.chambers.pressures import law_of, rows_of
 from diffsim_ti.mesh.enclosure import Enclosure, open_edges
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.output import Frames, Output, derived
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Chamber
 
@@ -28,18 +29,15 @@ class ChamberPressure(Output):
     doi:10.1017/CBO9780511755446.
     """
 
-    reads_chamber_pressures = True
+    reads_chamber_pressures, _shown = True, ("chamber",)
 
     def __init__(self, chamber: Chamber | str, name: str = "chamber_pressure"):
         self.chamber, self.name = chamber, name
 
-    def __repr__(self) -> str:
-        return f"ChamberPressure({self.chamber!r}, name={self.name!r})"
-
     def settled(self, scene: Scene) -> "ChamberPressure":
         out = copy(self)
         chambers = scene.terms_of(Chamber)
-        out.place, out.inputs = scene.place_among(chambers, self.chamber, "chamber"), scene.inputs
+        out.place, out.scene = scene.place_among(chambers, self.chamber, "chamber"), scene
         chamber = chambers[out.place]
         out.law, out.enclosure, (out.rows,) = law_of(chamber), chamber.enclosure, rows_of(scene, [chamber])
         return out
@@ -47,56 +45,18 @@ class ChamberPressure(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,)
 
-    @staticmethod
-    def _at(step: int, rows: np.ndarray) -> tuple[int, int]:
-        """Of rows of numbers, which one and which end of its step a frame shows."""
-        return min(max(step - 1, 0), len(rows) - 1), 1 if step else 0
-
-    def _numbers(self, step: int, follower: np.ndarray) -> np.ndarray:
-        row, end = self._at(step, follower)
-        return follower[row, self.rows, end]
-
-    def _volumes(self, frames) -> list[float]:
-        return [self.enclosure.volume(x.astype(np.float64)) for x in frames.positions]
-
     def value(self, frames: Frames) -> np.ndarray:
         if self.law.holds:
             return frames.chamber_pressures[:, self.place].copy()
-        follower, out = self.inputs.derive(frames.inputs).follower, []
-        for step, V in zip(frames.steps, self._volumes(frames)):
-            self.law.at(self._numbers(int(step), follower), 1.0)
-            out.append(self.law.pressure(V))
-        return np.array(out)
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        if self.law.holds:
-            zero = np.zeros(len(frames.positions))
-            return zero if change.chamber_pressures is None else change.chamber_pressures[:, self.place]
-        follower = self.inputs.derive(frames.inputs).follower
-        moved = self.inputs.derive_jvp(frames.inputs, change.inputs).follower
-        out = []
-        for k, (step, V) in enumerate(zip(frames.steps, self._volumes(frames))):
-            self.law.at(self._numbers(int(step), follower), 1.0)
-            out.append(self.law.by_numbers(V) @ self._numbers(int(step), moved))
-            if change.positions is not None:
-                G = self.enclosure.gradient(frames.positions[k].astype(np.float64))
-                out[-1] += self.law.slope(V) * (G * change.positions[k]).sum()
-        return np.array(out)
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        if self.law.holds:
-            out = np.zeros(frames.chamber_pressures.shape)
-            out[:, self.place] = seed
-            return Change(chamber_pressures=out)
-        derived, positions = self.inputs.derive(frames.inputs), np.zeros(frames.positions.shape)
-        adj = derived.zeros()
-        for k, (step, V) in enumerate(zip(frames.steps, self._volumes(frames))):
-            self.law.at(self._numbers(int(step), derived.follower), 1.0)
-            row, end = self._at(int(step), adj.follower)
-            adj.follower[row, self.rows, end] += seed[k] * self.law.by_numbers(V)
-            G = self.enclosure.gradient(frames.positions[k].astype(np.float64))
-            positions[k] = seed[k] * self.law.slope(V) * G
-        return Change(positions=positions, inputs=self.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs)))
+        follower, out = derived(self.scene, frames).follower, []
+        for step, x in zip(map(int, frames.steps), frames.positions):
+            row, end = min(max(step - 1, 0), len(follower) - 1), 1 if step else 0  # of its step, which a frame shows
+            numbers, volume = follower[row, self.rows, end], _volume(self.enclosure, x)
+            self.law.at(value_of(numbers), 1.0)
+            V = value_of(volume)
+            slopes = (volume, lambda: self.law.slope(V)), (numbers, lambda: self.law.by_numbers(V))
+            out.append(with_slopes(self.law.pressure(V), *slopes))
+        return np.stack(out)
 
 
 class EnclosedVolume(Output):
@@ -149,14 +109,9 @@ class EnclosedVolume(Output):
         return (num_frames,)
 
     def value(self, frames: Frames) -> np.ndarray:
-        return np.array([-self.enclosure.volume(x) for x in frames.positions.astype(np.float64)])
+        return -np.stack([_volume(self.enclosure, x) for x in frames.positions])
 
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        if change.positions is None:
-            return np.zeros(len(frames.positions))
-        by = self.vjp(frames, np.ones(len(frames.positions))).positions
-        return (by * change.positions).sum((1, 2))
 
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        gradients = [-s * self.enclosure.gradient(x) for s, x in zip(seed, frames.positions.astype(np.float64))]
-        return Change(positions=np.stack(gradients))  # a closed surface: where it counts from adds nothing
+def _volume(enclosure: Enclosure, x: np.ndarray) -> np.ndarray:
+    places = value_of(x).astype(np.float64)
+    return with_slopes(enclosure.volume(places), (x, lambda: enclosure.gradient(places)))

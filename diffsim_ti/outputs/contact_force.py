@@ -6,8 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.output import Frames, Output, force_or_moment
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Term
 
@@ -39,7 +38,7 @@ class ContactForce(Output):
     Wriggers, Computational Contact Mechanics, 2nd ed., 2006, sec. 5 and 8, doi:10.1007/978-3-540-32609-0.
     """
 
-    reads_contact_forces, unit = True, "N"
+    reads_contact_forces, unit, _shown = True, "N", ("obstacle", "part")
 
     def __init__(
         self,
@@ -63,9 +62,6 @@ class ContactForce(Output):
         if self.about is not None and (self.about.shape != (3,) or not np.all(np.isfinite(self.about))):
             raise ValueError(f"{said}: about must be 3 finite numbers [m], got {about!r}")
 
-    def __repr__(self) -> str:
-        return f"ContactForce({self.obstacle!r}, {self.part!r}, name={self.name!r})"
-
     def settled(self, scene: Scene) -> "ContactForce":
         out = copy(self)
         out.place, out.num_vertices = self._place(scene), scene.mesh.num_vertices
@@ -81,31 +77,6 @@ class ContactForce(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames, self.num_vertices, 3) if self.per_vertex else (num_frames, 3)
 
-    def _of(self, forces: np.ndarray) -> np.ndarray:
-        """On each vertex that counts."""
-        return forces[:, self.place, self.sides].sum(1)[:, self.vertices]
-
     def value(self, frames: Frames) -> np.ndarray:
-        f = self._of(frames.contact_forces)
-        if self.about is not None:
-            return moments(frames.positions[:, self.vertices], self.about, f)
-        return f if self.per_vertex else f.sum(1)
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        x, dx = frames.positions[:, self.vertices], change.positions
-        df = np.zeros(x.shape) if change.contact_forces is None else self._of(change.contact_forces)
-        if self.about is not None:
-            dx = None if dx is None else dx[:, self.vertices]
-            return moments_jvp(x, self.about, self._of(frames.contact_forces), dx, df)
-        return df if self.per_vertex else df.sum(1)
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        by_forces, positions = np.zeros(frames.contact_forces.shape), None
-        by_vertex = np.zeros(frames.positions.shape)
-        by_vertex[:, self.vertices] = seed if self.per_vertex else seed[:, None]
-        if self.about is not None:
-            positions, x = np.zeros(by_vertex.shape), frames.positions[:, self.vertices]
-            own = moments_vjp(x, self.about, self._of(frames.contact_forces), seed)
-            positions[:, self.vertices], by_vertex[:, self.vertices] = own
-        by_forces[:, self.place, self.sides] = by_vertex[:, None]
-        return Change(positions=positions, contact_forces=by_forces)
+        forces = frames.contact_forces[:, self.place, self.sides].sum(1)[:, self.vertices]
+        return forces if self.per_vertex else force_or_moment(forces, frames.positions[:, self.vertices], self.about)

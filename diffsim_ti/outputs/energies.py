@@ -5,13 +5,14 @@ from copy import copy
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import made, value_of, with_slopes
 from diffsim_ti.inputs import ConsistentMass
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.mesh.named_sets import SetOrIndices
-from diffsim_ti.outputs.deformation import Deformation
+from diffsim_ti.outputs.deformation import displacement_gradients
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads
-from diffsim_ti.outputs.output import Change, Frames, Output
-from diffsim_ti.outputs.stresses import PatchPressure, at_points
+from diffsim_ti.outputs.output import Change, Frames, Output, derived
+from diffsim_ti.outputs.stresses import at_points, patch_pressure, with_state
 from diffsim_ti.scene import Scene
 
 
@@ -59,58 +60,18 @@ class ElasticEnergy(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,) if self.sets is None else (num_frames, len(self.sets))
 
-    def _densities(self, frames):
-        """(what kernels read, deformation, psi, P, dpsi/dp, dpsi/dz, pressures of patches or None), by frames and points:
-        with patches psi is what each point has by itself. z: what the law remembers."""
-        derived = self.scene.inputs.derive(frames.inputs)
-        deformation = Deformation.of(frames, derived, self.scene.mesh, self.all)
-        F, z = deformation.F, self.remembered(frames, self.scene)
-        at = PatchPressure.of(self.scene, derived, deformation.H) if self.patched else None
-        p = self._at_points(derived.coefficients) if at is None else at.kept
-        p = np.tile(p, (len(F), 1))
-        own = evaluate(self.law, F.reshape(-1, 3, 3), np.concatenate([p, z.reshape(len(p), z.shape[-1])], 1))
-        psi, P, by = (x.astype(np.float64).reshape(*F.shape[:2], *x.shape[1:]) for x in own)
-        by_p, by_z = np.split(by, [p.shape[1]], 2)
-        return derived, deformation, psi, P, by_p, by_z.reshape(z.shape), at
-
-    def _at_points(self, coefficients: np.ndarray) -> np.ndarray:
-        """Of all points, shape (points, K)."""
-        return at_points(coefficients, len(self.all), self.points).reshape(-1, coefficients.shape[-1])
-
     def value(self, frames: Frames) -> np.ndarray:
-        derived, _, psi, *_, at = self._densities(frames)
-        psi = psi if at is None else psi + 0.5 * at.value * at.theta
-        return ((psi * derived.volumes.ravel()) @ self.masks.T).reshape(self.shape(len(psi)))
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        derived, deformation, psi, P, by, by_z, at = self._densities(frames)
-        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
-        du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
-        dH, dp, dV = deformation.jvp(du, moved.gradients), self._at_points(moved.coefficients), moved.volumes.ravel()
-        dpsi = (P * dH).sum((2, 3)) + (by * (dp if at is None else at.without_lam(dp))).sum(2)
-        dpsi += (by_z * self.remembered_jvp(change, by_z)).sum(3).reshape(psi.shape)
-        if at is not None:
-            psi = psi + 0.5 * at.value * at.theta
-            dpsi = dpsi + 0.5 * (at.jvp(dH, dp, dV) * at.theta + at.value * at.theta_jvp(dH))
-        return ((dpsi * derived.volumes.ravel() + psi * dV) @ self.masks.T).reshape(self.shape(len(psi)))
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        derived, deformation, psi, P, by, by_z, at = self._densities(frames)
-        adjoint, weight = derived.zeros(), seed.reshape(len(psi), -1) @ self.masks  # by frames and points
-        scaled = weight * derived.volumes.ravel()
-        H_adj, by_p, by_V = scaled[..., None, None] * P, (scaled[..., None] * by).sum(0), (weight * psi).sum(0)
-        if at is not None:
-            by_theta, by_lam, own = at.vjp(0.5 * scaled * at.theta)
-            H_adj = H_adj + (by_theta + 0.5 * scaled * at.value)[..., None, None] * at.G
-            by_p, by_V = at.split_vjp(by_p, by_lam), by_V + own + (0.5 * weight * at.value * at.theta).sum(0)
-        by_p = by_p.reshape(len(self.all), self.points, -1)
-        by_p = by_p if derived.coefficients.ndim == 3 else by_p.sum(1)
-        positions, adjoint.gradients = deformation.vjp(H_adj, frames.positions.shape[1])
-        adjoint.coefficients = by_p.sum(0) if derived.coefficients.ndim == 1 else by_p
-        adjoint.volumes, adjoint.rest = by_V.reshape(derived.volumes.shape), -positions.sum(0)
-        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        by_state = self.remembered_vjp(frames, scaled.reshape(by_z.shape[:3])[..., None] * by_z)
-        return Change(positions=positions, inputs=inputs, law_state=by_state)
+        of, z, added = derived(self.scene, frames), self.remembered(frames, self.scene), 0.0
+        H = displacement_gradients(frames, of, self.scene.mesh, self.all)
+        if self.patched:
+            pressure, p, theta, _ = patch_pressure(self.scene, of, H)
+            added = 0.5 * pressure * theta
+        else:
+            p = at_points(of.coefficients, len(self.all), self.points).reshape(-1, of.coefficients.shape[-1])
+        F, p = (np.eye(3) + H).reshape(-1, 3, 3), with_state(p, z)
+        psi, P, by_p = evaluate(self.law, value_of(F), value_of(p))
+        psi = with_slopes(psi, (F, lambda: P), (p, lambda: by_p)).reshape(H.shape[:2]) + added
+        return ((psi * of.volumes.ravel()) @ self.masks.T).reshape(self.shape(len(psi)))
 
 
 class Dissipation(ElasticEnergy):
@@ -160,39 +121,24 @@ class KineticEnergy(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,) if self.sets is None else (num_frames, len(self.sets))
 
-    def _read(self, frames):
-        return frames.velocities.astype(np.float64), self.scene.inputs.derive(frames.inputs)
-
-    def _products(self, derived, v: np.ndarray) -> np.ndarray:
-        """M v of each frame, or its change for those of M."""
-        if derived.element_masses is None:
-            return derived.mass[:, None] * v
-        mass = ConsistentMass.of(self.scene.mesh, derived.element_masses)
-        return np.stack([mass * frame for frame in v])
-
     def value(self, frames: Frames) -> np.ndarray:
-        v, derived = self._read(frames)
-        return (0.5 * (v * self._products(derived, v)).sum(2) @ self.masks.T).reshape(self.shape(len(v)))
+        v, of = frames.velocities.astype(np.float64), derived(self.scene, frames)
+        momentum = of.mass[:, None] * v if of.element_masses is None else self._momentum(of.element_masses, v)
+        return (0.5 * (v * momentum).sum(2) @ self.masks.T).reshape(self.shape(len(v)))
 
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        v, derived = self._read(frames)
-        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
-        dv = np.zeros(v.shape) if change.velocities is None else change.velocities
-        grown = dv * self._products(derived, v) + v * (self._products(derived, dv) + self._products(moved, v))
-        return (0.5 * grown.sum(2) @ self.masks.T).reshape(self.shape(len(v)))
+    def _momentum(self, masses: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """M v of each frame."""
+        mesh, m, w = self.scene.mesh, value_of(masses), value_of(v)
 
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        v, derived = self._read(frames)
-        adjoint, weight = derived.zeros(), (seed.reshape(len(v), -1) @ self.masks)[..., None]
-        if derived.element_masses is None:
-            adjoint.mass = 0.5 * (weight * v**2).sum((0, 2))
-        else:
-            nodes = self.scene.mesh.elements
-            for own, scaled in zip(v, 0.5 * weight * v):
-                adjoint.element_masses += np.einsum("eai,ebi->eab", scaled[nodes], own[nodes])
-        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        by_v = 0.5 * (weight * self._products(derived, v) + self._products(derived, weight * v))
-        return Change(velocities=by_v, inputs=inputs)
+        def product(masses, v):
+            mass = ConsistentMass.of(mesh, masses)
+            return np.stack([mass * frame for frame in v])
+
+        def by_masses(seed):
+            return np.einsum("feai,febi->eab", seed[:, mesh.elements], w[:, mesh.elements], optimize=True)
+
+        of_v = v, lambda dv: product(m, dv), lambda seed: product(m, seed)
+        return made(product(m, w), of_v, (masses, lambda dm: product(dm, w), by_masses))
 
 
 class WorkOfLoads(Output):

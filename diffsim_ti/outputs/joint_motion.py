@@ -5,9 +5,10 @@ from copy import copy
 import numpy as np
 
 from diffsim_ti.common import rotations
+from diffsim_ti.differentiation.arrays import made, value_of, with_slopes
 from diffsim_ti.mechanics.joints.joints import moved
 from diffsim_ti.mechanics.robots import Robots
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.output import Frames, Output, derived
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Gravity, Robot
 from diffsim_ti.terms.robots.model import bracket
@@ -21,13 +22,10 @@ class JointPositions(Output):
     Raises ValueError, when a Rollout is made, for a robot that the scene has not.
     """
 
-    reads_joint_states, column = True, 0
+    reads_joint_states, _shown, column = True, ("robot",), 0
 
     def __init__(self, robot: Robot | str = "robot", name: str = "joint_positions"):
         self.robot, self.name = robot, name
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.robot!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "JointPositions":
         out, robots = copy(self), scene.terms_of(Robot)
@@ -40,15 +38,6 @@ class JointPositions(Output):
 
     def value(self, frames: Frames) -> np.ndarray:
         return frames.joint_states[:, self.own, self.column].copy()
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        states = change.joint_states
-        return np.zeros(self.shape(len(frames.times))) if states is None else states[:, self.own, self.column]
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        out = np.zeros(frames.joint_states.shape)
-        out[:, self.own, self.column] = seed
-        return Change(joint_states=out)
 
 
 class JointVelocities(JointPositions):
@@ -101,10 +90,9 @@ class LinkMotion(JointPositions):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return num_frames, 13
 
-    def _stand(self, states: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _stand(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
         """(quaternion, position of the origin, velocities of origin and spin by joints, joint velocities, changes of these
         velocities by joint positions)"""
-        q, v = states[self.own, :2].T
         frames, S = self.model.kinematics(q)
         joint, place = self.model.links[self.link]
         turn, t = joined(frames[joint], place) if joint >= 0 else place
@@ -116,24 +104,21 @@ class LinkMotion(JointPositions):
         return turn if turn[0] >= 0 else -turn, t, J, v, bent
 
     def value(self, frames: Frames) -> np.ndarray:
-        stands = map(self._stand, frames.joint_states)
-        return np.stack([np.concatenate([t, turn, v @ J]) for turn, t, J, v, _ in stands])
+        return np.stack([self._motion(states[self.own, :2]) for states in frames.joint_states])
 
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        out = np.zeros(self.shape(len(frames.times)))
-        for row, states, d in zip(out, frames.joint_states, () if change.joint_states is None else change.joint_states):
-            (turn, _, J, _, bent), (dq, dv) = self._stand(states), d[self.own, :2].T
-            row[:3], row[3:7] = dq @ J[:, :3], 0.5 * rotations.product(np.append(0.0, dq @ J[:, 3:]), turn)
-            row[7:] = dv @ J + dq @ bent
-        return out
+    def _motion(self, states: np.ndarray) -> np.ndarray:
+        turn, t, J, v, bent = self._stand(*value_of(states).T)
 
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        out = np.zeros(frames.joint_states.shape)
-        for row, states, w in zip(out, frames.joint_states, seed):
-            turn, _, J, _, bent = self._stand(states)
+        def push(change):
+            dq, dv = change.T
+            dturn = 0.5 * rotations.product(np.append(0.0, dq @ J[:, 3:]), turn)
+            return np.concatenate([dq @ J[:, :3], dturn, dv @ J + dq @ bent])
+
+        def pull(w):
             by_turn = 0.5 * rotations.product(w[3:7], rotations.conjugate(turn))[1:]
-            row[self.own, 0], row[self.own, 1] = J @ np.append(w[:3], by_turn) + bent @ w[7:], J @ w[7:]
-        return Change(joint_states=out)
+            return np.stack([J @ np.append(w[:3], by_turn) + bent @ w[7:], J @ w[7:]], 1)
+
+        return made(np.concatenate([t, turn, v @ J]), (states, push, pull))
 
 
 class LinkEnergy(JointPositions):
@@ -159,48 +144,22 @@ class LinkEnergy(JointPositions):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return num_frames, 2
 
-    def _numbers(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(masses, gravity)"""
-        g = parameters[self.gravity][:3]
-        return self.all.numbers(parameters)[4, self.own], g if len(g) else np.zeros(3)
+    def value(self, frames: Frames) -> np.ndarray:
+        parameters = derived(self.scene, frames).parameters
+        masses, g = self.all.numbers(parameters)[4, self.own], parameters[self.gravity][:3]
+        g = g if len(g) else np.zeros(3)
+        return np.stack([self._of(*(states[self.own, k] for k in (0, 1)), masses, g) for states in frames.joint_states])
 
-    def _of(self, q, v, masses, g) -> tuple[np.ndarray, tuple]:
-        """(energies of a frame; its derivatives by q, v, masses and g, two rows or columns each)"""
-        model, none = self.model, np.zeros(3)
+    def _of(self, *numbers) -> np.ndarray:
+        """Energies of a frame, of joint positions and velocities, masses and gravity."""
+        (q, v, masses, g), model, none = map(value_of, numbers), self.model, np.zeros(3)
         M, _ = model.dynamics(q, 0 * v, masses, none)
         _, weight = model.dynamics(q, 0 * v, masses, g)
         by_q, _, by_masses, _ = model.derivatives(q, 0 * v, v, masses, none)
         c = np.array(
             [t + rotations.turned(turn, i.lever) for (turn, t), i in zip(model.kinematics(q)[0], model.inertias)]
         )
-        energies = np.array([0.5 * v @ M @ v, -masses @ c @ g])
-        own = [0.5 * v @ by_q, weight], [M @ v, 0 * v], [0.5 * v @ by_masses, -c @ g], [none, -masses @ c]
-        return energies, tuple(np.stack(rows) for rows in own)
-
-    def _each(self, frames: Frames) -> tuple:
-        derived = self.scene.inputs.derive(frames.inputs)
-        numbers = self._numbers(derived.parameters)
-        return derived, [self._of(rows[self.own, 0], rows[self.own, 1], *numbers) for rows in frames.joint_states]
-
-    def value(self, frames: Frames) -> np.ndarray:
-        return np.stack([energies for energies, _ in self._each(frames)[1]])
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        moved_so = self._numbers(self.scene.inputs.derive_jvp(frames.inputs, change.inputs).parameters)
-        states = np.zeros(frames.joint_states.shape) if change.joint_states is None else change.joint_states
-        out = []
-        for rows, (_, by) in zip(states, self._each(frames)[1]):
-            changes = rows[self.own, 0], rows[self.own, 1], *moved_so
-            out.append(sum(derivative @ x for derivative, x in zip(by, changes)))
-        return np.stack(out)
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        out, (derived, found) = np.zeros(frames.joint_states.shape), self._each(frames)
-        adjoint, by_numbers = derived.zeros(), np.zeros((5, self.all.count))
-        for row, w, (_, by) in zip(out, seed, found):
-            row[self.own, 0], row[self.own, 1], by_masses, by_g = (w @ derivative for derivative in by)
-            by_numbers[4, self.own] += by_masses
-            adjoint.parameters[self.gravity][:3] += by_g[: len(adjoint.parameters[self.gravity][:3])]
-        self.all.add_numbers(adjoint.parameters, by_numbers)
-        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(joint_states=out, inputs=inputs)
+        motion = 0.5 * v @ M @ v, (0.5 * v @ by_q, M @ v, 0.5 * v @ by_masses, none)
+        place = -masses @ c @ g, (weight, 0 * v, -c @ g, -masses @ c)
+        both = [(x, [(of, lambda by=by: by) for of, by in zip(numbers, slopes)]) for x, slopes in (motion, place)]
+        return np.stack([with_slopes(x, *slopes) for x, slopes in both])

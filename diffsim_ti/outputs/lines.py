@@ -22,12 +22,10 @@ class _OfLines(Output):
 
     quantity: str
     numbers: int
+    _shown = ("of",)
 
     def __init__(self, of: LineTerm | str, name: str):
         self.of, self.name = of, name
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.of!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "_OfLines":
         out = copy(self)

@@ -3,12 +3,15 @@ and the states themselves as outputs, which every rollout has."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import Public
+from diffsim_ti.differentiation.arrays import Node, Recorded, forward, made, reverse
+from diffsim_ti.inputs import Derived
 from diffsim_ti.scene import Scene
 from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import Growth
@@ -123,18 +126,92 @@ class Change:
             self.inputs[name] = self.inputs[name] + value if name in self.inputs else value
 
 
+class _DerivedNode(Node):
+    """What kernels read, of inputs that record: its arrays record, too."""
+
+    def __init__(self, scene: Scene, inputs: Node):
+        read, values = scene.inputs, inputs.value
+
+        def pull(adjoint):
+            return lambda into: _add_to(into, read.derive_vjp(values, adjoint, tuple(values)))
+
+        value = read.derive(values)
+        super().__init__(value, [(inputs, lambda changes: read.derive_jvp(values, changes), pull)], value.zeros)
+
+    def __getattr__(self, name: str):
+        def pull(seed):
+            return lambda into: setattr(into, name, getattr(into, name) + seed)
+
+        value = getattr(self.value, name)
+        return None if value is None else made(value, (self, lambda change: getattr(change, name), pull))
+
+
+def _add_to(into: dict, more: dict) -> None:
+    for name, x in more.items():
+        into[name] = into[name] + x if name in into else x
+
+
+class _Recording:
+    """Frames whose states and inputs record what outputs do to them."""
+
+    def __init__(self, frames: Frames):
+        self.frames = frames
+        known = {name: getattr(frames, name) for name in ("positions", "velocities", *NOTED)}
+        self.leaves = {name: Recorded(np.asarray(x, np.float64)) for name, x in known.items() if x is not None}
+        self.numbers = Node(frames.inputs, (), dict)
+
+    def __getattr__(self, name: str):
+        return self.leaves[name] if name in self.leaves else getattr(self.frames, name)
+
+    def __getitem__(self, name: str):
+        return getattr(self, name)
+
+    @cached_property
+    def inputs(self) -> dict[str, Recorded]:
+        def leaf(name, x):
+            return made(
+                x, (self.numbers, lambda changes: changes.get(name), lambda s: lambda into: _add_to(into, {name: s}))
+            )
+
+        return {name: leaf(name, x) for name, x in self.frames.inputs.items()}
+
+    @cached_property
+    def displacements(self) -> Recorded:
+        """Of the frames' own digits; they change as positions less the rest shape do."""
+        of_places = self.leaves["positions"], lambda dx: dx, lambda seed: seed
+        of_rest = self.inputs["rest_positions"], lambda dX: -dX, lambda seed: -seed.sum(0)
+        return made(self.frames.displacements.astype(np.float64), of_places, of_rest)
+
+    def tangent(self, y, change: "Change") -> np.ndarray:
+        """Change of what was made of the frames."""
+        changes = [(leaf, getattr(change, name)) for name, leaf in self.leaves.items()]
+        return forward(y, [*changes, (self.numbers, change.inputs)])
+
+    def adjoint(self, y, seed: np.ndarray) -> "Change":
+        """Gradient for that by what was made of them."""
+        *states, inputs = reverse(y, seed, [*self.leaves.values(), self.numbers])
+        return Change(**dict(zip(self.leaves, states)), inputs=inputs or {})
+
+
+def derived(scene: Scene, frames: "Frames | _Recording") -> Derived:
+    """What kernels read of the inputs of frames."""
+    return _DerivedNode(scene, frames.numbers) if isinstance(frames, _Recording) else scene.inputs.derive(frames.inputs)
+
+
 class Output(metaclass=Public):
     """A function y(positions, velocities, inputs) of a run's frames, for `Rollout(..., outputs=[...])`.
 
-    Write one outside the package by giving it `name`, `shape`, `value`, `jvp` and `vjp`, in NumPy and float64; it is then
-    in `frames[name]` and `Rollout.tangents`, takes a seed in `Rollout.vjp(frames, name=...)`, and has a field under
+    Write one outside the package by giving it `name`, `shape` and `value`, in NumPy and float64; it is then in
+    `frames[name]` and `Rollout.tangents`, takes a seed in `Rollout.vjp(frames, name=...)`, and has a field under
     `ti.ad.Tape` and a tensor in torch. `frames` (`Frames`) holds the states and, in `frames.inputs`, the values of
-    all inputs. Rollout.tangents and Rollout.vjp must agree in <w, J d> = <J^T w, d>: check a new output by that and by
-    differences.
+    all inputs. Derivatives are found from `value` (differentiation/arrays.py), which says with a TypeError what it has none
+    of; there write `jvp` and `vjp` beside it. Rollout.tangents and Rollout.vjp must then agree in <w, J d> = <J^T w, d>:
+    check that, and differences.
     Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.
     """
 
     name: str
+    _shown: tuple[str, ...] = ()  # arguments that `repr` shows, beside the name
     unit = ""  # for pictures
     linear = False  # whether it is linear in positions and velocities
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
@@ -143,6 +220,10 @@ class Output(metaclass=Public):
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
     reads_law_state = False  # the same of frames.law_state, where the law remembers
     reads_joint_states = False  # whether it reads frames.joint_states, which runs of robots note
+
+    def __repr__(self) -> str:
+        given = [repr(getattr(self, argument)) for argument in self._shown]
+        return f"{type(self).__name__}({', '.join([*given, f'name={self.name!r}'])})"
 
     @staticmethod
     def refuse_growth(output: str, scene: Scene) -> None:
@@ -167,16 +248,6 @@ class Output(metaclass=Public):
             )
         return frames.law_state.reshape(shape)
 
-    @staticmethod
-    def remembered_jvp(change: Change, z: np.ndarray) -> np.ndarray:
-        """The change of the same, z, in `change`."""
-        return change.law_state.reshape(z.shape) if z.size and change.law_state is not None else np.zeros_like(z)
-
-    @staticmethod
-    def remembered_vjp(frames: Frames, z_adj: np.ndarray) -> np.ndarray | None:
-        """The gradient by frames.law_state for that by the same, z."""
-        return z_adj.reshape(frames.law_state.shape) if z_adj.size else None
-
     def settled(self, scene: Scene) -> "Output":
         """This output for a scene: checked, with what depends on the scene alone; raises ValueError if it does not fit."""
         return self
@@ -189,13 +260,41 @@ class Output(metaclass=Public):
     def value(self, frames: Frames) -> np.ndarray:
         """y."""
 
-    @abstractmethod
     def jvp(self, frames: Frames, change: Change) -> np.ndarray:
         """Change of y for a change of frames and inputs, to first order."""
+        at = _Recording(frames)
+        return at.tangent(self.value(at), change)
 
-    @abstractmethod
     def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
         """Gradient by frames and inputs of a loss whose gradient by y is `seed`."""
+        at = _Recording(frames)
+        return at.adjoint(self.value(at), seed)
+
+
+def taken_from(output: Output, frames: "Frames | _Recording") -> np.ndarray:
+    """The value of an output for another one, also where it has derivatives of its own."""
+    if not isinstance(frames, _Recording) or type(output).vjp is Output.vjp:
+        return output.value(frames)
+    plain, found = frames.frames, []
+
+    def push(name):
+        return lambda change: output.jvp(plain, Change(**{name: change}))
+
+    def pull(name):
+        return lambda seed: getattr(adjoint(seed), name)
+
+    def adjoint(seed):  # asked for once for each leaf
+        found.extend(() if found else [output.vjp(plain, seed)])
+        return found[0]
+
+    states = [(leaf, push(name), pull(name)) for name, leaf in frames.leaves.items()]
+    by_inputs = lambda seed: lambda into: _add_to(into, adjoint(seed).inputs)  # noqa: E731
+    return made(output.value(plain), *states, (frames.numbers, push("inputs"), by_inputs))
+
+
+def force_or_moment(forces: np.ndarray, places: np.ndarray, about: np.ndarray | None) -> np.ndarray:
+    """Sum of forces on vertices in each frame, shape (frames, 3), or sum_i (x_i - about) x f_i."""
+    return forces.sum(1) if about is None else np.cross(places.astype(np.float64) - about, forces).sum(1)
 
 
 class _States(Output):

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
+from diffsim_ti.differentiation.arrays import summed_at, value_of
 from diffsim_ti.inputs import Derived
-from diffsim_ti.mesh.geometry import barycentric_in_plane, inverse_edges, shape_gradients
+from diffsim_ti.mesh.geometry import barycentric_in_plane, inverse_edges
 from diffsim_ti.mesh.jacobian import barycentric_in
 from diffsim_ti.outputs.deformation import followed
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.output import Frames, Output, derived
 from diffsim_ti.scene import Scene
 
 if TYPE_CHECKING:
@@ -62,43 +63,17 @@ class MaterialPoints(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return num_frames, len(self.points), 3
 
-    def _weights(self, frames) -> tuple[np.ndarray, np.ndarray]:
-        """(grad N, shape (num_points, nodes, 3), N, shape (num_points, nodes)) at the points, in the rest shape."""
-        X, nodes = frames.inputs["rest_positions"], self.located.vertices
-        if self.element.order == 2:
-            by_xi = self.element.derivatives(xi := followed(X, self.located, self.xi))
-            return by_xi @ np.linalg.inv(np.einsum("pai,pak->pik", X[nodes], by_xi)), self.element.functions(xi)
-        B = inverse_edges(X, nodes)
-        inner = np.einsum("pij,pj->pi", B, self.points - X[nodes[:, 0]])
-        return shape_gradients(B), np.concatenate([1 - inner.sum(1, keepdims=True), inner], 1)
-
-    def _deformation(self, frames, gradients: np.ndarray) -> np.ndarray:
-        """F at the points, shape (frames, num_points, 3, 3)."""
-        u = frames.displacements[:, self.located.vertices].astype(np.float64)
-        return np.eye(3) + np.einsum("fpai,paj->fpij", u, gradients)
-
     def value(self, frames: Frames) -> np.ndarray:
         u = frames.displacements[:, self.located.vertices].astype(np.float64)
-        return self.points + np.einsum("pa,fpai->fpi", self._weights(frames)[1], u)
+        return self.points + np.einsum("pa,fpai->fpi", self._shares(frames.inputs["rest_positions"]), u)
 
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        gradients, N = self._weights(frames)
-        out = np.zeros(self.shape(len(frames.positions)))
-        if change.positions is not None:
-            out += np.einsum("pa,fpai->fpi", N, change.positions[:, self.located.vertices])
-        if "rest_positions" in change.inputs:
-            moved = np.einsum("pa,pai->pi", N, change.inputs["rest_positions"][self.located.vertices])
-            out -= np.einsum("fpij,pj->fpi", self._deformation(frames, gradients), moved)
-        return out
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        gradients, N = self._weights(frames)
-        positions, rest = np.zeros(frames.positions.shape), np.zeros(frames.positions.shape[1:])
-        for frame, s in zip(positions, seed):
-            np.add.at(frame, self.located.vertices, N[:, :, None] * s[:, None])
-        pulled = np.einsum("fpij,fpi->pj", self._deformation(frames, gradients), seed)
-        np.add.at(rest, self.located.vertices, -N[:, :, None] * pulled[:, None])
-        return Change(positions=positions, inputs={"rest_positions": rest})
+    def _shares(self, X: np.ndarray) -> np.ndarray:
+        """N at the points in rest positions X, shape (num_points, nodes)."""
+        if self.element.order == 2:
+            return self.element.functions(followed(X, self.located, self.xi))
+        nodes = self.located.vertices
+        inner = np.einsum("pij,pj->pi", inverse_edges(X, nodes), self.points - X[nodes[:, 0]])
+        return np.concatenate([1 - inner.sum(1, keepdims=True), inner], 1)
 
 
 class CenterOfMass(Output):
@@ -123,63 +98,32 @@ class CenterOfMass(Output):
     [2.5, 0.5, 0.5]
     """
 
-    unit = "m"
-
-    linear = True
+    unit, linear, _shown = "m", True, ("of",)
 
     def __init__(self, of: str | ArrayLike | None = None, name: str = "center_of_mass"):
         self.of, self.name = of, name
-
-    def __repr__(self) -> str:
-        return f"CenterOfMass({self.of!r}, name={self.name!r})"
 
     def settled(self, scene: Scene) -> "CenterOfMass":
         out, mesh = copy(self), scene.mesh
         out.scene = scene
         out.vertices = np.arange(mesh.num_vertices) if self.of is None else mesh.vertex_indices(self.of)
-        if not out._masses(scene.inputs.derive(scene.inputs.values), out.vertices).sum() > 0:
+        if not out._masses(scene.inputs.derive(scene.inputs.values)).sum() > 0:
             raise ValueError(f"{self!r}: the set has no mass; name one that has vertices of tetrahedra")
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return num_frames, 3
 
-    def _masses(self, derived: Derived, vertices: np.ndarray) -> np.ndarray:
-        """m_i of some vertices [kg], or their change."""
-        mass = derived.mass
-        if derived.element_masses is not None:
-            mass = np.zeros(len(derived.rest))
-            np.add.at(mass, self.scene.mesh.elements, derived.element_masses.sum(2))
-        return mass[vertices]
-
-    def _read(self, frames: Frames) -> tuple[Derived, float, np.ndarray, np.ndarray, np.ndarray]:
-        """(what kernels read, m [kg], shares m_i / m, positions x_i [m], x)."""
-        derived = self.scene.inputs.derive(frames.inputs)
-        own, x = self._masses(derived, self.vertices), frames.positions[:, self.vertices].astype(np.float64)
-        share = own / own.sum()
-        return derived, own.sum(), share, x, np.einsum("i,fij->fj", share, x)
+    def _masses(self, of: Derived) -> np.ndarray:
+        """m_i [kg]."""
+        if of.element_masses is None:
+            return of.mass[self.vertices]
+        elements = self.scene.mesh.elements
+        return summed_at(elements, of.element_masses.sum(2), len(of.rest))[self.vertices]
 
     def value(self, frames: Frames) -> np.ndarray:
-        return self._read(frames)[-1]
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        _, mass, share, x, center = self._read(frames)
-        dm = self._masses(self.scene.inputs.derive_jvp(frames.inputs, change.inputs), self.vertices)
-        out = np.einsum("i,fij->fj", dm / mass, x - center[:, None])
-        moved = change.positions
-        return out if moved is None else out + np.einsum("i,fij->fj", share, moved[:, self.vertices])
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        derived, mass, share, x, center = self._read(frames)
-        positions, adjoint, by_mass = np.zeros(frames.positions.shape), derived.zeros(), np.zeros(len(derived.rest))
-        positions[:, self.vertices] = share[:, None] * seed[:, None]
-        by_mass[self.vertices] = np.einsum("fj,fij->i", seed, x - center[:, None]) / mass
-        if derived.element_masses is None:
-            adjoint.mass = by_mass
-        else:
-            adjoint.element_masses += by_mass[self.scene.mesh.elements][:, :, None]
-        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(positions=positions, inputs=inputs)
+        own = self._masses(derived(self.scene, frames))
+        return np.einsum("i,fij->fj", own / own.sum(), frames.positions[:, self.vertices].astype(np.float64))
 
 
 class PixelTracks(Output):
@@ -223,33 +167,15 @@ class PixelTracks(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return num_frames, len(self.points.points), 2
 
-    def _jacobian(self, x: np.ndarray) -> np.ndarray:
-        """d(column, row) / dx, shape (..., 2, 3)."""
-        axes, focal = self.camera.axes, self.camera.focal_lengths(self.size)
-        a = (x - self.camera.position) @ axes.T
-        depth = -a[..., 2:]
-        by_a = np.zeros((*x.shape[:-1], 2, 3))
-        by_a[..., 0, 0] = by_a[..., 1, 1] = 1
-        by_a[..., 2] = a[..., :2] / depth
-        return (np.array([focal[0], -focal[1]])[:, None] * by_a / depth[..., None]) @ axes
-
     def value(self, frames: Frames) -> np.ndarray:
         x = self.points.value(frames)
-        depth = -(x - self.camera.position) @ self.camera.axes[2]
+        depth = -(value_of(x) - self.camera.position) @ self.camera.axes[2]
         if not np.all(depth > 0):
             frame, k = np.argwhere(~(depth > 0))[0]
             raise FloatingPointError(
                 f"{self!r}: in frame {frame} point {k} is {-depth[frame, k]:.3g} m behind the camera; move it back"
             )
         return self.camera.project(x, self.size)[..., :2]
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        x = self.points.value(frames)
-        return np.einsum("fpij,fpj->fpi", self._jacobian(x), self.points.jvp(frames, change))
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        x = self.points.value(frames)
-        return self.points.vjp(frames, np.einsum("fpij,fpi->fpj", self._jacobian(x), seed))
 
     def visible(self, frames: Frames, within: float = 1e-3) -> np.ndarray:
         """Which points lie within the picture and are not hidden by the body, bool (frames, num_points).

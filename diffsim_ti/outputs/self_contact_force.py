@@ -35,7 +35,7 @@ class SelfContactForce(ContactForce):
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
 
-    reads_contact_forces = "surfaces"
+    reads_contact_forces, _shown = "surfaces", ("on", "part")
 
     def __init__(
         self,
@@ -51,9 +51,6 @@ class SelfContactForce(ContactForce):
                 "sum over all is zero"
             )
         super().__init__("self-contact", part, name, per_vertex, about, on)
-
-    def __repr__(self) -> str:
-        return f"SelfContactForce({self.on!r}, {self.part!r}, name={self.name!r})"
 
     def _place(self, scene: Scene) -> int:
         if scene.term(SelfContact) is None:

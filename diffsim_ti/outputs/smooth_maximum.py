@@ -6,7 +6,8 @@ from typing import Literal
 import numpy as np
 
 from diffsim_ti.common.checked import number
-from diffsim_ti.outputs.output import NOTED, Change, Frames, Output
+from diffsim_ti.differentiation.arrays import value_of, with_slopes
+from diffsim_ti.outputs.output import NOTED, Frames, Output, taken_from
 from diffsim_ti.scene import Scene
 
 
@@ -67,28 +68,17 @@ class SmoothMaximum(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,)
 
-    def _with_slope(self, frames) -> tuple[np.ndarray, np.ndarray]:
-        """(value, its derivative by y)"""
-        given = self.of.value(frames)
-        y, p = given.reshape(len(given), -1), self.sharpness
+    def value(self, frames: Frames) -> np.ndarray:
+        given = taken_from(self.of, frames)
+        shape, y, p = np.shape(given), value_of(given).reshape(len(given), -1), self.sharpness
         if self.kind == "ks":
             most = y.max(1, keepdims=True)
             shares = np.exp(p * (y - most) / self.scale)
             total = shares.sum(1, keepdims=True)
-            return (most + self.scale / p * np.log(total))[:, 0], (shares / total).reshape(given.shape)
-        most = np.abs(y).max(1, keepdims=True)
-        part = np.divide(np.abs(y), most, out=np.zeros_like(y), where=most > 0)
-        total = (part**p).sum(1, keepdims=True)
-        norm = np.where(most > 0, total, 1.0) ** (1 / p)
-        return (most * norm)[:, 0], (np.sign(y) * (part / norm) ** (p - 1)).reshape(given.shape)
-
-    def value(self, frames: Frames) -> np.ndarray:
-        return self._with_slope(frames)[0]
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        slope = self._with_slope(frames)[1]
-        return (slope * self.of.jvp(frames, change)).reshape(len(slope), -1).sum(1)
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        slope = self._with_slope(frames)[1]
-        return self.of.vjp(frames, slope * seed.reshape(-1, *[1] * (slope.ndim - 1)))
+            values, slope = most + self.scale / p * np.log(total), shares / total
+        else:
+            most = np.abs(y).max(1, keepdims=True)
+            part = np.divide(np.abs(y), most, out=np.zeros_like(y), where=most > 0)
+            norm = np.where(most > 0, (part**p).sum(1, keepdims=True), 1.0) ** (1 / p)
+            values, slope = most * norm, np.sign(y) * (part / norm) ** (p - 1)
+        return with_slopes(values[:, 0], (given, lambda: slope.reshape(shape)))

@@ -4,10 +4,10 @@ from copy import copy
 
 import numpy as np
 
-from diffsim_ti.mesh.geometry import barycentric_in_plane, triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+from diffsim_ti.mesh.geometry import barycentric_in_plane, triangle_normals
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.contact_traction import ContactTraction
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.output import Frames, Output
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Term
 
@@ -73,64 +73,18 @@ class TactilePad(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames, *self.size, 3)
 
-    def _axes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, float]:
-        """(rows -n, a, b; N and g of which they are made; their lengths): n = N / |N|, a along g less what is along n."""
+    def value(self, frames: Frames) -> np.ndarray:
+        t = np.einsum("pc,fpcd->fpd", self.weights, self.traction.value(frames)[:, self.corners])
+        axes = np.stack([self._axes(x) for x in frames.positions.astype(np.float64)])
+        return np.einsum("fpd,fkd->fpk", t, axes).reshape(self.shape(len(t)))
+
+    def _axes(self, x: np.ndarray) -> np.ndarray:
+        """Rows -n, a, b: n along the sum of the faces' normals, a along the set's longer side, less what is along n."""
         N, g = triangle_normals(x, self.triangles).sum(0), self.along @ x
         n = N / np.linalg.norm(N)
         flat = g - n * (n @ g)
-        size = np.linalg.norm(flat)
-        a = flat / size
-        return np.stack([-n, a, np.cross(n, a)]), N, g, np.linalg.norm(N), size
-
-    def _axes_jvp(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:
-        (n, a, _), _, g, length, size = self._axes(x)
-        n = -n
-        dn = triangle_normals_jvp(x, self.triangles, dx).sum(0) / length
-        dn = dn - n * (n @ dn)
-        dflat = self.along @ dx
-        dflat = dflat - n * (n @ dflat) - dn * (n @ g) - n * (dn @ g)
-        da = (dflat - a * (a @ dflat)) / size
-        return np.stack([-dn, da, np.cross(dn, a) + np.cross(n, da)])
-
-    def _axes_vjp(self, x: np.ndarray, axes_adj: np.ndarray) -> np.ndarray:
-        (n, a, _), _, g, length, size = self._axes(x)
-        n, (n_adj, a_adj, b_adj) = -n, axes_adj
-        n_adj, a_adj = -n_adj + np.cross(a, b_adj), a_adj + np.cross(b_adj, n)
-        flat_adj = (a_adj - a * (a @ a_adj)) / size
-        n_adj = n_adj - flat_adj * (n @ g) - g * (n @ flat_adj)
-        g_adj = flat_adj - n * (n @ flat_adj)
-        N_adj = (n_adj - n * (n @ n_adj)) / length
-        by_x = triangle_normals_vjp(x, self.triangles, np.broadcast_to(N_adj, (len(self.triangles), 3)))
-        return by_x + np.outer(self.along, g_adj)
-
-    def _sampled(self, t: np.ndarray) -> np.ndarray:
-        """Of vectors of vertices those of the grid's points."""
-        return np.einsum("pc,fpcd->fpd", self.weights, t[:, self.corners])
-
-    def value(self, frames: Frames) -> np.ndarray:
-        t = self._sampled(self.traction.value(frames))
-        axes = np.stack([self._axes(x)[0] for x in frames.positions.astype(np.float64)])
-        return np.einsum("fpd,fkd->fpk", t, axes).reshape(self.shape(len(t)))
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        t, dt = (self._sampled(y) for y in (self.traction.value(frames), self.traction.jvp(frames, change)))
-        x = frames.positions.astype(np.float64)
-        dx = np.zeros(x.shape) if change.positions is None else change.positions
-        axes, daxes = np.stack([self._axes(p)[0] for p in x]), np.stack([self._axes_jvp(*at) for at in zip(x, dx)])
-        out = np.einsum("fpd,fkd->fpk", dt, axes) + np.einsum("fpd,fkd->fpk", t, daxes)
-        return out.reshape(self.shape(len(t)))
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        t, x = self._sampled(self.traction.value(frames)), frames.positions.astype(np.float64)
-        seed = np.reshape(seed, (len(x), -1, 3))
-        axes = np.stack([self._axes(p)[0] for p in x])
-        by_t, of_points = np.zeros((len(x), x.shape[1], 3)), np.einsum("fpk,fkd->fpd", seed, axes)
-        for k in range(3):
-            np.add.at(by_t, (slice(None), self.corners[:, k]), self.weights[:, k, None] * of_points)
-        by_axes = np.einsum("fpk,fpd->fkd", seed, t)
-        out = self.traction.vjp(frames, by_t)
-        out.add(Change(positions=np.stack([self._axes_vjp(*at) for at in zip(x, by_axes)])))
-        return out
+        a = flat / np.linalg.norm(flat)
+        return np.stack([-n, a, np.cross(n, a)])
 
 
 def _longer_side(points: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -8,8 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.named_sets import SetOrIndices
-from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PatchRecovery, PointInterpolation, PointMeans
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.deformation import (
+    NUMBERS,
+    PatchRecovery,
+    PointInterpolation,
+    PointMeans,
+    displacement_gradients,
+)
+from diffsim_ti.outputs.output import Frames, Output, derived
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
 from diffsim_ti.scene import Scene
 
@@ -67,71 +73,25 @@ class _Tensors(Output):
         return num_frames, self.count, *(NUMBERS[self.numbers][0] if self.numbers else (3, 3))
 
     @abstractmethod
-    def _tensors(self, deformation: Deformation, z, derived) -> np.ndarray:
+    def _tensors(self, H: np.ndarray, z: np.ndarray, derived) -> np.ndarray:
         """T of the chosen tetrahedra; z: what the law remembers, as `remembered` has it."""
 
-    @abstractmethod
-    def _tensors_jvp(self, deformation: Deformation, dH, z, dz, derived, change) -> np.ndarray:
-        """Its change for those of H, of z and of the scene's numbers."""
-
-    @abstractmethod
-    def _tensors_vjp(self, deformation: Deformation, z, derived, seed, adjoint) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of H and z; adds those of the scene's numbers."""
-
-    def _start(self, frames):
-        derived = self.scene.inputs.derive(frames.inputs)
-        deformation = Deformation.of(frames, derived, self.scene.mesh, self.read)
-        z = self.remembered(frames, self.scene)
-        T = self._tensors(deformation, z, derived)
-        return derived, deformation, z, T, T if self.means is None else self.means.value(T, self._shares(derived))
+    def value(self, frames: Frames) -> np.ndarray:
+        of = derived(self.scene, frames)
+        H, z = displacement_gradients(frames, of, self.scene.mesh, self.read), self.remembered(frames, self.scene)
+        T = self._tensors(H, z, of)
+        shown = T if self.means is None else self.means.value(T, self._shares(of))
+        return NUMBERS[self.numbers][1](shown) if self.numbers else shown
 
     @property
     def _at_vertices(self) -> bool:
         return isinstance(self.at, str) and self.at != "tetrahedra"
 
-    def _shares(self, derived) -> np.ndarray:
+    def _shares(self, of) -> np.ndarray:
         """How much the points of the chosen tetrahedra count: by their volumes, alike, or by shares in values at places."""
         if self.alike:
             return np.ones(self.points * len(self.chosen))
-        return self.means.shares(derived.rest) if self.means.moves else derived.volumes[self.chosen].ravel()
-
-    def _shares_jvp(self, derived, moved) -> np.ndarray:
-        if self.alike:
-            return np.zeros(self.points * len(self.chosen))
-        if self.means.moves:
-            return self.means.shares_jvp(derived.rest, moved.rest)
-        return moved.volumes[self.chosen].ravel()
-
-    def value(self, frames: Frames) -> np.ndarray:
-        shown = self._start(frames)[-1]
-        return NUMBERS[self.numbers][1](shown) if self.numbers else shown
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        derived, deformation, z, T, shown = self._start(frames)
-        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
-        du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
-        dH, dz = deformation.jvp(du, moved.gradients[self.read]), self.remembered_jvp(change, z)
-        dT = self._tensors_jvp(deformation, dH, z, dz, derived, moved)
-        if self.means is not None:
-            dT = self.means.jvp(T, dT, self._shares(derived), self._shares_jvp(derived, moved))
-        return NUMBERS[self.numbers][2](shown, dT) if self.numbers else dT
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        derived, deformation, z, T, shown = self._start(frames)
-        by_rest = 0.0
-        adjoint, seed = derived.zeros(), NUMBERS[self.numbers][3](shown, seed) if self.numbers else seed
-        if self.means is not None:
-            seed, by_shares = self.means.vjp(T, self._shares(derived), seed)
-            if self.means.moves:
-                by_rest = self.means.shares_vjp(derived.rest, by_shares)
-            elif not self.alike:
-                np.add.at(adjoint.volumes, self.chosen, by_shares.reshape(-1, *adjoint.volumes.shape[1:]))
-        H_adj, z_adj = self._tensors_vjp(deformation, z, derived, seed, adjoint)
-        positions, by_B = deformation.vjp(H_adj, self.num_vertices)
-        np.add.at(adjoint.gradients, self.read, by_B)
-        adjoint.rest = by_rest - positions.sum(0)
-        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(positions=positions, inputs=inputs, law_state=self.remembered_vjp(frames, z_adj))
+        return self.means.shares(of.rest) if self.means.moves else of.volumes[self.chosen].ravel()
 
 
 class Strain(_Tensors):
@@ -157,17 +117,9 @@ class Strain(_Tensors):
     ):
         super().__init__(name, at, of, principal=principal, stretches=stretches)
 
-    def _tensors(self, deformation, z, derived):
-        H = deformation.H
+    def _tensors(self, H, z, derived):
         Ht = np.swapaxes(H, -1, -2)
         return 0.5 * (H + Ht + Ht @ H)  # small strains keep their digits
-
-    def _tensors_jvp(self, deformation, dH, z, dz, derived, change):
-        half = np.swapaxes(deformation.F, -1, -2) @ dH
-        return 0.5 * (half + np.swapaxes(half, -1, -2))
-
-    def _tensors_vjp(self, deformation, z, derived, seed, adjoint):
-        return 0.5 * deformation.F @ (seed + np.swapaxes(seed, -1, -2)), z
 
 
 class Stress(_Tensors):
@@ -235,33 +187,12 @@ class Stress(_Tensors):
         out.read = out.stresses.read
         return out
 
-    def _cauchy(self, P, F):
-        return P @ np.swapaxes(F, -1, -2) / np.linalg.det(F)[..., None, None]
-
-    def _tensors(self, deformation, z, derived):
-        P = self.stresses.value(deformation.H, z, derived)
-        return P if self.kind == "first_piola" else self._cauchy(P, self.stresses.chosen_of(deformation.F))
-
-    def _tensors_jvp(self, deformation, dH, z, dz, derived, change):
-        dP = self.stresses.jvp(deformation.H, dH, z, dz, derived, change)
+    def _tensors(self, H, z, derived):
+        P = self.stresses.value(H, z, derived)
         if self.kind == "first_piola":
-            return dP
-        F, dH = (self.stresses.chosen_of(x) for x in (deformation.F, dH))
-        P, J = self.stresses.value(deformation.H, z, derived), np.linalg.det(F)[..., None, None]
-        grown = np.einsum("...ij,...ji->...", np.linalg.inv(F), dH)[..., None, None]
-        Ft, dFt = np.swapaxes(F, -1, -2), np.swapaxes(dH, -1, -2)
-        return (dP @ Ft + P @ dFt) / J - grown * self._cauchy(P, F)
-
-    def _tensors_vjp(self, deformation, z, derived, seed, adjoint):
-        P_adj, F_adj = seed, np.zeros_like(seed)
-        if self.kind == "cauchy":
-            F, P = self.stresses.chosen_of(deformation.F), self.stresses.value(deformation.H, z, derived)
-            J = np.linalg.det(F)[..., None, None]
-            shrunk = (seed * self._cauchy(P, F)).sum((-1, -2))[..., None, None]
-            P_adj = seed @ F / J
-            F_adj = np.swapaxes(seed, -1, -2) @ P / J - shrunk * np.swapaxes(np.linalg.inv(F), -1, -2)
-        by_H, by_z = self.stresses.vjp(deformation.H, z, P_adj, derived, adjoint)
-        return by_H + self.stresses.chosen_vjp(F_adj), by_z
+            return P
+        F = np.eye(3) + self.stresses.chosen_of(H)
+        return P @ np.swapaxes(F, -1, -2) / np.linalg.det(F)[..., None, None]
 
 
 class PlasticStrain(_Tensors):
@@ -291,14 +222,5 @@ class PlasticStrain(_Tensors):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return num_frames, self.count
 
-    def _tensors(self, deformation, z, derived):
+    def _tensors(self, H, z, derived):
         return z[..., self.place][:, self.read].reshape(len(z), -1)
-
-    def _tensors_jvp(self, deformation, dH, z, dz, derived, change):
-        return self._tensors(deformation, dz, derived)
-
-    def _tensors_vjp(self, deformation, z, derived, seed, adjoint):
-        z_adj = np.zeros_like(z)
-        for into, rows in zip(z_adj, seed.reshape(len(z), len(self.read), -1)):
-            np.add.at(into[..., self.place], self.read, rows)
-        return np.zeros_like(deformation.H), z_adj

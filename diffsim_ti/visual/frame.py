@@ -11,7 +11,7 @@ from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, link_rows, obstacle_surfaces
 from diffsim_ti.outputs import Output, Stress
-from diffsim_ti.outputs.deformation import Deformation
+from diffsim_ti.outputs.deformation import displacement_gradients
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads
 from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.simulator import Simulator
@@ -135,7 +135,7 @@ def _strained(scene: Scene, frames: Frames, k: int) -> dict[str, np.ndarray]:
     mesh, derived = scene.mesh, scene.inputs.derive(frames.inputs)
     one = {name: getattr(frames, name)[[k]] for name in ("positions", "velocities", "displacements", "times", "steps")}
     one = replace(frames, **one, law_state=None if frames.law_state is None else frames.law_state[[k]], outputs={})
-    F = Deformation.of(one, derived, mesh, np.arange(mesh.num_tetrahedra)).F
+    F = np.eye(3) + displacement_gradients(one, derived, mesh, np.arange(mesh.num_tetrahedra))
     J = np.linalg.det(F).reshape(mesh.num_tetrahedra, -1).min(1)
     if mesh.order == 2:
         u = one.displacements[0].astype(np.float64)

@@ -194,17 +194,7 @@ class MeshPrimitives(Primitives):
 
     def at(self, p):
         vertices = p[4:].reshape(-1, 3)[self.own] if len(p) > 4 else self.vertices
-        return vertices + p[:3], float(p[3])
-
-    def jvp(self, p, dp):
-        moved = dp[4:].reshape(-1, 3)[self.own] if len(p) > 4 else np.zeros_like(self.vertices)
-        return moved + dp[:3], float(dp[3])
-
-    def vjp(self, p, by_corners, by_radius):
-        by_vertices = np.zeros((len(p[4:]) // 3, 3))
-        if len(p) > 4:
-            by_vertices[self.own] = by_corners
-        return np.concatenate([by_corners.sum(0), [by_radius], by_vertices.ravel()])
+        return vertices + p[:3], p[3]
 
 
 @dataclass(frozen=True)
@@ -319,32 +309,32 @@ class MeshForce(ObstacleForce):
                 act(found, rows, s_of, t_of, g, h, share)
 
     @traced
-    def _sum_of_parts(self, of_one, count, parameters, first, felt):
-        """Sums over parts of the numbers that of_one(where the part is `felt`, its share) gives."""
+    def _sum_of_parts(self, of_one, count, parameters, first, contact):
+        """Sums over parts of the numbers that of_one(place of contact, share of the part) gives."""
         total = [variable(ti.cast(0, self.fp)) for _ in range(count)]
 
         @traced
         def add(*seen):
-            there = *felt, lambda g, p, X, u: self.distance_and_normal(g, p[: self.count], X, u, seen[:-1])
+            there = *contact, lambda g, p, X, u: self.distance_and_normal(g, p[: self.count], X, u, seen[:-1])
             for x, more in zip(total, of_one(there, seen[-1])):
                 assign(x, x + more)
 
-        self.each_part(add, parameters, first, *felt)
+        self.each_part(add, parameters, first, *contact)
         return total
 
     @traced
-    def _sum_of_forces(self, one, parameters, first, felt, *more):
+    def _sum_of_forces(self, one, parameters, first, contact, *more):
         def of_one(there, share):
             f = one(parameters, first, there, *more)
             return [share * at(f, d) for d in range(3)]
 
-        return self.vector_of(self._sum_of_parts(of_one, 3, parameters, first, felt))
+        return self.vector_of(self._sum_of_parts(of_one, 3, parameters, first, contact))
 
     @traced
-    def dissipation(self, parameters, first, felt, v, v_obstacle):
+    def dissipation(self, parameters, first, contact, v, v_obstacle):
         one = super().dissipation
         of_one = lambda there, share: [share * one(parameters, first, there, v, v_obstacle)]  # noqa: E731
-        return self._sum_of_parts(of_one, 1, parameters, first, felt)[0]
+        return self._sum_of_parts(of_one, 1, parameters, first, contact)[0]
 
     @traced
     def friction_force(self, *given):
@@ -359,7 +349,7 @@ class MeshForce(ObstacleForce):
         return self._sum_of_forces(super().friction_force_jvp, *given)
 
     @traced
-    def friction_force_vjp(self, parameters, first, felt, v, v_obstacle, w, sums, i):
+    def friction_force_vjp(self, parameters, first, contact, v, v_obstacle, w, sums, i):
         one, count = super().friction_force_vjp, 6 if self.turns else 3
 
         def of_one(there, share):
@@ -367,7 +357,7 @@ class MeshForce(ObstacleForce):
             by_place, *others = one(parameters, first, there, v, v_obstacle, own, sums, i)
             return [at(by, d) for by, k in zip((by_place, *others), (count, 3, 3)) for d in range(k)]
 
-        return self.parted(self._sum_of_parts(of_one, count + 6, parameters, first, felt), count)
+        return self.parted(self._sum_of_parts(of_one, count + 6, parameters, first, contact), count)
 
     @ti.func
     def reached(self, parameters: ti.template(), first, X, u, move, d, approach):

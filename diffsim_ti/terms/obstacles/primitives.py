@@ -4,10 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
+
 
 @dataclass(frozen=True)
 class Primitives:
-    """What bodies feel of an obstacle between their own vertices, as pairs (mechanics/surfaces/obstacle_corners.py).
+    """By what an obstacle acts on bodies between their own vertices, as pairs (mechanics/surfaces/obstacle_corners.py).
 
     points: numbers of the corners that act on faces. edges: two corners of each edge that acts on edges, shape (k, 2).
     Corners lie where the numbers p of the obstacle's shape say, as it was made:
@@ -24,15 +26,20 @@ class Primitives:
     many = False  # whether they are so many that a run has those near bodies alone, by `of_some`
 
     def at(self, p: np.ndarray) -> tuple[np.ndarray, float]:
+        """By functions that record (differentiation/arrays.py)."""
         raise NotImplementedError
 
     def jvp(self, p: np.ndarray, dp: np.ndarray) -> tuple[np.ndarray, float]:
         """Their change."""
-        raise NotImplementedError
+        leaf = Recorded(p)
+        corners, radius = (forward(x, [(leaf, dp)]) for x in self.at(leaf))
+        return corners, float(radius)
 
     def vjp(self, p: np.ndarray, by_corners: np.ndarray, by_radius: float) -> np.ndarray:
         """Adjoint of p."""
-        raise NotImplementedError
+        leaf = Recorded(p)
+        parts = (reverse(x, seed, [leaf])[0] for x, seed in zip(self.at(leaf), (by_corners, by_radius)))
+        return sum((part for part in parts if part is not None), leaf.zeros())
 
 
 @dataclass(frozen=True)
@@ -42,13 +49,7 @@ class RoundPrimitives(Primitives):
     whole = True
 
     def at(self, p):
-        return p[:-1].reshape(-1, 3), float(p[-1])
-
-    def jvp(self, p, dp):
-        return self.at(dp)
-
-    def vjp(self, p, by_corners, by_radius):
-        return np.append(by_corners.ravel(), by_radius)
+        return p[:-1].reshape(-1, 3), p[-1]
 
 
 BALL = RoundPrimitives(np.zeros(1, int), np.zeros((0, 2), int))
@@ -61,18 +62,10 @@ class BoxPrimitives(Primitives):
     """Of a box: center, size, a quaternion q of any length; corners c + R(q) (signs size / 2)."""
 
     def at(self, p):
-        return p[:3] + 0.5 * (SIGNS * p[3:6]) @ _rotation(p[6:])[0].T, 0.0
-
-    def jvp(self, p, dp):
-        R, by_q = _rotation(p[6:])
-        turned = np.einsum("dij,d->ij", by_q, dp[6:])
-        return dp[:3] + 0.5 * ((SIGNS * dp[3:6]) @ R.T + (SIGNS * p[3:6]) @ turned.T), 0.0
-
-    def vjp(self, p, by_corners, by_radius):
-        R, by_q = _rotation(p[6:])
-        by_size = 0.5 * (SIGNS * (by_corners @ R)).sum(0)
-        by_R = 0.5 * by_corners.T @ (SIGNS * p[3:6])
-        return np.concatenate([by_corners.sum(0), by_size, np.einsum("dij,ij->d", by_q, by_R)])
+        w, x, y, z = p[6:] / np.linalg.norm(p[6:])
+        first, second = [-y * y - z * z, x * y - w * z, x * z + w * y], [x * y + w * z, -x * x - z * z, y * z - w * x]
+        R = np.eye(3) + 2 * np.stack([*first, *second, x * z - w * y, y * z + w * x, -x * x - y * y]).reshape(3, 3)
+        return p[:3] + 0.5 * (SIGNS * p[3:6]) @ R.T, 0.0
 
 
 BOX = BoxPrimitives(
@@ -101,48 +94,11 @@ class PrismPrimitives(Primitives):
         edges = np.concatenate([np.stack(pair, 1) for pair in pairs])
         return cls(np.arange(2 * n), edges, n, np.eye(3)[np.abs(axis).argmin()])
 
-    def _corners(self, p):
-        """By operations that take complex numbers."""
+    def at(self, p):
         start, end, radius = p[:3], p[3:6], p[6]
         axis = (end - start) / np.sqrt(((end - start) ** 2).sum())
         a = self.across - axis * (axis @ self.across)
         a = a / np.sqrt((a**2).sum())
         angle = 2 * np.pi * np.arange(self.sides) / self.sides
         ring = radius * (np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * np.cross(axis, a))
-        return np.concatenate([start + ring, end + ring])
-
-    def _by_numbers(self, p) -> np.ndarray:
-        """Derivatives by the numbers, shape (7, corners, 3), exact by steps into the complex plane."""
-        return np.stack([self._corners(p + 1e-30j * row).imag / 1e-30 for row in np.eye(7)])
-
-    def at(self, p):
-        return self._corners(p), 0.0
-
-    def jvp(self, p, dp):
-        return np.einsum("m,mkd->kd", dp, self._by_numbers(p)), 0.0
-
-    def vjp(self, p, by_corners, by_radius):
-        return np.einsum("mkd,kd->m", self._by_numbers(p), by_corners)
-
-
-def _rotation(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(rotation matrix of a quaternion of any length, its derivatives by the four numbers)."""
-    length = np.linalg.norm(q)
-    w, x, y, z = q / length
-    R = np.eye(3) + 2 * np.array(
-        [
-            [-y * y - z * z, x * y - w * z, x * z + w * y],
-            [x * y + w * z, -x * x - z * z, y * z - w * x],
-            [x * z - w * y, y * z + w * x, -x * x - y * y],
-        ]
-    )
-    by_unit = 2 * np.array(
-        [
-            [[0, -z, y], [z, 0, -x], [-y, x, 0]],
-            [[0, y, z], [y, -2 * x, -w], [z, w, -2 * x]],
-            [[-2 * y, x, w], [x, 0, z], [-w, z, -2 * y]],
-            [[-2 * z, -w, x], [w, -2 * z, y], [x, y, 0]],
-        ]
-    )
-    unit = q / length
-    return R, np.einsum("ed,eij->dij", (np.eye(4) - np.outer(unit, unit)) / length, by_unit)
+        return np.concatenate([start + ring, end + ring]), 0.0

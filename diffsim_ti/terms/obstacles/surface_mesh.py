@@ -17,7 +17,7 @@ class SurfaceMesh:
     """vertices [m], shape (k, 3); triangles, shape (t, 3), segments, (s, 2), and points, (p,), which name them by index.
 
     Vertices in one place are one to the topology (`one`), so that surfaces whose triangles share none are
-    closed, too. Parts that are closed and oriented have an inside, others are felt from both sides alike.
+    closed, too. Parts that are closed and oriented have an inside, others act on both sides alike.
     """
 
     vertices: np.ndarray
@@ -72,7 +72,7 @@ class SurfaceMesh:
         return np.stack(np.divmod(keys, len(self.vertices)), 1), which.reshape(-1, 3)
 
     def sharp_edges(self, length: float, bow: float) -> np.ndarray:
-        """Edges that a flat face of this length [m] would feel: segments, edges of one triangle or of more than two, and
+        """Edges that act on a flat face of this length [m]: segments, edges of one triangle or of more than two, and
         those where a face that rests on the surface lies more than a bow [m] off it, shape (e, 2).
 
         Where two triangles of height h bend by phi, away from where the body may be, that is phi length^2 / 6 h, as over
