@@ -105,7 +105,6 @@ def test_gradcheck_of_numbers(name, value):
     assert gradcheck(lambda x: moved(**{name: x}), variable(value), **GATE)
 
 
-@pytest.mark.executed_ptx
 @pytest.mark.parametrize("name", ["positions", "velocities"])
 def test_gradcheck_of_start(name):
     assert gradcheck(lambda x: moved(**{name: x}), variable(start()[name == "velocities"]), **GATE)
