@@ -158,6 +158,10 @@ LEFT_OUT = {
         test_contact_force::test_tape_and_torch_give_the_same_gradients[euler]
         test_laws_with_state::test_a_tape_finds_the_same_gradients[ImplicitEulerSolver]
     """,
+    "a bent state; the greatest pressure in `test_load_path.py`": """
+        test_modes::test_gradients_of_frequencies_agree_with_differences[rest]
+        test_chambers::test_a_sphere_at_and_beyond_its_largest_pressure[1.47]
+    """,
     "the same in f32, whose rounding is the larger": """
         test_energy_watch::test_a_bounce_at_the_usual_step_is_not_blamed[f64]
     """,
@@ -204,6 +208,8 @@ LEFT_OUT = {
         test_surface_drag::test_gradients_against_differences[BDF2Solver-names1]
         test_swept::test_gradients_where_ways_are_cut_and_obstacles_come_in_parts[ImplicitEulerSolver]
         test_contact_force::test_gradients_agree_with_differences[bdf]
+        test_reaction::test_gradients_agree_with_differences[euler]
+        test_supports::test_gradients_against_differences[SemiImplicitSolver]
         test_rotating_frame::test_gradients_against_differences[BDF2Solver-1]
         test_growth_over_time::test_gradients_against_differences[ImplicitMidpointSolver]
     """,
