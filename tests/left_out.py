@@ -448,6 +448,9 @@ OF_BACKENDS = """
     test_implicit_cycle::test_single_precision_takes_as_many_iterations_on_every_backend
     test_self_contact::test_collision_in_single_precision
     test_tape::test_a_chain_is_one_long_run
+    test_implicit_contact::test_stopping_distance[f32-0.2-1.019368-BDF2Solver]
+    test_implicit_contact::test_stopping_distance[f32-0.4-0.509684-BDF2Solver]
+    test_implicit_contact::test_stopping_distance[f32-0.4-0.509684-ImplicitEulerSolver]
 """
 
 
