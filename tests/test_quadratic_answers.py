@@ -129,14 +129,6 @@ def test_orders_of_convergence(volume, displacement, stress):
 # ---- stress at vertices of a surface ------------------------------------------------------------------------------------
 
 
-def swept(cells, place, pattern="kuhn"):
-    """Ten-node elements of the unit cube, cut into so many cells along each axis, whose nodes X lie at place(*X.T)."""
-    cube = ds.TetrahedralMesh.create_box(np.array(cells) + 1, 1.0, pattern=pattern).quadratic()
-    faces = {name: cube.surface_triangles[rows] for name, rows in cube.surface_sets.items()}
-    x = np.stack(place(*cube.vertices.T), 1)
-    return ds.TetrahedralMesh(x, cube.elements, vertex_sets=cube.vertex_sets, surface_sets=faces)
-
-
 def stress_at(scene, *points):
     """Of an equilibrium, at the vertices that lie there [MPa]."""
     frames = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-8), 1, outputs=ds.Stress(at="vertices")).forward()
@@ -150,13 +142,14 @@ STEEL = ds.LinearElastic(210e9, 0.3)
 
 def thick_cylinder(cells=(8, 8, 2)) -> ds.Scene:
     """An eighth, radii 0.1 and 0.2 m, under a pressure of 1 MPa from within."""
-
-    def place(s, t, z):
-        r, angle = 0.1 * (1 + s), np.pi / 4 * t
-        return r * np.cos(angle), r * np.sin(angle), 0.02 * z
-
+    cube = ds.TetrahedralMesh.create_box(np.add(cells, 1), 1.0, "five").quadratic()
+    faces = {name: cube.surface_triangles[rows] for name, rows in cube.surface_sets.items()}
+    s, t, z = cube.vertices.T
+    r, angle = 0.1 * (1 + s), np.pi / 4 * t
+    x = np.stack([r * np.cos(angle), r * np.sin(angle), 0.02 * z], 1)
+    mesh = ds.TetrahedralMesh(x, cube.elements, vertex_sets=cube.vertex_sets, surface_sets=faces)
     fixed = {"ymin": "normal", "ymax": "normal", "zmin": "z", "zmax": "z"}
-    return ds.Scene(swept(cells, place, "five"), STEEL, terms=ds.Pressure(1e6, "xmin"), fixed=fixed, precision="f64")
+    return ds.Scene(mesh, STEEL, terms=ds.Pressure(1e6, "xmin"), fixed=fixed, precision="f64")
 
 
 def test_hoop_stress_of_a_thick_cylinder():
