@@ -170,6 +170,9 @@ LEFT_OUT = {
         test_energy_watch::test_work_from_outside_is_counted[supports above a ball by pairs-SemiImplicitSolver]
         test_energy_watch::test_work_from_outside_is_counted[supports above a ball by pairs-VelocityVerletSolver]
     """,
+    "explicit steps; the midpoint rule's period in `test_implicit.py`": """
+        test_springs::test_period_of_a_mass_on_a_spring[ImplicitMidpointSolver]
+    """,
     "verdicts on random functions in `test_gradients.py`": """
         test_gradient_fuzz::test_verdicts[52]
     """,
