@@ -49,8 +49,7 @@ AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()
 TOGETHER = [
     names.split()
     for names in (
-        "term_order every_adjoint",
-        "gradients outputs unequal_steps gradient_faults checkpoints tape",
+        "gradients outputs unequal_steps gradient_faults checkpoints tape term_order every_adjoint",
         "muscles growth_over_time rotating_frame surface_drag",
         "quadratic quadratic_solvers",
         "quadratic_outputs tensor_outputs",

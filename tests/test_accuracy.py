@@ -114,9 +114,8 @@ def test_a_mesh_without_an_error_has_a_bar_as_small_as_the_tolerance():
     assert found.relative < 1e-8 and abs(found.error - true) < 1e-12 and not found.notes
 
 
-UNEQUAL = ds.UnequalSteps([0.01, 0.02, 0.01], 2)
-RUNS = [(ds.StaticSolver, 1), (ds.ImplicitEulerSolver, UNEQUAL), (ds.ImplicitMidpointSolver, UNEQUAL)]
-RUNS += [(kind, 5) for kind in (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)]
+RUNS = [(ds.StaticSolver, 1), (ds.ImplicitMidpointSolver, ds.UnequalSteps([0.01, 0.02, 0.01], 2))]
+RUNS += [(ds.ImplicitEulerSolver, 5), (ds.BDF2Solver, 5)]
 
 
 @pytest.mark.parametrize("kind, steps", RUNS)
@@ -175,8 +174,10 @@ def falling(kind, gravity: float, tip=None, **options) -> ds.Rollout:
     return ds.Rollout(kind(scene, dt=0.05, **options), 5, outputs=ds.MaterialPoints([[3, 0.5, 0.5]], "end"))
 
 
-@pytest.mark.parametrize("kind", [ds.StaticSolver, ds.BDF2Solver])
-@pytest.mark.parametrize("tip", ["tie", "affine", "rigid", "basis"])
+@pytest.mark.parametrize(
+    "kind, tip",
+    [(ds.BDF2Solver, "tie"), (ds.StaticSolver, "affine"), (ds.BDF2Solver, "rigid"), (ds.StaticSolver, "basis")],
+)
 def test_small_motions_of_ties_and_sets_have_the_exact_difference(kind, tip, monkeypatch):
     monkeypatch.setattr(estimate, "LARGE", np.inf)
     monkeypatch.setattr(estimate, "CANCELS", np.inf)

@@ -25,9 +25,9 @@ def loaded(volume="tetrahedra", precision="f64") -> ds.Scene:
     mesh, rng = random_mesh(2), np.random.default_rng(0)
     m, shape = mesh.num_tetrahedra, mesh.vertices.shape
     terms = [
-        ds.Ground(-0.15, 1e3, 0.2),
         ds.Gravity(),
         ds.Drag(2.0),
+        ds.Ground(-0.15, 1e3, 0.2),  # in the order of test_gradients.py, whose kernels these are
         ds.ExternalForce(50 * rng.normal(size=(STEPS, 3, 3)), [1, 5, 6]),
     ]
     return ds.Scene(

@@ -37,14 +37,6 @@ class WithoutVolumetricCurvature(StableNeoHookeanLaw):
         return p[1], 0, 0
 
 
-@dataclass(frozen=True)
-class SlightlyWrongProducts(StableNeoHookeanLaw):
-    @traced
-    def stress_differential_and_products(self, H, dH, p):
-        dP, products = super().stress_differential_and_products(H, dH, p)
-        return dP, [products[0] * self.real(1.001), products[1]]
-
-
 def with_law(law):
     class Mutated(ds.StableNeoHookean):
         def law(self, precision):
@@ -142,10 +134,7 @@ def test_mutated_results(monkeypatch, solver, name):
     assert not gates_passed(rollout)[1], f"{name}: nothing was noticed"
 
 
-@pytest.mark.parametrize(
-    "law, dot_product_sees_it",
-    [(TransposedBlock, True), (WithoutVolumetricCurvature, False), (SlightlyWrongProducts, True)],
-)
+@pytest.mark.parametrize("law, dot_product_sees_it", [(TransposedBlock, True), (WithoutVolumetricCurvature, False)])
 def test_mutated_laws(law, dot_product_sees_it):
     """The dot product compares with the tangent, which shares dP: a symmetric mistake is for differences to find."""
     symmetric, right = gates_passed(rollout_of(free_scene(with_law(law)), steps=3))
@@ -461,27 +450,3 @@ def test_state_updated_in_place_is_caught_by_a_taylor_test():
     assert abs(naive - differences) > 0.1 * abs(differences)  # wrong, and nothing was said
     assert ds.taylor_test(run, 3.0, naive, 1.0, epsilon=1e-2).rate < 1.1
     assert ds.taylor_test(run, 3.0, differences, 1.0, epsilon=1e-2).rate > 1.9  # the function itself is smooth
-
-
-@by_solver
-def test_ours_under_the_same_test(solver):
-    """As nonlinear, as long, in one tape: the rollout keeps or restores what its mirror reads."""
-    rollout = rollout_of(full_scene(), solver, 60)
-    density, total = rollout.field("density"), ti.field(ti.f64, (), needs_grad=True)
-    base = density.to_numpy()
-
-    @ti.kernel
-    def end(x: ti.template()):
-        for i in range(x.shape[1]):
-            total[None] += x[1, i].norm_sqr()
-
-    def run(t):
-        density.from_numpy(base * (1 + float(t)))
-        with ti.ad.Tape(total):
-            rollout.run()
-            end(rollout.positions)
-        return total[None]
-
-    run(0.0)
-    slope = float((density.grad.to_numpy() * base).sum())
-    assert ds.taylor_test(run, 0.0, slope, 1.0, epsilon=1e-2).rate >= 1.95

@@ -461,7 +461,6 @@ def dot(a: dict, b: dict) -> float:
     return sum(float((a[name] * b[name]).sum()) for name in a)
 
 
-@pytest.mark.executed_ptx
 @by_solver
 def test_hessian_product(solver):
     rollout = rollout_of(full_scene(), solver, 20)

@@ -117,7 +117,7 @@ signal.signal = guarded
 """
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.3, 0.9, 1.6, 2.4])
+@pytest.mark.parametrize("delay", [0.0, 0.6, 1.8])
 def test_interrupts_at_any_moment_end_in_one_line(tmp_path, delay):
     CUBE.save(tmp_path / "cube.vtu")
     (tmp_path / "sitecustomize.py").write_text(SAYS_THAT_IT_IS_GUARDED)

@@ -43,6 +43,7 @@ def test_intervals_of_friction_and_drag_from_a_bounce():
     assert inside.sum(0).min() >= 87 and 0.92 <= inside.mean() <= 0.98
 
 
+@pytest.mark.thorough
 def test_intervals_of_a_field_on_eight_regions():
     mesh = ds.TetrahedralMesh.create_box([9, 2, 2], [0.8, 0.1, 0.1], pattern="five")
     regions = np.minimum((mesh.centroids[:, 0] / 0.1).astype(int), 7)

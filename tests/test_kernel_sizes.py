@@ -1,7 +1,5 @@
 """Kernels stay so short that the first step and the first gradient of any law compile in seconds."""
 
-import random
-
 import pytest
 from kernel_sizes import LAWS, SOLVERS, sizes
 
@@ -9,13 +7,11 @@ import diffsim_ti as ds
 from diffsim_ti.runtime import launch
 
 MOST = 30e6  # sum over the kernels of the squares of their variables: 20 s of a core of 2026 (`kernel_sizes.py`)
-ALWAYS = ["nested ogden3", "viscous ogden3"]
-SOME = random.Random(7).sample(sorted(set(LAWS) - set(ALWAYS)), 2)
 
 
-@pytest.mark.parametrize("name", ALWAYS + SOME)
+@pytest.mark.parametrize("name", ["nested ogden3", "viscous ogden3"])
 def test_kernels_of_a_first_step_and_its_gradient_are_short(name):
-    """All laws: python tests/kernel_sizes.py"""
+    """The longest; all laws: python tests/kernel_sizes.py"""
     for solver in SOLVERS:
         for order in (1, 2):
             found = sizes(LAWS[name], solver, order)

@@ -3,8 +3,6 @@
 import copy
 import pickle
 import re
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 
@@ -406,13 +404,6 @@ def test_content_hash_follows_content():
     assert mesh.content_hash != mesh.scaled(1 + 1e-15).content_hash
     assert len({mesh.content_hash, TetrahedralMesh.create_cube(3, pattern="five").content_hash}) == 2
     assert re.fullmatch("[0-9a-f]{64}", mesh.content_hash)
-
-
-def test_meshio_and_scipy_are_not_imported_before_use():
-    code = "import sys, diffsim_ti.mesh as m; m.TetrahedralMesh.create_cube(); print('meshio' in sys.modules)"
-    root = Path(__file__).parents[1]
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True)
-    assert out.stdout.split()[-1] == "False"
 
 
 # Files

@@ -84,13 +84,11 @@ def test_every_table_of_these_scripts_has_marks_on_the_page():
         assert f"<!-- {name} -->" in page and f"<!-- end of {name} -->" in page
 
 
-@pytest.mark.parametrize(
-    "names", [("NAFEMS LE10", "Lame's cylinder"), pytest.param(("",), marks=pytest.mark.thorough)], ids=["two", "all"]
-)
-def test_closed_forms(names):
+@pytest.mark.thorough
+def test_closed_forms():
     """On coarse meshes of ten nodes, one or two of which lie across what is bent."""
-    rows = closed_forms.main(quick=True, names=names)
-    assert len(rows) == 2 if names[0] else len(rows) > 10
+    rows = closed_forms.main(quick=True)
+    assert len(rows) > 10
     for name, _, _, error, _, _ in rows:
         assert error < 10, name
 

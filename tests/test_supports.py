@@ -207,32 +207,6 @@ def test_uniaxial_traction_finds_the_stretch_back():
     np.testing.assert_allclose(frames.positions[-1], mesh.vertices * [s, q, q], rtol=0, atol=1e-8)
 
 
-def cooks_membrane(n: int, layers: int = 2) -> float:
-    """How far the middle of its loaded edge rises with n x n cells, for a force of 1 on a thickness of 1; u_z = 0 is one
-    line of `fixed`. Linear elasticity, plane strain of E 15/16, nu 1/4: that is plane stress of E 1, nu 1/3."""
-    mesh = ds.TetrahedralMesh.create_box((n + 1, n + 1, layers), (48.0, 48.0, 48 / n * (layers - 1)), pattern="five")
-    X, Y, Z = mesh.vertices.T / [[48], [48], [1]]
-    moved = np.stack([48 * X, 44 * X + Y * (44 + (16 - 44) * X), Z], 1)
-    mesh = ds.TetrahedralMesh(moved, mesh.tetrahedra, vertex_sets=dict(mesh.vertex_sets)).with_surface_set(
-        "right", lambda x, n: x[:, 0] > 47.999
-    )
-    mesh = mesh.with_vertex_set("all", np.arange(mesh.num_vertices))
-    fixed, load = {"xmin": "xyz", "all": "z"}, ds.Traction([0, 1 / 16 * 1e-3, 0], "right")
-    scene = ds.Scene(mesh, ds.LinearElastic(15 / 16, 1 / 4), 1.0, load, fixed, precision="f64")
-    frames = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-11), 1).forward()
-    middle = np.linalg.norm(mesh.vertices[:, :2] - [48, 52], axis=1) < 1e-6
-    assert np.abs(frames.displacements[-1][:, 2]).max() == 0
-    return frames.displacements[-1][middle, 1].mean() * 1e3
-
-
-def test_cooks_membrane_in_plane_strain():
-    """23.967 is the limit of biquadratic elements (23.9608 with 32 x 32, 23.9650 with 64 x 64); 23.96 in the literature.
-    Errors of linear tetrahedra fall by h^2, which leaves 0.7 % with 32 x 32; nothing depends on z."""
-    errors = 1 - np.array([cooks_membrane(n) for n in (8, 16, 32)]) / 23.967
-    assert np.all(errors > 0) and errors[2] < 0.01 and np.all(errors[:2] / errors[1:] > 3.3), errors
-    assert abs(cooks_membrane(12, 3) / cooks_membrane(12) - 1) < 0.02
-
-
 def tube(n: int, radii=(1.0, 1.5), length=0.3) -> ds.TetrahedralMesh:
     """A quarter of a tube along z, n cells through its wall; "inner" is its inside."""
     box = ds.TetrahedralMesh.create_box((n + 1, 2 * n + 1, 2), (1.0, 1.0, length), pattern="five")
@@ -245,12 +219,12 @@ def tube(n: int, radii=(1.0, 1.5), length=0.3) -> ds.TetrahedralMesh:
     return mesh.with_surface_set("inner", np.flatnonzero(inside))
 
 
-@pytest.mark.parametrize("E, nu", [(1e5, 0.3), (4e6, 0.1)])
-def test_thick_tube_under_pressure(E, nu):
+def test_thick_tube_under_pressure():
     """Lame, plane strain by rollers on both ends: u(r) = (1 + nu) p a^2 / (E (b^2 - a^2)) [(1 - 2 nu) r + b^2 / r], the
     stress along it 2 nu p a^2 / (b^2 - a^2), and what the planes of symmetry carry, p a on each. Errors fall by h^2, which
     leaves 1 % with six cells through the wall; forces are in balance on any mesh."""
-    (a, b), p, length, errors = (1.0, 1.5), 1e-6 * E, 0.3, []
+    E, nu, (a, b), length, errors = 1e5, 0.3, (1.0, 1.5), 0.3, []
+    p = 1e-6 * E
     fixed = dict(x0="x", y0="y", zmin="z", zmax="z")
     sides = [ds.Reaction(name, name=name) for name in ("x0", "y0", "zmax")]
     for n in (3, 6):

@@ -226,17 +226,6 @@ def test_only_wanted_gradients_reach_fields():
     assert g.grad.to_numpy().any() and not E.grad.to_numpy().any() and list(rollout.gradients) == ["gravity"]
 
 
-def test_f32():
-    single, double, total = small(precision="f32"), small(), scalar_field()
-    gradients = []
-    for rollout in (single, double):
-        E = rollout.field("youngs_modulus")
-        taped(rollout, total)
-        gradients.append(E.grad.to_numpy())
-    assert gradients[0].dtype == np.float32
-    assert np.linalg.norm(gradients[0] - gradients[1]) <= 1e-4 * np.linalg.norm(gradients[1])
-
-
 @ti.kernel
 def squares(positions: ti.template(), velocities: ti.template(), total: ti.template()):
     for f, i in positions:
@@ -419,11 +408,10 @@ def test_a_run_between_a_tapes_runs():
     assert np.array_equal(E.grad.to_numpy(), expected[0]) and np.array_equal(x0.grad.to_numpy(), expected[1])
 
 
-@pytest.mark.backends
 @by_solver
 def test_other_work_in_a_tape_is_not_taped(solver):
     """Runs, gradients, tangents, steps and looks between kernels of a user leave nothing that a tape would go through."""
-    scene = full_scene(precision="f32", steps=4)
+    scene = full_scene(steps=4)
     rollout = rollout_of(scene, solver, 4, save_every=2, outputs=[ds.Stress(), ds.ElasticEnergy()])
     simulator, batch = ds.Simulator(rollout.solver.for_scene(scene)), ds.Batch(rollout.solver, 4, 2)
     with ti.ad.Tape(scalar_field()) as tape:

@@ -40,7 +40,6 @@ def simulator(method, **options):
     return DifferentiableSimulator(MESH, material, solver, **options)
 
 
-@pytest.mark.executed_ptx
 @by_method
 def test_gradcheck(method):
     sim = simulator(method)
