@@ -261,7 +261,9 @@ def in_a_groove(solver, dt, steps, path=None, obstacles=(slice(0, 4),)):
     mesh = ds.TetrahedralMesh(wedge, [[0, 1, 2, 3]], fix_orientation=True)
     terms = [ds.Gravity((6.0, -9.0, 0)), *groove]
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 3e3, terms, initial_velocities=(1.0, 0, 0), precision="f64")
-    outputs = [ds.ContactForce(x.name, part, name=f"{part}_{x.name}") for part in ("normal", "friction") for x in groove]
+    outputs = [
+        ds.ContactForce(x.name, part, name=f"{part}_{x.name}") for part in ("normal", "friction") for x in groove
+    ]
     frames = ds.Rollout(solver(scene, dt=dt), steps, save_every=1, outputs=outputs).forward()
     normal, friction = (sum(frames[f"{part}_{x.name}"] for x in groove) for part in ("normal", "friction"))
     return normal[:, 1], -friction[:, 0] / mu * np.sin(np.pi / 6), frames

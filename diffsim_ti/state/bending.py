@@ -57,8 +57,8 @@ class Bending:
             left = bend.bend / 2 / 4 ** cuts_of(a.mesh, self.width, bend.bend)
             if left > self.width:
                 warn(
-                    f"{bend} where they touch, and lie up to {left:.3g} m from the triangles of pairs, more than the width {self.width:.3g} "
-                    f"m: refine the mesh, or take a width of {left:.3g} m"
+                    f"{bend} where they touch, and lie up to {left:.3g} m from the triangles of pairs, more than the width "
+                    f"{self.width:.3g} m: refine the mesh, or take a width of {left:.3g} m"
                 )
             raise bend
         self.ws.place_obstacles(now)
