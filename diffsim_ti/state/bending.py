@@ -72,5 +72,5 @@ class Bending:
                 most = float(nearer.max())
                 warn(
                     f"{FacesBend(most)} towards {term!r}, which acts at their nodes alone: refine the mesh there, or take a "
-                    f"width of {2 * most:.3g} m or more"
+                    f"width of {2.2 * most:.3g} m or more"
                 )
