@@ -366,7 +366,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("monitor/guard.py", "reduce the substep to {} s"): "test_contact_crossing.py, battery_of_impacts.py",
     ("monitor/guard.py", "the barrier cannot stop it"): "test_contact_crossing.py, battery_of_impacts.py",
     ("monitor/guard.py", "the substep has outgrown"): "battery_of_impacts.py",
-    ("state/bending.py", "acts at their nodes alone"): "test_curved_contact.py, from the start",
+    ("state/bending.py", "acts at their nodes alone"): "test_curved_contact.py",
     ("batch/batch.py", "act at their nodes alone"): "test_curved_contact.py, from the start",
     ("terms/obstacles/obstacle.py", "from the triangles of their nodes"): "test_curved_contact.py",
     ("terms/obstacles/obstacle.py", "at their vertices alone"): "test_own_obstacle.py",

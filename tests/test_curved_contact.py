@@ -11,6 +11,7 @@ from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces import curved_pairs
 from diffsim_ti.mechanics.surfaces.curved_pairs import CurvedPairs
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs
 from diffsim_ti.mesh import reference_face
@@ -74,18 +75,25 @@ def test_what_is_felt_at_nodes_alone_is_said():
 
 @pytest.mark.parametrize("solver", [EXPLICIT, IMPLICIT])
 def test_a_run_says_where_faces_bend_farther_than_nodes_tell(solver):
-    """A bar that is straight in the mesh is bent to an arch under a plate: once."""
-    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (0.4, 0.02, 0.1)).quadratic()
-    x = mesh.vertices.copy()
-    x[:, 1] += 0.06 * np.sin(np.pi * x[:, 0] / 0.4)
-    plate = ds.HalfSpace((0, x[:, 1].max() + 1e-3, 0), (0, -1, 0), width=2e-3, stiffness_per_area=1e7)
-    scene = scene_of(mesh, plate, initial_positions=x, fixed=["xmin", "xmax"])
-    simulator = ds.Simulator(solver(scene, dt=2e-5 if solver.explicit else 1e-3))
-    with pytest.warns(
-        UserWarning, match="faces .* have bent by .* m where they touch, where HalfSpace.*acts at their nodes"
-    ) as said:
-        simulator.run(3)
+    """A bar that is straight in the mesh is bent to an arch under a plate: once, and not where it is as wide as it advises,
+    or where faces bend away from it."""
+
+    def run(height, width):
+        mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (0.4, 0.02, 0.1)).quadratic()
+        x = mesh.vertices.copy()
+        x[:, 1] += height * np.sin(np.pi * x[:, 0] / 0.4)
+        plate = ds.HalfSpace((0, x[:, 1].max() + 0.5 * width, 0), (0, -1, 0), width=width, stiffness_per_area=1e7)
+        scene = scene_of(mesh, plate, initial_positions=x, fixed=["xmin", "xmax"])
+        ds.Simulator(solver(scene, dt=2e-5 if solver.explicit else 1e-3)).run(3)
+
+    match = r"faces .* have bent by .* m towards HalfSpace.*acts at their nodes alone: .* a width of (\S+) m"
+    with pytest.warns(UserWarning, match=match) as said:
+        run(0.06, 2e-3)
     assert len(said) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run(0.06, float(re.search(match, str(said[0].message))[1]))
+        run(-0.06, 2e-3)
 
 
 # ---- surfaces that meet each other -----------------------------------------------------------------------------------
@@ -136,6 +144,20 @@ def test_curved_faces_press_on_each_other(solver, precision):
         frames, mass = rollout.forward(), simulator.workspace.arrays.values.mass[:, None]
         p, q = ((mass * frames.velocities[k]).sum(0) for k in (0, -1))
         np.testing.assert_allclose(q, p, rtol=0, atol=1e-12 * np.abs(p).max())
+
+
+def test_a_run_that_finds_faces_bent_through_each_other_has_smaller_triangles_once_it_is_reset(monkeypatch):
+    """It takes four triangles for each curved face until it finds that they bend; smaller ones are not apart there."""
+    monkeypatch.setattr(curved_pairs, "cuts_of", lambda mesh, width, bend: 2 if bend else 0)
+    simulator = ds.Simulator(EXPLICIT(balls_face_to_face(0.1 * W), dt=5e-4))
+    simulator.run(8)
+    bending = simulator.workspace.bending
+    bending.limit = bending.of_pairs = 0.0
+    with pytest.raises(ValueError, match=r"^step 8, .* bent by .* not apart there: reset\(\) the simulator"):
+        simulator.run(1)
+    simulator.reset()
+    simulator.run(1)
+    assert simulator.smallest_gap() > 0 and isinstance(simulator.workspace.pairs, CurvedPairs)
 
 
 def rubbing_balls(precision="f64", friction=0.4, **options) -> ds.Scene:

@@ -243,27 +243,45 @@ def test_a_crease_presses_by_both_of_its_sides():
     assert report.passed and ds.dot_product_test(rollout) < 1e-9, str(report)
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_friction_in_a_groove_is_that_of_both_sides(turned):
+def in_a_groove(solver, dt, steps, path=None, obstacles=(slice(0, 4),)):
     """Two sides with 60 degrees between them hold a wedge of weight N by N / (2 sin 30) each, so that it slides along them
-    against mu N / sin 30. The bottom of the groove is out of reach: thick sides are nearer."""
-    mu, dt, width, radius = 0.2, 5e-3, 0.01, 0.02
+    against mu N / sin 30. The bottom of the groove is out of reach: thick sides are nearer. obstacles: the triangles of
+    each. Returns what presses and rubs at frames, over mu / sin 30, and the frames."""
+    mu, width, radius = 0.2, 0.01, 0.02
     sides = np.array([[x, abs(z), z * np.tan(np.pi / 6)] for x in (-1, 3) for z in (-1.0, 0.0, 1.0)])
-    path = (lambda t: (0, 0, 0, 0.3 * t, 0, 0)) if turned else None
-    groove = ds.MeshObstacle(
-        sides, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]], radius=radius, width=width, stiffness=1.5e3, friction=mu,
-        friction_speed=1e-3, path=path, name="groove",
-    )  # fmt: skip
+    groove = [
+        ds.MeshObstacle(
+            sides, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]][own], radius=radius, width=width, stiffness=1.5e3,
+            friction=mu, friction_speed=1e-3, path=path, name=f"side_{k}",
+        )
+        for k, own in enumerate(obstacles)
+    ]  # fmt: skip
     low = 2 * (radius + 0.5 * width)
     wedge = np.array([[0, low, 0], [0.2, low, 0], [0.1, low + 0.2, 0.1], [0.1, low + 0.2, -0.1]])
     mesh = ds.TetrahedralMesh(wedge, [[0, 1, 2, 3]], fix_orientation=True)
-    terms = [ds.Gravity((6.0, -9.0, 0)), groove]
+    terms = [ds.Gravity((6.0, -9.0, 0)), *groove]
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), 3e3, terms, initial_velocities=(1.0, 0, 0), precision="f64")
-    parts = [ds.ContactForce("groove", part, name=part) for part in ("normal", "friction")]
-    frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=dt), 12, save_every=1, outputs=parts).forward()
-    normal, friction = frames["normal"][1:-1, 1], frames["friction"][2:, 0]
-    assert normal.min() > 5 and np.all(frames.velocities[:, :, 0] > 0.5)
-    np.testing.assert_allclose(-friction, mu * normal / np.sin(np.pi / 6), rtol=2e-3)  # it bounces, so not all along
+    outputs = [
+        ds.ContactForce(x.name, part, name=f"{part}_{x.name}") for part in ("normal", "friction") for x in groove
+    ]
+    frames = ds.Rollout(solver(scene, dt=dt), steps, save_every=1, outputs=outputs).forward()
+    normal, friction = (sum(frames[f"{part}_{x.name}"] for x in groove) for part in ("normal", "friction"))
+    return normal[:, 1], -friction[:, 0] / mu * np.sin(np.pi / 6), frames
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_friction_in_a_groove_is_that_of_both_sides(turned):
+    path = (lambda t: (0, 0, 0, 0.3 * t, 0, 0)) if turned else None
+    normal, friction, frames = in_a_groove(ds.ImplicitEulerSolver, 5e-3, 12, path)
+    assert normal[1:-1].min() > 5 and np.all(frames.velocities[:, :, 0] > 0.5)
+    np.testing.assert_allclose(friction[2:], normal[1:-1], rtol=2e-3)  # it bounces, so not all along
+
+
+@pytest.mark.parametrize("obstacles, swings", [((slice(0, 4),), True), ((slice(0, 2), slice(2, 4)), False)])
+def test_sides_of_a_groove_press_in_turn_in_explicit_steps_unless_each_is_an_obstacle(obstacles, swings):
+    normal, friction, frames = in_a_groove(ds.SemiImplicitSolver, 2.5e-4, 240, obstacles=obstacles)
+    np.testing.assert_allclose(friction[100:].mean(), normal[100:].mean(), rtol=1e-2)
+    assert (np.ptp(frames.positions[100:, 0, 2]) > 1e-6) == swings
 
 
 def test_what_starts_wrong_is_said_with_what_helps():

@@ -194,6 +194,20 @@ def test_a_run_has_what_is_near_alone_and_finds_what_it_would_find_with_all(solv
         )
 
 
+def test_what_turns_towards_a_body_within_a_step_is_met_in_time(monkeypatch):
+    """An obstacle of a point on its axis below a cube and one that comes round from afar, while the list of pairs holds."""
+    turn, axis, found = (lambda t: (0, 0, 0, 0, 0, 4.6 * t)), np.array([0.05, -0.3, 0.05]), []
+    points = ds.MeshObstacle([axis, axis + [0.34, -0.09, -0.02]], path=turn, about=axis, **BARRIER)
+    for many in (1, 10**6):
+        monkeypatch.setattr(mesh_obstacle, "MOST_HELD", many)
+        simulator = ds.Simulator(ds.SemiImplicitSolver(cube(points, velocity=(0, 0, 0)), dt=0.095, substeps=50))
+        count = simulator.workspace.pairs.nearby.corners.count
+        simulator.run(4)
+        found.append((count, simulator.positions))
+    (of_near, x), (of_all, y) = found
+    assert (of_near, of_all) == (1, 2) and np.array_equal(x, y) and x[:, 0].mean() < SIZE / 2 - 1e-3
+
+
 @lru_cache
 def caught(solver=ds.ImplicitEulerSolver, steps=8, dt=1e-3, outputs=(), **options):
     """A cube that falls on a wire that turns between its vertices, and would meet itself; all rub."""

@@ -200,7 +200,7 @@ class Batch(metaclass=Public):
         resolution = self.sweep.resolutions() if off > FAR * min(widths) + 2 * bow(mesh) else None
         if resolution and any(np.isfinite(resolution(b).smallest_gap) for b in range(self.num_scenes)):
             warn(
-                f"{FacesBend(off)}, where obstacles act at their nodes alone: refine the mesh there, or take a width of "
+                f"{FacesBend(off)} where obstacles act at their nodes alone: refine the mesh there, or take a width of "
                 f"{2 * off:.3g} m or more"
             )
 

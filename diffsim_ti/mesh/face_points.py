@@ -125,8 +125,8 @@ def bows(nodes: np.ndarray) -> np.ndarray:
 
 
 def points_of_bow(nodes: np.ndarray) -> np.ndarray:
-    """Where `bows` looks, on the curved faces, shape (k, 15, 3)."""
-    return np.einsum("ka,fai->fki", _places_of_bow()[0], nodes)
+    """Where `bows` looks, on the curved faces and on the triangles, shape (2, k, 15, 3)."""
+    return np.einsum("ska,fai->sfki", _places_of_bow(), nodes)
 
 
 @lru_cache(maxsize=None)

@@ -14,6 +14,7 @@ from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs.step_values import StepValues
 from diffsim_ti.materials import Material
+from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
@@ -116,10 +117,16 @@ class Simulator(metaclass=Public):
         self._stale = True
         self._load_step()
         self.workspace.place_obstacles(0)
-        if self.workspace.pairs:
-            self.workspace.pairs.forget(self.workspace.state.u)
-            self.workspace.check_surfaces()
-        self.workspace.check_apart()
+        try:
+            if self.workspace.pairs:
+                self.workspace.pairs.forget(self.workspace.state.u)
+                self.workspace.check_surfaces()
+            self.workspace.check_apart()
+        except Overlap:
+            raise Overlap(
+                f"{self.workspace.when(self.step_count)}: {FacesBend(bend / 2)} where they touch, and the smaller triangles "
+                "that this asks for are not apart there: reset() the simulator, which keeps them, and run it again"
+            ) from None
 
     def __reduce__(self):
         raise TypeError(

@@ -2,8 +2,8 @@
 
 Contact takes a face for the four triangles of its nodes; pairs take smaller ones where it was curved from the start. That
 is right to BOWED widths. Where a face that pairs look at has bent farther, the run that finds it is done again with
-triangles as small as the bow asks for; where it is farther than FAR widths from the triangles that an obstacle meets at
-nodes, a warning says so.
+triangles as small as the bow asks for; where it is nearer to an obstacle that acts at nodes than these triangles by more
+than FAR widths, a warning says so.
 """
 
 import weakref
@@ -22,7 +22,7 @@ class FacesBend(Exception):
     """Faces have bent by `off` [m] near what they touch, farther than a run takes them for; `bend` is what to take."""
 
     def __init__(self, off: float):
-        super().__init__(f"faces of ten-node tetrahedra have bent by {off:.3g} m where they touch")
+        super().__init__(f"faces of ten-node tetrahedra have bent by {off:.3g} m")
         self.bend = 2 * off
 
 
@@ -57,21 +57,20 @@ class Bending:
             left = bend.bend / 2 / 4 ** cuts_of(a.mesh, self.width, bend.bend)
             if left > self.width:
                 warn(
-                    f"{bend}, and lie up to {left:.3g} m from the triangles of pairs, more than the width {self.width:.3g} "
-                    f"m: refine the mesh, or take a width of {left:.3g} m"
+                    f"{bend} where they touch, and lie up to {left:.3g} m from the triangles of pairs, more than the width "
+                    f"{self.width:.3g} m: refine the mesh, or take a width of {left:.3g} m"
                 )
             raise bend
         self.ws.place_obstacles(now)
         places = runtime.fetch(a.offsets).astype(np.float64)
         for k, limit in list(self.limits.items()):
-            term, far = a.contacts[k], np.flatnonzero(off > limit)
-            points = points_of_bow(nodes[far]).reshape(-1, 3)
-            gaps = term.gap(points, a.poses.row_of(k, places)).reshape(len(far), -1).min(1)
-            near = gaps < float(term.values["barrier_width"])
-            if near.any():
+            term, row, far = a.contacts[k], a.poses.row_of(k, places), points_of_bow(nodes[off > limit])
+            curved, flat = term.gap(far.reshape(-1, 3), row).reshape(far.shape[:-1])
+            nearer = (flat - curved).max(1)
+            if (nearer > limit)[curved.min(1) < float(term.values["barrier_width"])].any():
                 del self.limits[k]
-                most = float(off[far][near].max())
+                most = float(nearer.max())
                 warn(
-                    f"{FacesBend(most)}, where {term!r} acts at their nodes alone: refine the mesh there, or take a width "
-                    f"of {2 * most:.3g} m or more"
+                    f"{FacesBend(most)} towards {term!r}, which acts at their nodes alone: refine the mesh there, or take a "
+                    f"width of {2.2 * most:.3g} m or more"
                 )

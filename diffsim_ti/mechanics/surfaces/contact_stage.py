@@ -121,6 +121,10 @@ class PairContact(Stage):
         yield
         self.finish(at)
 
+    def holds(self, u, slot: int) -> bool:
+        """Whether the list holds at u[slot]."""
+        return self.inner.holds(*self._fine(u, slot))
+
     def prepare(self, at: Passes, u, slot: int, anew: bool) -> None:
         """A pass begins at u[slot]; anew: what was before says nothing of the list."""
         self.follow(at, AT_BEGIN)
@@ -146,7 +150,7 @@ class PairContact(Stage):
 
     def follow(self, at: Passes, m: int) -> None:
         """Obstacles are where a pass begins (AT_BEGIN), or at its end."""
-        if self.obstacles:
+        if self.obstacles and self.obstacles.moves:
             self.obstacles.follow(self.a.poses.value(self.a.rows["path"], moment_of(at)), m)
 
     def _fine(self, u, slot: int) -> tuple:

@@ -38,16 +38,17 @@ class NearbyContact(Stage):
             self.now.begin, self.now.work = earlier.begin, earlier.work
         return self.now
 
-    def _cover(self, at: Passes, u, slot: int, more: float = 0.0) -> PairContact:
-        now = self._stage()
-        now.follow(at, AT_BEGIN)
-        now.pairs.cover(runtime.fetch_row(u, slot), more=more)
+    def _cover(self, u, slot: int, more: float = 0.0) -> PairContact:
+        self.now.pairs.cover(runtime.fetch_row(u, slot), more=more)
         return self._stage()
 
     @contextmanager
     def do(self, at: Passes):
-        u, slot, anew = at.history.u, at.slot, at.launch is None
-        stage = self._cover(at, u, slot) if anew or self.turning else self._stage()
+        u, slot, stage = at.history.u, at.slot, self._stage()
+        stage.follow(at, AT_BEGIN)
+        anew = at.launch is None and not stage.holds(u, slot)
+        if anew or self.turning:
+            stage = self._cover(u, slot)
         stage.prepare(at, u, slot, anew or not stage.inner.fresh)
         if not at.stride:
             copy_slot(u, slot, stage.begin, 0)
@@ -58,7 +59,8 @@ class NearbyContact(Stage):
                 break
             except FarFromAll as far:
                 begin = stage.begin_of(at)
-                stage = self._cover(at, *begin, far.more)
+                stage.follow(at, AT_BEGIN)
+                stage = self._cover(*begin, far.more)
                 stage.prepare(at, *begin, anew=True)
         if at.stride:
             self.by_end[at.end] = stage

@@ -236,6 +236,7 @@ class ObstacleMotion:
         for array in (self.given, self.given_dot, self.unmoved):
             runtime.fill(array, 0)
         self.rows, self.m = np.zeros((arrays.poses.size, 3)), AT_STAGE
+        self.moves = any(x.term.path is not None or x.term.led is not None for x in self.corners.parts)
         self.displacements = np.zeros((self.corners.count, 3))
         self.by_parameters = self.by_rows = None
 

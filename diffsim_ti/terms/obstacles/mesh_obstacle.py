@@ -47,9 +47,10 @@ class MeshObstacle(Obstacle):
     have no kink. Over flat parts, and convex ones that are thicker than the width and have no edges sharper than 90 degrees,
     it is the barrier of the distance; of thinner ones the far side presses, too. Friction is that of each part by its own
     normal force, so that a body which two sides of a groove with an angle 2 a between them hold slides along it against
-    mu N / sin(a). Explicit steps, their friction and gaps go by what is nearest, and the energy of contact that explicit
-    runs report counts all parts. Where what is nearest goes from a face to an edge or a corner the contact's stiffness
-    jumps.
+    mu N / sin(a). In explicit steps what is nearest acts alone: in a crease the sides press in turn, and friction is
+    mu N / sin(a) as a mean over steps; sides that are obstacles of their own press together. Gaps go by what is nearest, and
+    the energy of contact that explicit runs report counts all parts. Where what is nearest goes from a face to an edge or a
+    corner the contact's stiffness jumps.
     Raises ValueError for vertices or indices that do not fit.
     Li, Kaufman, Jiang 2023, Convergent Incremental Potential Contact, arXiv:2307.15908.
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
