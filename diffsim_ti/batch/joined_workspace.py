@@ -66,10 +66,6 @@ class JoinedWorkspace(ImplicitWorkspace):
 
     # ---- what passes are told ----------------------------------------------------------------------------------------
 
-    def gravity_of(self, values) -> np.ndarray:
-        g = of_scenes(values.parameters, self.num_scenes)[:, self.arrays.features().gravity :][:, :3]
-        return np.repeat(g, self.arrays.vertices_of_one, axis=0)
-
     def _host_values(self):
         return of_each(self.each)
 

@@ -170,7 +170,7 @@ class EnergyBalance:
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (ws.state.u, ws.state.v))
         free = runtime.fetch(a.inverse_mass) > 0
         mass, features = values.mass[:, None] * free[:, None], a.features()
-        weight = mass * values.parameters[features.gravity :][:3] if features.gravity >= 0 else 0 * mass
+        weight = mass * a.gravity_of(values)
         kinetic = 0.5 * float((mass * a.supports.free(v) ** 2).sum())
         stored = quantities.elastic_energy(ws) + sum(quantities.stored_energies(ws).values())
         if features.groups:  # a stage does not act on fixed vertices
@@ -314,9 +314,6 @@ class OwnWork:
         """V [J]; the weight of fixed vertices is carried by what holds them."""
         ws, a = self.ws, self.ws.arrays
         out = quantities.elastic_energy(ws) + sum(quantities.stored_energies(ws).values())
-        at = a.features().gravity
-        if at >= 0:
-            mass = a.values.mass * (runtime.fetch(a.inverse_mass) > 0)
-            u = runtime.fetch_row(ws.state.u, 0).astype(np.float64)
-            out -= float((mass[:, None] * a.values.parameters[at:][:3] * (a.values.rest + u)).sum())
-        return out
+        mass = a.values.mass * (runtime.fetch(a.inverse_mass) > 0)
+        u = runtime.fetch_row(ws.state.u, 0).astype(np.float64)
+        return out - float((mass[:, None] * a.gravity_of(a.values) * (a.values.rest + u)).sum())

@@ -375,9 +375,8 @@ class JointStageAdjoint(JointAdjoint):
     def collect(self, out) -> None:
         """Add what was summed up."""
         super().collect(out)
-        at = self.ws.arrays.features().gravity
-        if at >= 0:
-            out.parameters[at : at + 3] += self.by_gravity
+        gravity_adj = self.ws.arrays.gravity_of(out)
+        gravity_adj += self.by_gravity
         out.joints += self.by_steps.joints
         if out.rest is not None:
             out.rest = out.rest + self.by_rest

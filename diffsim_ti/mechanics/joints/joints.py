@@ -169,8 +169,7 @@ class Joints:
         (self.q_n, self.v_n, *_), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
         self.poses_n, self.S_n = self.kinematics(self.q_n)
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
-        at = a.features().gravity
-        self.gravity = a.values.parameters[at : at + 3].copy() if at >= 0 else np.zeros(3)
+        self.gravity = a.gravity_of(a.values).copy()
         self.M, self.bias = np.zeros((self.count, self.count)), np.zeros(self.count)
         for robot, own in zip(self.robots.terms, self.slices):
             numbers = self.q_n[own], self.v_n[own], self.masses[own], self.gravity

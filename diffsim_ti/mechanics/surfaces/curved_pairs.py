@@ -13,8 +13,8 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.curved_friction import CurvedLaggedFriction
 from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleMotion, SurfaceWithObstacles
-from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
+from diffsim_ti.mesh.geometry import surface_edges
 from diffsim_ti.runtime import Kernel, kernels_of, vector_type
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
@@ -135,16 +135,17 @@ class CurvedPairs:
     """
 
     def __init__(self, kind: type, arrays, parallel: bool, body, nearby: NearCorners | None):
-        self.a, self.nearby, self._kind, self._body = arrays, nearby, kind, (body, nearby and surface_edges(body))
+        self.a, self.nearby, self._kind, self._body = arrays, nearby, kind, body
+        self._edges = surface_edges(body.surface_triangles) if nearby else None
         self.kernels = kernels_of(Transfer, arrays.precision, parallel, nearby is not None)
         self._began, self._sums = None, None  # what a pass began with, in Newton's method; adjoints of who went
         self._hold()
 
     def _hold(self) -> None:
         """Have the corners that are near."""
-        arrays, parallel, (surface, edges) = self.a, self.kernels.parallel, self._body
+        arrays, parallel, surface = self.a, self.kernels.parallel, self._body
         if self.nearby:
-            surface = SurfaceWithObstacles(surface, edges, self.nearby.corners, arrays.self_contact)
+            surface = SurfaceWithObstacles(surface, self._edges, self.nearby.corners, arrays.self_contact)
         self.finer, self.matrix = FinerArrays(arrays, surface), surface.matrix
         self.obstacles = ObstacleMotion(surface, arrays) if self.nearby else None
         self.inner = self._kind(self.finer, parallel)

@@ -177,8 +177,9 @@ class SurfaceWithObstacles:
     meeting_edges meet each other. areas: of each triangle and each edge.
     """
 
-    def __init__(self, body, edges: np.ndarray, corners: ObstacleCorners, self_contact):
-        n, given = body.num_vertices, [x.as_given for x in corners.parts]
+    def __init__(self, body, of_body: tuple, corners: ObstacleCorners, self_contact):
+        """of_body: `surface_edges` of its triangles."""
+        (edges, sides), n, given = of_body, body.num_vertices, [x.as_given for x in corners.parts]
         self.num_vertices, self.first, self.vertices = n + corners.count, n, np.concatenate([body.vertices, *given])
         self.body, self.corners, self.surface_triangles = body, corners, body.surface_triangles
         self.surface_vertices = np.concatenate([body.surface_vertices, np.arange(n, self.num_vertices)])
@@ -189,8 +190,7 @@ class SurfaceWithObstacles:
         self.own_edges, self.meeting_edges = len(edges), len(edges) if self_contact else 0
         self.acting = np.concatenate([body.surface_vertices[: None if self_contact else 0], points])
         size = np.linalg.norm(triangle_normals(body.vertices, body.surface_triangles), axis=1)
-        keys = np.sort(body.surface_triangles[:, [[0, 1], [1, 2], [2, 0]]], 2).reshape(-1, 2) @ [n, 1]
-        of_edges = np.bincount(np.searchsorted(edges @ [n, 1], keys), np.repeat(size / 3, 3), len(edges))
+        of_edges = np.bincount(sides.ravel(), np.repeat(size / 3, 3), len(edges))
         self.areas = size, np.concatenate([of_edges, np.zeros(len(self.edges) - len(edges))])
         self.numbers = np.zeros(self.num_vertices, int)
         for number, part in enumerate(corners.parts, start=1):

@@ -146,16 +146,10 @@ class PrescribedInPasses(Workspace):
         """Number of pass j, also of the steps of a run that come one by one."""
         return self.first_step * int(np.max(self.solver.schedule.substeps)) + j
 
-    def gravity_of(self, values: Derived) -> np.ndarray:
-        """Gravity [m/s^2], one vector or one for each vertex; there is some."""
-        return values.parameters[self.arrays.features().gravity :][:3]
-
     def loads(self, j: int, stage: Stage) -> np.ndarray:
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
-        values, features = self.arrays.values, self.arrays.features()
-        out = np.zeros_like(values.displacement)
-        if features.gravity >= 0:
-            out += self.mass * self.gravity_of(values)
+        values = self.arrays.values
+        out = np.zeros_like(values.displacement) + self.mass * self.arrays.gravity_of(values)
         out = self._add_forces(self.arrays.rows["forces"], out, j, stage)
         return out * self.load_share(j, stage)
 
@@ -166,9 +160,7 @@ class PrescribedInPasses(Workspace):
             loads = self.loads(j, stage)
             shift = np.divide(loads, mass, out=np.zeros_like(loads), where=mass > 0)
             return inertial + shift, np.zeros_like(loads)
-        values, features = self.arrays.values, self.arrays.features()
-        if features.gravity >= 0:
-            inertial = inertial + self.gravity_of(values) / stage.inertia
+        inertial = inertial + self.arrays.gravity_of(self.arrays.values) / stage.inertia
         return inertial, self.applied_forces(self.arrays.rows["forces"], j, stage)
 
     def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:

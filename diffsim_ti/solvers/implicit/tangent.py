@@ -93,8 +93,7 @@ class ImplicitTangent(RecordedPasses):
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + self.mass_dot * self.weight(share)
         dR += from_friction
-        if a.features().gravity >= 0:
-            dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
+        dR += share * ws.mass * a.gravity_of(tangent)
         dR += ws.applied_forces(tangent.forces, j, s)
         dR += ws.hosts.jvp(ws.potential.held_at, held, (held - dx) / self.gamma, tangent)
         if ws.rigid:

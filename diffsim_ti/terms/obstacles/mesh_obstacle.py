@@ -13,7 +13,7 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
 from diffsim_ti.materials.calculus.tensor import sum_of
-from diffsim_ti.mesh.geometry import cross
+from diffsim_ti.mesh.geometry import cross, surface_edges
 from diffsim_ti.runtime import assign, at, let, traced, variable
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
@@ -25,7 +25,7 @@ from diffsim_ti.terms.obstacles.turning import rotation_matrix
 from diffsim_ti.terms.pose import brought_back
 from diffsim_ti.terms.term import place
 
-MOST_HELD = 256  # edges and points that act by pairs, from which on a run has those near bodies alone
+FEW = 256  # edges and points that act by pairs, from which on a run has those near bodies alone
 
 
 class MeshObstacle(Obstacle):
@@ -123,8 +123,7 @@ class MeshObstacle(Obstacle):
         out = super().settled(scene, density, initial_positions, initial_velocities)
         if "barrier_width" in self.left_to_scene:
             out._check_rounding()
-        sides = np.sort(scene.mesh.surface_triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-        out._edges_of_bodies = np.unique(sides, axis=0)
+        out._edges_of_bodies, _ = surface_edges(scene.mesh.surface_triangles)
         return out
 
     def check_start(self, positions, surface, offset=(0.0, 0.0, 0.0)):
@@ -185,7 +184,7 @@ class MeshPrimitives(Primitives):
 
     @property
     def many(self):
-        return len(self.points) + len(self.edges) > MOST_HELD
+        return len(self.points) + len(self.edges) > FEW
 
     def of_some(self, points: np.ndarray, edges: np.ndarray) -> "MeshPrimitives":
         """These points and edges alone, by their places among all."""
