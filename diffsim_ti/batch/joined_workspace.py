@@ -52,11 +52,6 @@ class JoinedWorkspace(ImplicitWorkspace):
         """Give scenes up."""
         self.left |= which
 
-    @property
-    def rate(self) -> float:
-        at = self.arrays.features().drag
-        return float(self.each[0].parameters[at]) if at >= 0 else 0.0
-
     def balance(self):
         return None
 

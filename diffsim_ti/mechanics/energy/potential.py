@@ -167,12 +167,11 @@ class Potential:
         finally:
             runtime.fill(a.parameters, kept)
 
-    def energy(self) -> tuple[float, float, np.ndarray]:
-        """(energy [J], the sum of its absolute parts, J at each point)."""
+    def energy(self) -> tuple[float, np.ndarray]:
+        """(energy [J], J at each point)."""
         self.launch("energy", lanes=False)
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
-        contact = np.concatenate([contact, self.energies_beside()])
-        return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
+        return elastic.sum() + np.concatenate([contact, self.energies_beside()]).sum(), J
 
     def energies_beside(self) -> np.ndarray:
         """Those of pairs, from the host and of joints [J]."""

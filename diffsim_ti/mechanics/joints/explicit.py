@@ -18,7 +18,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.errors import NotConverged
-from diffsim_ti.mechanics.joints.joints import Joints, moved
+from diffsim_ti.mechanics.joints.joints import Joints, balanced, moved
 from diffsim_ti.mechanics.joints.sweeps import JointAdjoint, JointSweep, JointTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import copy_slot
@@ -39,16 +39,6 @@ class ExplicitJoints(Joints):
         """Stand there, with the velocities of links in rows of obstacles."""
         self.w, self.q = w, self.q_n + self.h * w
         self.put_rates(rows, w)
-
-    def put_rates(self, rows: np.ndarray, w: np.ndarray) -> None:
-        self._put_rates(rows, w)
-
-    def own_forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(-dPhi/dq, sizes of what it adds up, what digits of places leave)"""
-        return *self._own_forces(), self._rounding()
-
-    def effort(self) -> np.ndarray:
-        return sum(self._efforts())
 
 
 class JointStage(Stage):
@@ -109,7 +99,7 @@ class JointStage(Stage):
                 copy_slot(source, 1, target, at.end)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
-        history.joints[at.end] = J.q, J.w - self.rebound(), J.effort()
+        history.joints[at.end] = J.q, J.w - self.rebound(), sum(J.efforts())
         self.met[at.end] = J.w, touches
 
     def look(self) -> bool:
@@ -151,42 +141,38 @@ class JointStage(Stage):
         return self.blend * felt[0] + felt[1]
 
     def left(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(what is left of that equation, sizes of what it adds up, what digits of places leave)"""
+        """(what is left of that equation, by its sign a force, sizes of what it adds up, what digits of places leave)"""
         J = self.joints
-        own, size, noise = J.own_forces()
+        own, size = J.own_forces()
         x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
         sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
-        return self.weighed(self.felt(self.wrenches)) - J.h * own, J.h * size + met, J.h * noise
+        return J.h * own - self.weighed(self.felt(self.wrenches)), J.h * size + met, J.h * J.rounding()
 
     def find(self, meets: bool = False) -> None:
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
-        J, (F, size, noise), best, stalled = self.joints, self.left(), np.inf, 0
-        for _ in range(ROUNDS):
-            share = float(np.max(np.abs(F) / (max(1e-14, 4 * J.eps) * size + noise)))
-            stalled = 0 if share < 0.5 * best else stalled + 1
-            if share <= 1 or (stalled > 3 and np.all(np.abs(F) <= J.loose * size + noise)) or stalled > 20:
-                break
-            best = min(best, share)
-            step = -np.linalg.solve(self.slope(meets), F)
-            if not step @ F < 0:  # which friction alone can do
-                step = -np.linalg.solve(self.slope(), F)
-            w, slope, t = J.w, step @ F, 1.0
-            while True:
-                self.go(w + t * step)
-                if meets:
-                    self.launch("press")
-                    self.look()
-                F, size, noise = self.left()
-                if step @ F <= -J.falls * slope or t < 1e-12:
-                    break
-                t *= 0.5
-        share = float(np.max(np.abs(F) / (size + noise / J.loose)))
+        J = self.joints
+
+        def stand(w):
+            self.go(w)
+            if meets:
+                self.launch("press")
+                self.look()
+            return self.left()
+
+        def direction(R):
+            step, w = np.linalg.solve(self.slope(meets), R), J.w
+            if not step @ R > 0:  # which friction alone can do
+                step = np.linalg.solve(self.slope(), R)
+            return step, 1.0, lambda t: stand(w + t * step)
+
+        R, size, noise = balanced(self.left(), direction, max(1e-14, 4 * J.eps), J.loose, ROUNDS)
+        share = float(np.max(np.abs(R) / (size + noise / J.loose)))
         if not share <= J.loose:
             remedy = "take smaller steps, or begin with links outside of the body"
             error = NotConverged(f"joints of robots are out of balance by {share:.2g}: {remedy}", [share])
             raise self.ws.dated(error, self.at.j, self.at.num_passes)
-        J.w = J.w - np.linalg.solve(self.slope(), F)  # so that momentum is kept to round-off
+        J.w = J.w + np.linalg.solve(self.slope(), R)  # so that momentum is kept to round-off
         J.q = J.q_n + J.h * J.w
 
     def slope(self, meets: bool = False) -> np.ndarray:

@@ -203,11 +203,11 @@ class CurvedPairs:
         self.launch([self._refining(*what)])
         return what[2]
 
-    def _covered(self, u, slot: int = 0):
-        """Displacements of the finer surface, from those of a slot, with all that is near."""
+    def _covered(self, u):
+        """Displacements of the finer surface, from u[0], with all that is near, for which `inner` may be made anew."""
         if self.nearby:
-            self.cover(runtime.fetch_row(u, slot))
-        return self.fine(u, slot)
+            self.cover(runtime.fetch_row(u, 0))
+        return self.fine(u, 0)
 
     def fine(self, u, slot: int):
         """Displacements of the finer surface, from those of a slot."""
@@ -258,10 +258,6 @@ class CurvedPairs:
     # ---- as of pairs of nodes ----------------------------------------------------------------------------------------
 
     @property
-    def width(self) -> float:
-        return self.inner.width
-
-    @property
     def list(self):
         return self.inner.list
 
@@ -286,10 +282,6 @@ class CurvedPairs:
         fine = self._covered(u)
         self.inner.forget(fine)
 
-    def ensure(self, u, slot: int) -> None:
-        fine = self._covered(u, slot)
-        self.inner.ensure(fine, 0)
-
     def look(self, u) -> tuple[float, float]:
         fine = self._covered(u)
         return self.inner.look(fine)
@@ -297,8 +289,8 @@ class CurvedPairs:
     def unbind(self) -> None:
         self.inner.unbind()
 
-    def forces(self, u, slot: int, out, exact: bool = False) -> None:
-        self.inner.forces(self.fine(u, slot), 0, self.finer.corner, exact)
+    def forces(self, u, slot: int, out) -> None:
+        self.inner.forces(self.fine(u, slot), 0, self.finer.corner)
         self._gather(out)
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, poses_dot=None) -> None:

@@ -35,6 +35,8 @@ class Tunnelling(FloatingPointError, metaclass=Public):
 class Overlap(ValueError):
     """A state in which surfaces touch or pass through each other, or an obstacle reaches into a face."""
 
+    apart = None  # displacements that static solves begin from instead (solvers/implicit/overlap.py)
+
 
 class SurfacePairs:
     """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py), or with obstacles that act by

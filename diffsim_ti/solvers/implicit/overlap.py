@@ -30,7 +30,29 @@ ASIDE = 0.5  # how far beside a triangle a vertex may lie, over its distance fro
 
 
 def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
-    """Displacements near u [m] at which surfaces are apart. Raises the error where none are found within an edge of u."""
+    """Displacements near u [m] at which surfaces are apart, which the error of u keeps. Raises the error where none are found
+    within an edge of u."""
+    pairs, potential, is_new = workspace.pairs, workspace.potential, error.apart is None
+    place, deepest = _apart(workspace, u, error) if is_new else (error.apart, 0.0)
+    pairs.begin(place, np.zeros_like(place))
+    runtime.fill(potential.u, place[None])
+    try:
+        pairs.check_apart(potential.u)
+    except Overlap:
+        raise error from None
+    if not np.all((workspace.volume_ratios(place) > 0) | (workspace.volume_ratios(u) <= 0)):
+        raise error
+    if is_new:
+        error.apart = place
+        warn(
+            f"static solve: surfaces overlap by up to {deepest:.3g} m where it begins; they are pressed apart first, and "
+            "friction between them acts from the next step on"
+        )
+    return place
+
+
+def _apart(workspace, u: np.ndarray, error: Overlap) -> tuple[np.ndarray, float]:
+    """(displacements at which vertices and edges are apart, how deep they were [m])"""
     from scipy.sparse import block_diag, diags, identity, kron
     from scipy.sparse.linalg import splu
 
@@ -50,19 +72,7 @@ def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
         if missing.max(initial=0.0) < 0.5 * gap:  # vertices are apart: are edges?
             rows, missing = _crossed(inner, x, gap, max(deepest, gap))
         if missing.max(initial=0.0) < 0.5 * gap:
-            pairs.begin(place, np.zeros_like(place))
-            runtime.fill(potential.u, place[None])
-            try:
-                pairs.check_apart(potential.u)
-            except Overlap:
-                raise error from None
-            if not np.all((workspace.volume_ratios(place) > 0) | (workspace.volume_ratios(u) <= 0)):
-                raise error
-            warn(
-                f"static solve: surfaces overlap by up to {deepest:.3g} m where it begins; they are pressed apart first, "
-                "and friction between them acts from the next step on"
-            )
-            return place
+            return place, deepest
         rows = rows @ moves
         place = place + splu((K + stiff * (rows.T @ rows)).tocsc()).solve(stiff * (rows.T @ missing)).reshape(-1, 3)
     raise error

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
-from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, VolumeConstraints
+from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, Multipliers
 from diffsim_ti.mechanics.constraints import ConstraintForce
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
@@ -89,11 +89,11 @@ class PrescribedInPasses(Workspace):
         """Places of those that hold a volume among the scene's."""
         return self.volumes.places if self.volumes else []
 
-    def volume_constraints(self, eps: float) -> VolumeConstraints | None:
+    def volume_constraints(self, eps: float) -> Multipliers | None:
         """The scene's chambers that hold a volume, and relations without a stiffness."""
         forces = [force for force in self.hosts if isinstance(force, HeldPressure | ConstraintForce) and force.laws]
         given = self.linear, self.arrays.values.rest, self.solver.tolerance, eps
-        return VolumeConstraints(forces, *given) if forces else None
+        return Multipliers(forces, *given) if forces else None
 
     def start_multipliers(self, j: int, u: np.ndarray) -> None:
         """Begin pass j with the pressures of constrained volumes that the pass before it ended with."""

@@ -353,7 +353,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     def volume_ratios(self, u: np.ndarray) -> np.ndarray:
         """J of each tetrahedron at a displacement."""
         self.potential.place(u)
-        return self.potential.energy()[2]
+        return self.potential.energy()[1]
 
     # ---- what obstacles do -------------------------------------------------------------------------------------------
 
