@@ -128,13 +128,9 @@ def identify(
         first = Search(problem, priors, resume)
         more, ways = search(first, show, starts is None), further
         if not isinstance(further, list):
-            early, late = (
-                searching.grown(problem, priors, go_on, most, show),
-                searching.around(problem, priors, further),
-            )
-            again = [first] * (
-                starts is None and first.stopped == SET_ASIDE
-            )  # to its end where nothing explains the data
+            early = searching.grown(problem, priors, go_on, most, show)
+            again = [first] * (first.stopped == SET_ASIDE)  # to its end, where nothing explains the data
+            late = searching.around(problem, priors, further)
             ways = islice(chain(early, again, late), None if starts is None else further)
         if more and (starts is not None or (not first.stopped.startswith("stopped") and _is_far(first, FAR))):
             for start in ways:
