@@ -30,8 +30,8 @@ ASIDE = 0.5  # how far beside a triangle a vertex may lie, over its distance fro
 
 
 def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
-    """Displacements near u [m] at which surfaces are apart, which the error keeps. Raises the error where none are found within
-    an edge of u."""
+    """Displacements near u [m] at which surfaces are apart, which the error keeps. Raises it where there are none within an
+    edge of u."""
     pairs, potential, is_new = workspace.pairs, workspace.potential, error.apart is None
     place, deepest = _apart(workspace, u, error) if is_new else (error.apart, 0.0)
     pairs.begin(place, np.zeros_like(place))
