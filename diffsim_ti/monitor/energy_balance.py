@@ -31,7 +31,18 @@ class Window:
     passes: int = 0
 
 
-class EnergyBalance:
+class Gains:
+    """Energy that steps have `gained`, and the most that was `moving`: kinetic, of strains and of contacts [J]."""
+
+    gained = moving = 0.0
+
+    @property
+    def share(self) -> float:
+        """The one over the other."""
+        return self.gained / self.moving if self.moving > 0 else 0.0
+
+
+class EnergyBalance(Gains):
     """Follows T + V less the work of what is outside, as it is at checks, every few hundred passes.
 
     T is the kinetic energy of free vertices, V that of strains, with what plastic flow has dissipated, weight, contacts,
@@ -72,13 +83,8 @@ class EnergyBalance:
         self.window: Window | None = None
         self.steady, self._rows = True, None  # whether cables pull as they did at first, and with what (their rows)
         self._soon = self.first if self.ws.arrays.features().pulled else np.inf
-        self.gained, self.moving = 0.0, 0.0  # [J]
+        self.gained = self.moving = 0.0
         self._risen, self._lowest = 0.0, 0.0  # the level against that of the first check
-
-    @property
-    def share(self) -> float:
-        """Energy gained, over the largest that moved: kinetic, of strains and of contacts."""
-        return self.gained / self.moving if self.moving > 0 else 0.0
 
     def before(self, first: int, num_passes: int) -> None:
         """Passes from `first` on come next; whatever was done to the state since the last ones is outside the balance."""
@@ -204,7 +210,7 @@ class EnergyGained(CarriesMore, UserWarning):
         self.gained, self.share, self.step, self.time, self.substep = gained, share, step, time, substep
 
 
-class EnergyWatch:
+class EnergyWatch(Gains):
     """Sums what implicit midpoint and BDF2 steps add to the energy, against the largest energy that moved so far.
 
     Between u and u' = 2 u* - u the forces f(u*) = -dE/du do the work f(u*) . (u' - u), and kinetic energy changes by just
@@ -227,7 +233,7 @@ class EnergyWatch:
 
     def clear(self) -> None:
         """Forget what was seen."""
-        self.gained, self.moving = 0.0, 0.0  # [J]
+        self.gained = self.moving = 0.0
         self.begin()
 
     def begin(self) -> None:
@@ -272,11 +278,6 @@ class EnergyWatch:
             energies.append(self.ws.potential.energy()[0])
         self.ws.collisions.put(places)
         return (energies[0] - energies[1]) / (2 * share)
-
-    @property
-    def share(self) -> float:
-        """Energy gained, over the largest that moved: kinetic, of strains and of contacts."""
-        return self.gained / self.moving if self.moving > 0 else 0.0
 
 
 class OwnWork:

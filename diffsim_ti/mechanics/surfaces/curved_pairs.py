@@ -374,9 +374,9 @@ class CurvedPairs:
         obstacle = surface.corners.parts[numbers.max() - 1].k if numbers.any() else None
         return tuple(int(i) for i in dict.fromkeys(nodes.tolist())), obstacle
 
-    def is_collision_free(self, u: np.ndarray, step: np.ndarray, to=None) -> bool:
-        self.cover(u, u + step, to=to)
-        return self.inner.is_collision_free(self.spread(u), self._step(step, to))
+    def is_collision_free(self, u: np.ndarray, step: np.ndarray) -> bool:
+        self.cover(u, u + step)
+        return self.inner.is_collision_free(self.spread(u), self._step(step, None))
 
     def check_end(self, u: np.ndarray, u_next: np.ndarray, to=None) -> None:
         self.cover(u, u_next, to=to)

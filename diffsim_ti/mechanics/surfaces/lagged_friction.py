@@ -184,9 +184,7 @@ class LaggedFriction:
             at |= dict(numbers_dot=self.pairs.contacts.numbers_dot)
         self.pairs.run(self.kernels.measure_jvp, at, self.own, slot=0)
 
-    def jvp(
-        self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers, only=None
-    ) -> np.ndarray:
+    def jvp(self, u: np.ndarray, du, dx, du_begin, numbers, poses_dot=None, only: int | None = None) -> np.ndarray:
         """Change of the forces for those of u, of x, of where the pass begins, and of `numbers`, a Tangent."""
         self._back_to_begin()
         runtime.fill(self.pairs.step, du_begin[None])

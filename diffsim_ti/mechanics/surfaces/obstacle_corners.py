@@ -41,15 +41,12 @@ class ObstacleCorners:
                 self.parts.append(SimpleNamespace(**part, primitives=primitives))
         self.count = end
 
-    def _numbers(self, part, parameters: np.ndarray) -> np.ndarray:
-        return parameters[part.shape]
-
     def made(self, parameters: np.ndarray) -> np.ndarray:
         """Where corners are as obstacles were made, shape (count, 3) [m]."""
-        return np.concatenate([x.primitives.at(self._numbers(x, parameters))[0] for x in self.parts])
+        return np.concatenate([x.primitives.at(parameters[x.shape])[0] for x in self.parts])
 
     def radii(self, parameters: np.ndarray) -> np.ndarray:
-        return np.array([x.primitives.at(self._numbers(x, parameters))[1] for x in self.parts])
+        return np.array([x.primitives.at(parameters[x.shape])[1] for x in self.parts])
 
     # ---- poses -------------------------------------------------------------------------------------------------------
 
@@ -64,7 +61,7 @@ class ObstacleCorners:
 
     def _arms(self, part, parameters, rows, m: int, p=None, c=None) -> np.ndarray:
         """R (p - c) of an obstacle that turns."""
-        p = part.primitives.at(self._numbers(part, parameters))[0] if p is None else p
+        p = part.primitives.at(parameters[part.shape])[0] if p is None else p
         c = self.about(part, parameters) if c is None else c
         return rotations.turned(rotations.from_rodrigues(rows[self.row_of(part, m)]), p - c)
 
@@ -72,7 +69,7 @@ class ObstacleCorners:
         """Where corners are at the rows number m of poses."""
         out = []
         for x in self.parts:
-            p, _ = x.primitives.at(self._numbers(x, parameters))
+            p, _ = x.primitives.at(parameters[x.shape])
             if self.row_of(x, m) is not None:
                 p = self.about(x, parameters) + self._arms(x, parameters, rows, m, p)
             out.append(p + rows[3 * x.k + m])
@@ -82,7 +79,7 @@ class ObstacleCorners:
         """Its change for those of the parameters and of the rows (rotations: theta)."""
         out = []
         for x in self.parts:
-            dp, _ = x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))
+            dp, _ = x.primitives.jvp(parameters[x.shape], change[x.shape])
             row = self.row_of(x, m)
             if row is not None:
                 dc, arms = self.about(x, change), self._arms(x, parameters, rows, m)
@@ -116,9 +113,7 @@ class ObstacleCorners:
             self._add_shape(x, parameters, np.zeros((x.own.stop - x.own.start, 3)), by_parameters, float(by))
 
     def radii_jvp(self, parameters, change) -> np.ndarray:
-        return np.array(
-            [x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[1] for x in self.parts]
-        )
+        return np.array([x.primitives.jvp(parameters[x.shape], change[x.shape])[1] for x in self.parts])
 
     # ---- velocities, on the chord of a time tau from where the pass begins (mechanics/obstacles/turned.py) --------------
 
@@ -144,10 +139,7 @@ class ObstacleCorners:
             out[x.own], row = rows_dot[3 * x.k + RATE], self.row_of(x, AT_BEGIN)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
-                J, dp = (
-                    rotations.left_jacobian(turn),
-                    x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[0],
-                )
+                J, dp = (rotations.left_jacobian(turn), x.primitives.jvp(parameters[x.shape], change[x.shape])[0])
                 darms = np.cross(rows_dot[row], arms)
                 darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self.about(x, change))
                 turned = rotations.turned(rotations.quaternion(turn), arms)

@@ -58,13 +58,12 @@ class PairShares:
         """Their change for those of u*, of x, of where the pass begins, of `numbers`, a Tangent, and of rows of poses."""
         out, friction = np.zeros(self.shape), self.pairs.friction
         runtime.fill(self.p.w, d_star[None])
-        moved = numbers.rest, parameters_dot
-        more = dict(poses_dot=poses_dot) if self.pairs.obstacles else {}
-        self.pairs.product(self.p.u, 0, self.p.w, self.p.arrays.corner, *moved, **more)
+        moved = numbers.rest, parameters_dot, poses_dot
+        self.pairs.product(self.p.u, 0, self.p.w, self.p.arrays.corner, *moved)
         for row, number in self.parts:
             out[row, 0] = self._pushes(number, all_pairs=True)
         for row, number in self.parts if friction else ():
-            out[row, 1] = friction.jvp(self.p.held_at, d_star, dx, du_begin, numbers, only=number, **more)
+            out[row, 1] = friction.jvp(self.p.held_at, d_star, dx, du_begin, numbers, poses_dot, number)
         return out
 
     def vjp(self, seed: np.ndarray) -> np.ndarray:

@@ -268,10 +268,10 @@ class SurfacePairs:
         """Contact forces at u[slot], to the last corners of `out`."""
         self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
 
-    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, only=None) -> None:
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, poses_dot=None, only=None) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of the rest shape and all parameters).
 
-        only: of the pairs of one contact.
+        poses_dot: changes of the rows of poses, which only CurvedPairs has; only: of the pairs of one contact.
         """
         at, numbers = self._of_product(u, w, out, rest_dot, parameters_dot, only)
         self.run(self.kernels.products, at, slot=slot, **numbers)
