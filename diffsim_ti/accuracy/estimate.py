@@ -223,7 +223,7 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     """(error of the mesh, of the solver's tolerance, shares of the first by tetrahedron, how it was found, other numbers)"""
     scene, solver, tight = own.rollout.scene, own.rollout.solver, {}
     if not solver.explicit:
-        tight = dict(tolerance=max(0.01 * solver.tolerance, 1e-12))  # so that its own is not felt
+        tight = dict(tolerance=max(0.01 * solver.tolerance, 1e-12))  # so that its own error does not count
     fine, there, P, parents = on_finer_mesh(own.rollout, finer, values, **tight)
     value, seed = number.of(frames)
     n, mesh, eps = scene.mesh.num_vertices, fine.scene.mesh, np.finfo(float).eps

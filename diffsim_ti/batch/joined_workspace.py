@@ -73,8 +73,8 @@ class JoinedWorkspace(ImplicitWorkspace):
 
     def add_loads(self, rows_adj, j, stage, by_vertices) -> None:
         share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
-        for own, felt in zip(of_scenes(rows_adj, self.num_scenes, 1), of_scenes(by_vertices, self.num_scenes)):
-            self.solver.schedule.add_load(own, j, share, keyed, felt[acts_at])
+        for own, by in zip(of_scenes(rows_adj, self.num_scenes, 1), of_scenes(by_vertices, self.num_scenes)):
+            self.solver.schedule.add_load(own, j, share, keyed, by[acts_at])
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ class SurfaceAreas(Link):
     A, N: a triangle's area and unit normal; theta: its angle at the vertex, so that it is dealt out among its corners, by
     the same shares however a square is cut in two. Where the surface is flat or bends little, a is the sum of these shares.
     What counts at an edge is what faces one way: where a cube lies on its bottom, its sides carry nothing, and sides of
-    any height are not felt. a is the mean, over the surface around, of what faces the same way, by the square of the cosine.
+    any height do not count. a is the mean, over the surface around, of what faces the same way, by the square of the cosine.
 
     Of ten-node tetrahedra, whose faces are four triangles each, a face's corners hand on nearly all of their shares to its
     three middles: under an even pressure a quadratic face pushes its middles alone (A / 3 each, corners 0), and what its

@@ -18,7 +18,7 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))  # entries of J in thei
 NUMBERS = 16  # of each body: M, X_, J^-1, J
 SUMS = 7  # adjoints of M and J
 SIZE = 4  # of each vertex of a body: adjoints of y and m
-# what kernels read of them; reach: of all vertices, an inverse mass [1/kg], of a body's as an impulse there feels it at most
+# what kernels read of them; reach: of all vertices, an inverse mass [1/kg], of a body's what an impulse there meets at most
 BODIES = dict.fromkeys(("body_first", "body_vertex", "body_kind", "body_of"), "ints") | dict(
     body_place="vectors", body_mass="scalars", body_reach="scalars", body_numbers="doubles", body_force="vectors2"
 )
@@ -94,10 +94,10 @@ class BodyArrays:
             body_sums=runtime.array(ti.f64, SUMS * len(self.bodies)),
         )
 
-    def collect(self, felt: dict, out: Derived) -> None:
+    def collect(self, found: dict, out: Derived) -> None:
         """Add what the sums say of masses and rest positions."""
-        of_vertices = runtime.fetch(felt["body_adjoints"]).reshape(-1, SIZE)
-        sums = runtime.fetch(felt["body_sums"]).reshape(-1, SUMS)
+        of_vertices = runtime.fetch(found["body_adjoints"]).reshape(-1, SIZE)
+        sums = runtime.fetch(found["body_sums"]).reshape(-1, SUMS)
         by_y, by_mass = of_vertices[:, :3], of_vertices[:, 3]
         by_J = np.zeros_like(self.J)
         for k, (a, b) in enumerate(PAIRS):

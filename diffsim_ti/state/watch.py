@@ -39,7 +39,7 @@ class ContactResolution:
     travel: largest approach to an obstacle in one substep, as a share of its width.
     share: the same as a share of the depth at which the barrier alone would stop the vertex.
     The last two are the largest of these at which gradients of a bounce stay within 10 %, with these solver's contacts.
-    smallest_gap [m], with the vertex and obstacle that reached it; infinite if no barrier was felt.
+    smallest_gap [m], with the vertex and obstacle that reached it; infinite if no barrier acted.
     substep [s]: the substep h; advised_substep [s]: one at which gradients of a bounce stay within 10 %.
     """
 

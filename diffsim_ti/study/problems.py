@@ -152,7 +152,7 @@ def sag(nu: float = 0.3) -> Problem:
 def bounce_scene(speed: float, cells: int, pattern: str, precision: str, **element) -> Scene:
     """A mass of 1 kg that meets a floor at `speed` [m/s] from 5 mm above the barrier: stiffness 1e4 N/m, width 0.01 m.
 
-    It is the apex of a tetrahedron too soft to be felt (1e-6 Pa), hanging from three fixed vertices.
+    It is the apex of a tetrahedron too soft to count (1e-6 Pa), hanging from three fixed vertices.
     """
     mesh = TetrahedralMesh([[0, 1, 0], [1, 1, 0], [0, 1, 1], [0, 0.015, 0]], [[0, 1, 2, 3]], fix_orientation=True)
     how = dict(initial_velocities=-speed * np.eye(4, 3, -3)[:, [1, 0, 2]], precision=precision) | element

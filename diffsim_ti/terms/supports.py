@@ -215,10 +215,10 @@ def rigid_motions_left(places: np.ndarray, held: np.ndarray) -> str:
     return motions_left(np.einsum("kij,kmj->kim", held, motions).reshape(-1, 6))
 
 
-def motions_left(felt: np.ndarray) -> str:
-    """The rigid motions that none of the rows, shape (k, 6), feels, in words; a row says what it feels of three translations
-    and of three rotations."""
-    _, sizes, V = np.linalg.svd(np.concatenate([np.zeros((6, 6)), felt]), full_matrices=False)
+def motions_left(rows: np.ndarray) -> str:
+    """The rigid motions that none of the rows, shape (k, 6), resists, in words; a row says how it resists three translations
+    and three rotations."""
+    _, sizes, V = np.linalg.svd(np.concatenate([np.zeros((6, 6)), rows]), full_matrices=False)
     left = V[sizes <= 1e-8 * max(sizes.max(), 1.0)]
     if len(left) == 6:
         return "6 rigid modes: 3 translations, 3 rotations"

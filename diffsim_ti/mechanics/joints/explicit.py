@@ -127,8 +127,8 @@ class JointStage(Stage):
         x = self.joints.places(self.joints.u_n)[1][self.near]
         return np.concatenate([own.sum(1), np.cross(x, own).sum(1)], 1).reshape(-1, 2, 6)
 
-    def felt(self, wrenches: np.ndarray) -> np.ndarray:
-        """What joints feel of them, by push and by friction, shape (2, joints): J^T."""
+    def on_joints(self, wrenches: np.ndarray) -> np.ndarray:
+        """What they do to joints, by push and by friction, shape (2, joints): J^T."""
         return np.einsum("la,ad,lkd->ka", self.carried, self.joints.S_n, wrenches)
 
     def bent(self) -> np.ndarray:
@@ -136,9 +136,9 @@ class JointStage(Stage):
         turns = self.joints.turns(self.joints.S_n)
         return np.einsum("la,lb,bad,lkd->kba", self.carried, self.carried, turns, self.wrenches)
 
-    def weighed(self, felt: np.ndarray) -> np.ndarray:
+    def weighed(self, acting: np.ndarray) -> np.ndarray:
         """What counts of it in the equation of w."""
-        return self.blend * felt[0] + felt[1]
+        return self.blend * acting[0] + acting[1]
 
     def left(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(what is left of that equation, by its sign a force, sizes of what it adds up, what digits of places leave)"""
@@ -147,7 +147,7 @@ class JointStage(Stage):
         x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
         sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
-        return J.h * own - self.weighed(self.felt(self.wrenches)), J.h * size + met, J.h * J.rounding()
+        return J.h * own - self.weighed(self.on_joints(self.wrenches)), J.h * size + met, J.h * J.rounding()
 
     def find(self, meets: bool = False) -> None:
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
@@ -183,10 +183,10 @@ class JointStage(Stage):
 
     def rebound(self) -> np.ndarray:
         """(1 - b) A^-1 J^T P"""
-        return (1 - self.blend) * np.linalg.solve(self.inertia, self.felt(self.wrenches)[0])
+        return (1 - self.blend) * np.linalg.solve(self.inertia, self.on_joints(self.wrenches)[0])
 
     def answers(self) -> np.ndarray:
-        """Changes of what joints feel by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
+        """Changes of what acts on joints, by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
         displacements, velocities and impulses of the vertices that are near."""
         J, change = self.joints, self.change
         out = np.zeros((2, J.count, J.count))
@@ -200,7 +200,7 @@ class JointStage(Stage):
             self.launch("press_jvp", rate_dot=0.0)
             du, dv = (runtime.fetch_row(x, 0)[self.near] for x in (change.u, change.v))
             given = runtime.look(change.impulse)[:, self.near].astype(np.float64)
-            out[:, :, b] = self.felt(self.wrenches_of(given))
+            out[:, :, b] = self.on_joints(self.wrenches_of(given))
             self.moves.append((b, du, dv, given))
         return out
 
@@ -260,13 +260,13 @@ class JointStageTangent(Stage):
             wrenches = stage.wrenches_of(given[:, near])
             dx = (du_n + own.tangent.rest)[near]
             wrenches[..., 3:] += np.cross(dx, stage.given[stage.own]).sum(1).reshape(-1, 2, 3)
-            felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
-            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers), dF + stage.weighed(felt))
-            felt = felt[0] + answers[0] @ dw
+            acting = stage.on_joints(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
+            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers), dF + stage.weighed(acting))
+            acting = acting[0] + answers[0] @ dw
             _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
             by_q, by_m = stage.mass_derivatives(z)
             dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
-            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * felt - dA)
+            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * acting - dA)
             u, v = runtime.fetch(run.u), runtime.fetch(run.v)
             for b, du_b, dv_b, given_b in stage.moves:
                 u[0, near] += du_b * dw[b]
@@ -326,7 +326,7 @@ class JointStageAdjoint(JointAdjoint):
         w = np.linalg.solve(K.T, by_w)
         self.w, self._to_q_n, by_x = h * w, np.zeros(len(w)), np.zeros_like(self.by_rest)
         if touches:
-            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what joints feel
+            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what acts on joints
             seeds = self._with(seeds, by)
             own = stage.carried[:, None] * by  # (links, 2, joints)
             turn = np.repeat((own @ J.S_n[:, 3:]).reshape(-1, 1, 3), len(near), 1)
@@ -349,7 +349,7 @@ class JointStageAdjoint(JointAdjoint):
             self.add_frame(frame)
 
     def _with(self, seeds, by: np.ndarray) -> np.ndarray:
-        """Adjoints of all impulses, with those by what joints feel."""
+        """Adjoints of all impulses, with those by what acts on joints."""
         stage, J = self.stage, self.joints
         out = np.zeros((2 * len(stage.ws.arrays.obstacles), *self.by_rest.shape)) + seeds
         arms = moved(J.S_n, J.places(J.u_n)[1][stage.near])  # (near, joints, 3)

@@ -181,16 +181,16 @@ class BodyStage(Bodies):
                     y, u = self.arm(m, b, scene), source[s, i]
                     v, p_adj = self.narrow(self.at_arm(w, y)), self.narrow(self.at_arm(by, y))
                     by_load = ti.cast(by_total * self.reach(b, y, scene), self.fp)
-                    by_u, by_v, felt = self.friction.vjp(i, u, v, small, p_adj, by_load, now, scene, adjoint)
+                    by_u, by_v, impulse = self.friction.vjp(i, u, v, small, p_adj, by_load, now, scene, adjoint)
                     adjoint.u[0, i] = adjoint.u[0, i] + by_u
                     wide = self.wide(by_v)
                     o += wide
                     p += y.x * wide
                     q += y.y * wide
                     r += y.z * wide
-                    by_y = self.along(by, self.wide(felt)) + self.along(w, wide)
+                    by_y = self.along(by, self.wide(impulse)) + self.along(w, wide)
                     self.add_adjoint(m, by_y, ti.cast(0, ti.f64), adjoint)
-                    self.add_reach(m, b, y, self.double(felt.w) * by_total, scene, adjoint)
+                    self.add_reach(m, b, y, self.double(impulse.w) * by_total, scene, adjoint)
         return o, p, q, r
 
     @traced

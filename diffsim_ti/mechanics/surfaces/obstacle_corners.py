@@ -299,8 +299,8 @@ class ContactNumbers:
         self.rows_of_bodies = len(mu)
         rough = [x.first + x.force.index.friction for x in parts if x.force.friction]
         self.mu = np.concatenate([mu, rough]).astype(int)
-        felt = np.array([x.force.friction for x in parts])
-        self.row_of = np.where(felt, self.rows_of_bodies + np.cumsum(felt) - 1, -1)
+        rough = np.array([x.force.friction for x in parts])
+        self.row_of = np.where(rough, self.rows_of_bodies + np.cumsum(rough) - 1, -1)
         per_area = [0, *(int(x.force.per_area) for x in parts)]
         self.owner = runtime.upload(surface.owner, ti.i32)
         self.at_number = runtime.upload(self.rows.ravel(), ti.i32)

@@ -287,7 +287,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     def _kinetic_added(self, u, v, u_next, v_star, y, stage: Stage) -> float:
         """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, of which drag is a
         part, for y is what inertia would lead to without; what keeps a shape does none."""
-        way = self.rigid.felt(u_next - u)
+        way = self.rigid.resultants(u_next - u)
         after, before, way, rate = (x * mask_of(self.free) for x in (v_star, v, way, (v_star - y) / stage.gamma))
         added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)
         return added - float((rate * (self.mass * way)).sum())

@@ -1,6 +1,7 @@
 """Friction of an obstacle at a vertex of a body of few numbers, as an impulse in an explicit pass.
 
-Many vertices slow the same body. With velocities v before friction and 1 / w_i a bound of the mass that vertex i feels, each
+Many vertices slow the same body. With velocities v before friction and 1 / w_i a bound of the mass that an impulse at vertex
+i moves, each
 takes the impulse of backward Euler (friction.py) as if it had the share of its load in the body,
 
     p_i = -h mu N_i g(|t_i|) t_i,    g = lost_per(|t_i|, C, eps),    C = sum_j h mu N_j w_j,
@@ -79,5 +80,5 @@ def vjp(force, parameters, first, X, u, v, v_obstacle, time, total, w, load_adj)
     )
     seeds = [(loaded, load_adj), *((k, let(at(w, d))) for d, k in enumerate(out))]
     adjoints, count = g.reverse(seeds, [*moved, *before, *obstacle, numbers[0], *p]), len(moved)
-    felt = let(ti.types.vector(4, force.fp)(*(x.value for x in out), loaded.value))
-    return (*force.parted(adjoints, count), adjoints[count + 6], tuple(adjoints[count + 7 :]), felt)
+    impulse = let(ti.types.vector(4, force.fp)(*(x.value for x in out), loaded.value))
+    return (*force.parted(adjoints, count), adjoints[count + 6], tuple(adjoints[count + 7 :]), impulse)

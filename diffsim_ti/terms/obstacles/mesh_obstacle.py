@@ -298,7 +298,7 @@ class MeshForce(ObstacleForce):
         own = ti.types.vector(3, self.fp)(*self.turned(X, [k * at(w, a) for a in range(3)], True))
         let(self.over_parts(VJP, parameters, first, X, u, let(own), parameters, sums, i))
 
-    # friction of implicit passes, by the normal force of each part, as both sides of a crease rub
+    # friction of implicit passes, by the normal force of each part, as friction acts on both sides of a crease
 
     @ti.func
     def each_part(self, act: A, parameters: A, first, X, u):
@@ -318,32 +318,32 @@ class MeshForce(ObstacleForce):
                 act(found, rows, s_of, t_of, g, h, share)
 
     @traced
-    def _sum_of_parts(self, of_one, count, parameters, first, felt):
-        """Sums over parts of the numbers that of_one(where the part is `felt`, its share) gives."""
+    def _sum_of_parts(self, of_one, count, parameters, first, pressed):
+        """Sums over parts of the numbers that of_one(where the part is `pressed`, its share) gives."""
         total = [variable(ti.cast(0, self.fp)) for _ in range(count)]
 
         @traced
         def add(*seen):
-            there = *felt, lambda g, p, X, u: self.distance_and_normal(g, p[: self.count], X, u, seen[:-1])
+            there = *pressed, lambda g, p, X, u: self.distance_and_normal(g, p[: self.count], X, u, seen[:-1])
             for x, more in zip(total, of_one(there, seen[-1])):
                 assign(x, x + more)
 
-        self.each_part(add, parameters, first, *felt)
+        self.each_part(add, parameters, first, *pressed)
         return total
 
     @traced
-    def _sum_of_forces(self, one, parameters, first, felt, *more):
+    def _sum_of_forces(self, one, parameters, first, pressed, *more):
         def of_one(there, share):
             f = one(parameters, first, there, *more)
             return [share * at(f, d) for d in range(3)]
 
-        return self.vector_of(self._sum_of_parts(of_one, 3, parameters, first, felt))
+        return self.vector_of(self._sum_of_parts(of_one, 3, parameters, first, pressed))
 
     @traced
-    def dissipation(self, parameters, first, felt, v, v_obstacle):
+    def dissipation(self, parameters, first, pressed, v, v_obstacle):
         one = super().dissipation
         of_one = lambda there, share: [share * one(parameters, first, there, v, v_obstacle)]  # noqa: E731
-        return self._sum_of_parts(of_one, 1, parameters, first, felt)[0]
+        return self._sum_of_parts(of_one, 1, parameters, first, pressed)[0]
 
     @traced
     def friction_force(self, *given):
@@ -358,7 +358,7 @@ class MeshForce(ObstacleForce):
         return self._sum_of_forces(super().friction_force_jvp, *given)
 
     @traced
-    def friction_force_vjp(self, parameters, first, felt, v, v_obstacle, w, sums, i):
+    def friction_force_vjp(self, parameters, first, pressed, v, v_obstacle, w, sums, i):
         one, count = super().friction_force_vjp, 6 if self.turns else 3
 
         def of_one(there, share):
@@ -366,7 +366,7 @@ class MeshForce(ObstacleForce):
             by_place, *others = one(parameters, first, there, v, v_obstacle, own, sums, i)
             return [at(by, d) for by, k in zip((by_place, *others), (count, 3, 3)) for d in range(k)]
 
-        return self.parted(self._sum_of_parts(of_one, count + 6, parameters, first, felt), count)
+        return self.parted(self._sum_of_parts(of_one, count + 6, parameters, first, pressed), count)
 
     @ti.func
     def reached(self, parameters: ti.template(), first, X, u, move, d, approach):

@@ -292,12 +292,12 @@ class ObstacleForce(VertexForce):
         by = (*adjoints[len(moved) + 7 :], *self.rows_of(p))
         return (*self.parted(adjoints, len(moved)), adjoints[len(moved) + 6], by)
 
-    # ---- friction as a force of implicit passes, at the velocity v; felt: (X, u), the place where N and n are those of the
-    # barrier, and where they are not those of `distance_and_normal`, what `record` takes them from -------------------------
+    # ---- friction as a force of implicit passes, at the velocity v; pressed: (X, u), the place where N and n are those of
+    # the barrier, and where they are not those of `distance_and_normal`, what `record` takes them from -------------------------
 
     @traced
-    def _record_friction_force(self, parameters, first, felt, v, v_obstacle):
-        g, p, place, d, n = self.record(parameters, first, *felt)
+    def _record_friction_force(self, parameters, first, pressed, v, v_obstacle):
+        g, p, place, d, n = self.record(parameters, first, *pressed)
         n, push = friction.normal_force(g, n, self.push(g, p, d))
         speed, v_obstacle = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, v_obstacle))
         return g, p, place, speed, v_obstacle, n, push
@@ -307,39 +307,39 @@ class ObstacleForce(VertexForce):
         return [at(parameters, first + k) for k in range(self.size)]
 
     @traced
-    def dissipation(self, parameters, first, felt, v, v_obstacle):
+    def dissipation(self, parameters, first, pressed, v, v_obstacle):
         """Potential of friction by the velocity [W]."""
-        g, p, _, speed, v_obstacle, n, push = self._record_friction_force(parameters, first, felt, v, v_obstacle)
+        g, p, _, speed, v_obstacle, n, push = self._record_friction_force(parameters, first, pressed, v, v_obstacle)
         return friction.dissipation(g, n, push, speed, v_obstacle, *self.rough(p)).value
 
     @traced
-    def _with_friction(self, parameters, first, felt, v, v_obstacle):
-        g, p, moved, speed, v_obstacle, n, push = self._record_friction_force(parameters, first, felt, v, v_obstacle)
+    def _with_friction(self, parameters, first, pressed, v, v_obstacle):
+        g, p, moved, speed, v_obstacle, n, push = self._record_friction_force(parameters, first, pressed, v, v_obstacle)
         return g, p, moved, speed, v_obstacle, friction.friction_force(g, n, push, speed, v_obstacle, *self.rough(p))
 
     @traced
-    def friction_force(self, parameters, first, felt, v, v_obstacle):
+    def friction_force(self, parameters, first, pressed, v, v_obstacle):
         """Force of friction [N]; `v_obstacle`: the obstacle's velocity."""
-        return self.vector_of([k.value for k in self._with_friction(parameters, first, felt, v, v_obstacle)[-1]])
+        return self.vector_of([k.value for k in self._with_friction(parameters, first, pressed, v, v_obstacle)[-1]])
 
     @traced
-    def friction_product(self, parameters, first, felt, v, v_obstacle, dv):
+    def friction_product(self, parameters, first, pressed, v, v_obstacle, dv):
         """Its change for a change of the velocity alone."""
-        g, _, _, speed, _, f = self._with_friction(parameters, first, felt, v, v_obstacle)
+        g, _, _, speed, _, f = self._with_friction(parameters, first, pressed, v, v_obstacle)
         return self.vector_of(g.forward([(x, at(dv, d)) for d, x in enumerate(speed)], f))
 
     @traced
-    def friction_force_jvp(self, parameters, first, felt, v, v_obstacle, parameters_dot, du, dv, dv_obstacle):
+    def friction_force_jvp(self, parameters, first, pressed, v, v_obstacle, parameters_dot, du, dv, dv_obstacle):
         """Its change for changes of everything."""
-        g, p, moved, speed, obstacle, f = self._with_friction(parameters, first, felt, v, v_obstacle)
+        g, p, moved, speed, obstacle, f = self._with_friction(parameters, first, pressed, v, v_obstacle)
         dots = all_changes(p, parameters_dot, first, (moved, du), (speed, dv), (obstacle, dv_obstacle))
         return self.vector_of(g.forward(dots, f))
 
     @traced
-    def friction_force_vjp(self, parameters, first, felt, v, v_obstacle, w, sums, i):
+    def friction_force_vjp(self, parameters, first, pressed, v, v_obstacle, w, sums, i):
         """Adjoints of u, v and the obstacle's velocity as vectors for the adjoint w of the force; adds to sums[.., i] those
         of the obstacle's numbers."""
-        g, p, moved, speed, obstacle, f = self._with_friction(parameters, first, felt, v, v_obstacle)
+        g, p, moved, speed, obstacle, f = self._with_friction(parameters, first, pressed, v, v_obstacle)
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *obstacle, *p])
         self.add_numbers(first, p, adjoints[len(moved) + 6 :], sums, i)
         return self.parted(adjoints, len(moved))

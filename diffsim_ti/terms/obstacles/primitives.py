@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Primitives:
-    """What bodies feel of an obstacle between their own vertices, as pairs (mechanics/surfaces/obstacle_corners.py).
+    """How an obstacle acts on bodies between their own vertices, as pairs (mechanics/surfaces/obstacle_corners.py).
 
     points: numbers of the corners that act on faces. edges: two corners of each edge that acts on edges, shape (k, 2).
     Corners lie where the numbers p of the obstacle's shape say, as it was made:

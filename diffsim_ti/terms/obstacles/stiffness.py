@@ -15,7 +15,7 @@ def stiffness_of_impact(
 ) -> float:
     """Stiffness per area [N/m^3] of a barrier `width` [m] wide for a body that meets an obstacle at `speed` [m/s].
 
-    A front that is stopped feels p = rho c v (c the speed of pressure waves), to which come rho v^2 and the weight of the
+    On a front that is stopped acts p = rho c v (c the speed of pressure waves), to which come rho v^2 and the weight of the
     column above, rho g H along the axis of gravity, and twice the pressure that loads and muscles press with (`pressed`),
     for loads that are applied suddenly swings as far again. The surface shall carry p at half the width: k = p / (1.19 w). A
     point that meets the obstacle alone may carry 47 times that before it uses 98 % of the width.

@@ -186,7 +186,7 @@ class SurfaceDistance:
     @ti.func
     def pushed(self, x, j, feature, s, t, share, behind: A, radius, width, begin, parameters: A):
         """Of a feature, with a share of a barrier of stiffness one: (energy, f = -dE/dx, df/dx: xx, xy, xz, yy, yz, zz,
-        df/dwidth, df/dradius), and rows, s, t, g, h of `seen`. behind: whether it is felt from the other side."""
+        df/dwidth, df/dradius), and rows, s, t, g, h of `seen`. behind: whether it acts to the other side."""
         out = ti.Vector.zero(self.fp, 16)
         found, rows, s_of_it, t_of_it, g, h = self.seen(x, j, feature, s, t, begin, parameters)
         side = ti.cast(1, self.fp)
