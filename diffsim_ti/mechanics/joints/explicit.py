@@ -66,8 +66,7 @@ class JointStage(Stage):
         J.now, J.u_n = at.history.joints[at.slot], runtime.fetch_row(at.history.u, at.slot)
         J.begin(at.j, SimpleNamespace(gamma=at.now.h), self.rows)
         self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
-        self.near, self.given = np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3))
-        self.wrenches = self.wrenches_of(self.given)
+        self._note(np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3)))
 
     def go(self, w: np.ndarray) -> None:
         """Links move with w in the pass; nothing is noted of it."""
@@ -105,10 +104,15 @@ class JointStage(Stage):
     def look(self) -> bool:
         """Note what links have done to vertices, and say whether that is anything."""
         impulses = runtime.look(self.ws.impulses.impulse)
-        self.near = np.flatnonzero(impulses[self.own].any((0, 2)))
-        self.given = impulses[:, self.near].astype(np.float64)
-        self.wrenches = self.wrenches_of(self.given)
-        return bool(self.near.size)
+        near = np.flatnonzero(impulses[self.own].any((0, 2)))
+        self._note(near, impulses[:, near].astype(np.float64))
+        return bool(near.size)
+
+    def _note(self, near: np.ndarray, given: np.ndarray) -> None:
+        """near: vertices that links touch, at x where the pass begins; given: what all obstacles give them."""
+        J, self.near, self.given = self.joints, near, given
+        self.x = J.a.values.rest[near] + J.u_n[near]
+        self.wrenches = self.wrenches_of(given)
 
     def launch(self, name: str, **numbers) -> None:
         """A kernel on the vertices, from the first state of the pair to the second."""
@@ -124,8 +128,7 @@ class JointStage(Stage):
     def wrenches_of(self, impulses: np.ndarray) -> np.ndarray:
         """Sums of impulses of each link, and of their moments about the origin, shape (links, 2, 6)."""
         own = impulses[self.own]
-        x = self.joints.places(self.joints.u_n)[1][self.near]
-        return np.concatenate([own.sum(1), np.cross(x, own).sum(1)], 1).reshape(-1, 2, 6)
+        return np.concatenate([own.sum(1), np.cross(self.x, own).sum(1)], 1).reshape(-1, 2, 6)
 
     def on_joints(self, wrenches: np.ndarray) -> np.ndarray:
         """What they do to joints, by push and by friction, shape (2, joints): J^T."""
@@ -144,8 +147,8 @@ class JointStage(Stage):
         """(what is left of that equation, by its sign a force, sizes of what it adds up, what digits of places leave)"""
         J = self.joints
         own, size = J.own_forces()
-        x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
-        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
+        given = np.abs(self.given[self.own])
+        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(self.x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
         return J.h * own - self.weighed(self.on_joints(self.wrenches)), J.h * size + met, J.h * J.rounding()
 
@@ -352,7 +355,7 @@ class JointStageAdjoint(JointAdjoint):
         """Adjoints of all impulses, with those by what acts on joints."""
         stage, J = self.stage, self.joints
         out = np.zeros((2 * len(stage.ws.arrays.obstacles), *self.by_rest.shape)) + seeds
-        arms = moved(J.S_n, J.places(J.u_n)[1][stage.near])  # (near, joints, 3)
+        arms = moved(J.S_n, stage.x)  # (near, joints, 3)
         for link, k in enumerate(stage.own[::2] // 2):
             for side in range(2):
                 out[2 * k + side, stage.near] += np.einsum("a,iad->id", stage.carried[link] * by[side], arms)

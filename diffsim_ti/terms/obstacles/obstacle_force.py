@@ -293,7 +293,7 @@ class ObstacleForce(VertexForce):
         return (*self.parted(adjoints, len(moved)), adjoints[len(moved) + 6], by)
 
     # ---- friction as a force of implicit passes, at the velocity v; pressed: (X, u), the place where N and n are those of
-    # the barrier, and where they are not those of `distance_and_normal`, what `record` takes them from -----------------------
+    # the barrier, and where they are not those of `distance_and_normal`, what `record` takes them from ------------------
 
     @traced
     def _record_friction_force(self, parameters, first, pressed, v, v_obstacle):
