@@ -511,11 +511,14 @@ def test_gradients_of_a_scene_that_is_given_up_are_of_its_run_alone(monkeypatch)
 
 
 def test_a_scene_whose_linear_solve_reaches_its_limit_fails_alone(monkeypatch):
+    leave, left = JoinedNewton.leave, []
+    monkeypatch.setattr(JoinedNewton, "leave", lambda self, *more: (left.append(more[1].tolist()), leave(self, *more)))
     monkeypatch.setattr(Preconditioner, "patience", 1)  # products
     scene = ds.Scene(MESH, ds.StableNeoHookean(1e3, 0.3), terms=[ds.Gravity()], fixed="ymin", precision="f64")
-    batch = ds.Batch(ds.StaticSolver(scene, max_iterations=1), 1, 3, gradients=[])
+    batch = ds.Batch(ds.ImplicitEulerSolver(scene, dt=0.1, max_iterations=1), 1, 3, gradients=[])
     frames = batch.forward(gravity=[[0, 0, 0], [0, -9.81, 0], [0, 0, 0]])
     assert frames.alive.tolist() == [True, False, True] and frames.alone == (1,)
+    assert left == [[False, True, False]]
     assert not frames.displacements[[0, 2]].any() and "Newton's method stopped after" in str(frames.error(1))
 
 
