@@ -14,6 +14,7 @@ from diffsim_ti import runtime
 from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_scene import JoinedArrays
 from diffsim_ti.diff_simulator import rollout_frames
+from diffsim_ti.solvers.implicit.preconditioners import Preconditioner
 
 MESH = ds.TetrahedralMesh.create_box(3, 0.1)
 LOW = MESH.vertices[:, 1].min()
@@ -507,6 +508,18 @@ def test_gradients_of_a_scene_that_is_given_up_are_of_its_run_alone(monkeypatch)
         found.append(batch.vjp(frames, frames.displacements))
     for name, expected in found[1].items():
         np.testing.assert_allclose(found[0][name], expected, rtol=0, atol=1e-6 * np.abs(expected).max(), err_msg=name)
+
+
+def test_a_scene_whose_linear_solve_reaches_its_limit_fails_alone(monkeypatch):
+    leave, left = JoinedNewton.leave, []
+    monkeypatch.setattr(JoinedNewton, "leave", lambda self, *more: (left.append(more[1].tolist()), leave(self, *more)))
+    monkeypatch.setattr(Preconditioner, "patience", 1)  # products
+    scene = ds.Scene(MESH, ds.StableNeoHookean(1e3, 0.3), terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    batch = ds.Batch(ds.ImplicitEulerSolver(scene, dt=0.1, max_iterations=1), 1, 3, gradients=[])
+    frames = batch.forward(gravity=[[0, 0, 0], [0, -9.81, 0], [0, 0, 0]])
+    assert frames.alive.tolist() == [True, False, True] and frames.alone == (1,)
+    assert left == [[False, True, False]]
+    assert not frames.displacements[[0, 2]].any() and "Newton's method stopped after" in str(frames.error(1))
 
 
 def test_scenes_of_other_drag_take_implicit_steps_by_turns():

@@ -7,7 +7,7 @@ from test_every_adjoint import assert_transposed
 from test_term_order import IMPLICIT, SOLVERS
 
 import diffsim_ti as ds
-from diffsim_ti.mechanics.chambers.multipliers import VolumeConstraints
+from diffsim_ti.mechanics.chambers.multipliers import Multipliers
 from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
 from diffsim_ti.monitor.stability import Stiffness
 from diffsim_ti.terms import Chamber
@@ -153,7 +153,7 @@ def test_a_forgotten_multiplier_would_be_found(monkeypatch):
     """The mutation that the dot products of held volumes are there for."""
     rollout = rollout_of(ds.StaticSolver, filled())
     rollout.forward()
-    monkeypatch.setattr(VolumeConstraints, "adjoint", lambda self, x, y, by_pressure, solve: (y, 0 * by_pressure))
+    monkeypatch.setattr(Multipliers, "adjoint", lambda self, x, y, by_pressure, solve: (y, 0 * by_pressure))
     assert ds.dot_product_test(rollout) > 1e-3
 
 

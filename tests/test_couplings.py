@@ -213,6 +213,19 @@ def test_a_press_fit_by_contact_and_what_friction_holds_of_it():
     assert exact == pytest.approx(2 * d * first[0] / over, rel=0.01)
 
 
+def test_bodies_are_pressed_apart_whatever_is_far_away():
+    cube, found = ds.TetrahedralMesh.create_cube(2, size=0.1), []
+    for others in ([], [cube.translated([7.0, 0, 0])]):
+        mesh = ds.TetrahedralMesh.joined([cube, cube.translated([0.003, 0.0995, 0.001]), *others])
+        fixed = ["body_0_ymin", "body_1_ymax", *(["body_2_ymin"] * len(others))]
+        scene = ds.Scene(mesh, ds.LinearElastic(E=1e5, nu=NU), terms=[ds.SelfContact(1e4, 1e-3)], fixed=fixed)
+        with pytest.warns(UserWarning, match="surfaces overlap by up to 0.0005 m"):
+            found.append(ds.Rollout(ds.StaticSolver(scene), 1).forward().displacements[-1])
+    alone, beside = found[0], found[1][: len(found[0])]
+    np.testing.assert_allclose(beside, alone, atol=1e-4 * np.abs(alone).max())
+    assert np.abs(alone).max() > 1e-4 and not found[1][len(alone) :].any()
+
+
 def test_bodies_that_overlap_far_are_refused():
     cube = ds.TetrahedralMesh.create_cube(2, size=0.1)
     mesh = ds.TetrahedralMesh.joined([cube, cube.translated([0, 0.03, 0])])

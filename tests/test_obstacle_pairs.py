@@ -180,7 +180,7 @@ def test_a_run_has_what_is_near_alone_and_finds_what_it_would_find_with_all(solv
 
     monkeypatch.setattr(NearCorners, "take", counted)
     for many in (256, 10**6):
-        monkeypatch.setattr(mesh_obstacle, "MOST_HELD", many)
+        monkeypatch.setattr(mesh_obstacle, "FEW", many)
         rollout = ds.Rollout(solver(scene, dt=dt, **options), steps, gradients="all", save_every=1, checkpoint_every=3)
         frames = rollout.forward()
         seed = np.cos(np.arange(frames.positions.size)).reshape(frames.positions.shape)

@@ -663,7 +663,7 @@ def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advic
         ds.Rollout(ds.ImplicitEulerSolver(scene_of(narrow), dt=1e-3), 1).forward(**{"robot.positions": [0.5, 0.0]})
     with pytest.raises(ValueError, match="attached: no link 'hand'; the file has base"):
         ds.Robot.from_urdf(ARM, attached=dict(hand="xmin"))
-    arm = ds.Robot.from_urdf(ARM, attached=dict(tip="xmin"), links=())
+    arm, held = ds.Robot.from_urdf(ARM, attached=dict(tip="xmin"), links=()), MESH.vertex_indices("xmin")[:1]
     for options, message, less in (
         (dict(fixed="ymin"), "name sets that share no vertices", dict(fixed="xmax")),
         (dict(terms=[ds.SelfContact()]), "leave these out", dict()),
@@ -673,6 +673,11 @@ def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advic
             dict(terms=[ds.Sphere((0, 1, 0), 0.1, by_pairs=False, **CONTACT)]),
         ),
         (dict(terms=[ds.Pressure(10.0, "ymax")]), "which .* has not: leave out", dict()),
+        (
+            dict(terms=[ds.MultiPointConstraint(held, [[1.0, 0, 0]])]),
+            "names no vertices that links of robots hold",
+            dict(terms=[ds.MultiPointConstraint(held, [[1.0, 0, 0]], stiffness=1.0)]),
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **options), dt=1e-3))

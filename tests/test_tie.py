@@ -62,6 +62,17 @@ def test_constant_stress_goes_through(order, held):
     np.testing.assert_allclose(frames["reaction"][-1], [-2e4, 0, 0], atol=1e-6)  # on the right half
 
 
+def test_relations_hold_through_a_tie():
+    """The end is pulled, and what is glued goes half as far of itself: a relation there changes nothing."""
+    mesh, far = halves(), 0.2
+    ends = ("right_xmax", far), ("left_xmax", far / 2)
+    terms = [ds.MultiPointConstraint.mean(mesh, end, (1, 0, 0), value, name=end) for end, value in ends]
+    u = equilibrium(scene_of(terms, mesh, fixed={"left_xmin": "x", "ymin": "y", "zmin": "z"})).displacements[-1]
+    A = np.linalg.lstsq(mesh.vertices, u, rcond=None)[0]
+    assert A[0, 0] == pytest.approx(far / 2, rel=1e-9)
+    np.testing.assert_allclose(u, mesh.vertices @ A, atol=1e-9)
+
+
 def test_a_beam_of_unequal_halves_bends_as_one():
     """Ten nodes, within a thousandth of the matching mesh; a hundredth was asked for."""
     drops = []

@@ -183,7 +183,7 @@ class FreeVertices:
 
     @ti.func
     def hits(self, i, b, moved: A, now: A, scene: A, plan: A):
-        """In how many scenes an obstacle may be felt or noted in the pass."""
+        """In how many scenes an obstacle may act or be noted in the pass."""
         count = ti.cast(0, self.fp)
         for g in ti.static(self.lane_groups):
             for k in range(g.count):

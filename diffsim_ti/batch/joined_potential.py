@@ -25,7 +25,16 @@ A = ti.template()
 BY_SCENE = "energy", "forces", "contact_blocks"  # kernels that leave out scenes which rest
 
 
-class SeesOneScene:
+class ReadsScenes:
+    """Kernels that read which scene a vertex belongs to."""
+
+    def _kernel(self, name, body, *more, **arrays):
+        kernel = super()._kernel(name, body, *more, **arrays)
+        own = kernel.arrays | dict(scene=kernel.arrays["scene"] | dict(scene_of="ints"))
+        return Kernel(name, body, self.precision, own, {n: kernel.kinds[n] for n in kernel.numbers})
+
+
+class SeesOneScene(ReadsScenes):
     """Functions of obstacles at vertex i, which see the numbers of its scene."""
 
     @traced
@@ -70,17 +79,16 @@ class ObstaclesOfScenes(SeesOneScene, ObstaclePotential):
 
 
 @dataclass(frozen=True)
-class JoinedKernels(PotentialKernels):
+class JoinedKernels(ReadsScenes, PotentialKernels):
     """skip: 1 of a scene whose products are not wanted."""
 
     @cached_property
     def obstacles(self) -> ObstaclesOfScenes:
         return ObstaclesOfScenes(self.features, self.law.precision)
 
-    def _kernel(self, name, body, reads_law=True, **arrays):
-        kernel = super()._kernel(name, body, reads_law, **arrays)
-        own = kernel.arrays | dict(scene=kernel.arrays["scene"] | dict(scene_of="ints"))
-        return Kernel(name, body, self.law.precision, own, {n: kernel.kinds[n] for n in kernel.numbers})
+    @property
+    def precision(self) -> str:
+        return self.law.precision
 
     @ti.func
     def is_wanted(self, at: A, plan: A):
@@ -118,11 +126,6 @@ class SweptOfScenes(SeesOneScene, SweptKernels):
     def one(self) -> SweptKernels:
         return SweptKernels(self.features, self.precision, self.parallel)
 
-    def _kernel(self, name, body):
-        kernel = super()._kernel(name, body)
-        own = kernel.arrays | dict(scene=kernel.arrays["scene"] | dict(scene_of="ints"))
-        return Kernel(name, body, self.precision, own, {n: kernel.kinds[n] for n in kernel.numbers})
-
     @traced
     def share_of_one(self, g, k, i, scene, way, at, most, kept):
         scene, way = self.seen_at(i, scene, way)
@@ -137,11 +140,6 @@ class SweptOfScenes(SeesOneScene, SweptKernels):
 @dataclass(frozen=True)
 class SharesOfScenes(SeesOneScene, ObstacleShares):
     """What each obstacle of its scene does to a vertex."""
-
-    def _kernel(self, name, body, **arrays):
-        kernel = super()._kernel(name, body, **arrays)
-        own = kernel.arrays | dict(scene=kernel.arrays["scene"] | dict(scene_of="ints"))
-        return Kernel(name, body, self.precision, own, {n: kernel.kinds[n] for n in kernel.numbers})
 
 
 class JoinedPotential(Potential):

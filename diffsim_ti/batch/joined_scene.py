@@ -102,6 +102,11 @@ class JoinedArrays(SceneArrays):
         self.alone = np.zeros(self.num_places)
         self.alone[self.place] = 1
 
+    def gravity_of(self, values) -> np.ndarray:
+        """That of each vertex, by its scene."""
+        at, each = self._features["gravity"], of_scenes(values.parameters, self.num_scenes)
+        return np.repeat(each[:, at : at + 3], self.vertices_of_one, axis=0) if at >= 0 else np.zeros(3)
+
     def place_obstacles(self, schedule, j) -> None:
         """To where they are in the first scene, for what looks at states between passes."""
         path = self.rows["path"]

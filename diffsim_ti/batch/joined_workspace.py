@@ -52,11 +52,6 @@ class JoinedWorkspace(ImplicitWorkspace):
         """Give scenes up."""
         self.left |= which
 
-    @property
-    def rate(self) -> float:
-        at = self.arrays.features().drag
-        return float(self.each[0].parameters[at]) if at >= 0 else 0.0
-
     def balance(self):
         return None
 
@@ -65,10 +60,6 @@ class JoinedWorkspace(ImplicitWorkspace):
         return of_scenes(self.impulses.forces, self.num_scenes, axis=3).copy()
 
     # ---- what passes are told ----------------------------------------------------------------------------------------
-
-    def gravity_of(self, values) -> np.ndarray:
-        g = of_scenes(values.parameters, self.num_scenes)[:, self.arrays.features().gravity :][:, :3]
-        return np.repeat(g, self.arrays.vertices_of_one, axis=0)
 
     def _host_values(self):
         return of_each(self.each)
@@ -82,8 +73,8 @@ class JoinedWorkspace(ImplicitWorkspace):
 
     def add_loads(self, rows_adj, j, stage, by_vertices) -> None:
         share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
-        for own, felt in zip(of_scenes(rows_adj, self.num_scenes, 1), of_scenes(by_vertices, self.num_scenes)):
-            self.solver.schedule.add_load(own, j, share, keyed, felt[acts_at])
+        for own, by in zip(of_scenes(rows_adj, self.num_scenes, 1), of_scenes(by_vertices, self.num_scenes)):
+            self.solver.schedule.add_load(own, j, share, keyed, by[acts_at])
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 

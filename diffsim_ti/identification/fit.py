@@ -97,7 +97,7 @@ def identify(
     priors = Priors(prior, problem.unknowns, rollouts[0].scene.mesh)
     further = AT_MOST if starts is None else searching.further_starts(problem, starts)
     most, with_covariance = max_iterations, problem.size <= DENSE if covariance is None else covariance
-    searches = []
+    searches: list[Search] = []
 
     def search(one: Search, show, hesitates: bool = False) -> bool:
         """Run a search to its end, or until it `hesitates`; whether there may be more."""
@@ -117,41 +117,34 @@ def identify(
                 raise Ended(STOPPED)
             if len(one.report) >= most:
                 raise Ended(f"stopped after {most} iterations")
-            stopped, converged = go_on(one, recorded, tolerance)
+            one.stopped, one.converged = go_on(one, recorded, tolerance)
         except Ended as end:
-            stopped, converged = str(end), False
-        searches.append((one, stopped, converged))
-        return stopped != STOPPED
+            one.stopped, one.converged = str(end), False
+        if one not in searches:
+            searches.append(one)
+        return one.stopped != STOPPED
 
     with progress_bar("identify", most, progress) as show:
-        more = search(Search(problem, priors, resume), show, starts is None)
-        first, why, _ = searches[0]
-        ways = further
+        first = Search(problem, priors, resume)
+        more, ways = search(first, show, starts is None), further
         if not isinstance(further, list):
-            early, late = (
-                searching.grown(problem, priors, go_on, most, show),
-                searching.around(problem, priors, further),
-            )
-            ways = (
-                chain(early, [first] * (why == SET_ASIDE), late)
-                if starts is None
-                else islice(chain(early, late), further)
-            )
-        if more and (starts is not None or (not why.startswith("stopped") and _is_far(first, FAR))):
+            early = searching.grown(problem, priors, go_on, most, show)
+            again = [first] * (first.stopped == SET_ASIDE)  # to its end, where nothing explains the data
+            late = searching.around(problem, priors, further)
+            ways = islice(chain(early, again, late), None if starts is None else further)
+        if more and (starts is not None or (not first.stopped.startswith("stopped") and _is_far(first, FAR))):
             for start in ways:
-                if start is first:  # nothing explains the data: it goes on to its end
+                if start is first:
                     more = search(first, show)
-                    searches[0] = searches.pop()
                 else:
                     with suppress(*FAILURES):  # numbers that end its first run
                         more = search(Search(problem, priors, None, start, len(searches)), show)
-                latest = searches[0 if start is first else -1][0]
-                if not more or (starts is None and not _is_far(latest, 1.0)):
+                if not more or (starts is None and not _is_far(first if start is first else searches[-1], 1.0)):
                     break
-    best = min(range(len(searches)), key=lambda k: searches[k][0].cost)
-    if best > 0:
-        searches[best][0].path = searches[0][0].path
-        searches[best][0].write()
+    best = min(searches, key=lambda search: search.cost)
+    if best is not first:
+        best.path = first.path
+        best.write()
     return _result(searches, best, with_covariance, check_mesh if more else False)
 
 
@@ -164,15 +157,14 @@ def _is_far(search: Search, times: float) -> bool:
     return degrees > 0 and float(chdtrc(degrees, square)) < 0.01
 
 
-def _result(searches: list[tuple[Search, str, bool]], best: int, with_covariance: bool, check_mesh) -> Identification:
-    search, stopped, converged = searches[best]
-    problem, t, residual = search.problem, search.point.t, search.point.residual
+def _result(searches: list[Search], search: Search, with_covariance: bool, check_mesh) -> Identification:
+    problem, t, residual, stopped = search.problem, search.point.t, search.point.residual, search.stopped
     if ended := [label for label, x, ends in zip(problem.labels, t, problem.reach.T) if x in ends]:
         stopped = f"{stopped}, with {', '.join(ended)} at the end of what its range lets it reach"
     starts = []
-    for one, why, _ in searches:
+    for one in searches:
         ends = dict(start=problem.all_numbers(one.start), numbers=problem.all_numbers(one.point.t))
-        starts.append(ends | dict(cost=one.cost, chi_square=one.chi_square, stopped=why))
+        starts.append(ends | dict(cost=one.cost, chi_square=one.chi_square, stopped=one.stopped))
     settled, more, simulations = float(problem.size), {}, problem.simulations
     mesh = MeshCheck(reason="more unknowns than a covariance is made for")
     if with_covariance:
@@ -184,5 +176,5 @@ def _result(searches: list[tuple[Search, str, bool]], best: int, with_covariance
         settled = found.seen_share
     inputs = [{k: x for k, x in problem.inputs(e, t).items() if k != TIME_OFFSET} for e in range(len(problem.rollouts))]
     numbers, degrees = (problem.numbers(t), problem.labels, problem.all_numbers(t)), max(len(residual) - settled, 0.0)
-    how = simulations, stopped, converged, search.report, inputs, search.state, starts, mesh
+    how = simulations, stopped, search.converged, search.report, inputs, search.state, starts, mesh
     return Identification(*numbers, residual, search.chi_square, degrees, *how, **more)

@@ -15,11 +15,6 @@ from diffsim_ti.rollout import Frames, Rollout
 Experiment = Rollout | ModalTest
 
 
-def is_experiment(given) -> bool:
-    """Whether this is one, and no list of several."""
-    return isinstance(given, Experiment)
-
-
 @dataclass
 class Point:
     """Free variables t, the frames of each experiment there, and the residuals of all, in deviations."""
@@ -31,7 +26,7 @@ class Point:
 
 def experiments(rollout, data, noise) -> tuple[list, list, list]:
     """Experiments, and the data and the noise of each."""
-    if is_experiment(rollout):
+    if isinstance(rollout, Experiment):
         return [rollout], [data], [noise]
     rollouts, data = list(rollout), list(data)
     noises = list(noise) if isinstance(noise, list | tuple) else [noise] * len(rollouts)

@@ -29,7 +29,10 @@ STOPPED = "stopped by the callback"
 
 
 class Search:
-    """The best point so far, its cost sum r^2 + prior, and a report of each iteration, written to `path` if there is one."""
+    """The best point so far, its cost sum r^2 + prior, and a report of each iteration, written to `path` if there is one;
+    in the end, why it stopped and whether it converged."""
+
+    stopped, converged = "", False
 
     def __init__(
         self, problem: Problem, priors: Priors, resume: dict | str | Path | None = None, start=None, number: int = 0

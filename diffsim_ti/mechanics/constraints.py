@@ -70,8 +70,8 @@ class ConstraintForce(HostForce):
     def _along(self, u) -> list[float]:
         return [float((c * u[at]).sum()) for c, at in zip(self.c, self.vertices)]
 
-    def _pushes(self, u) -> list[float]:
-        along = self._along(u)
+    def _pushes(self, along: list[float]) -> list[float]:
+        """p of each, of c . u."""
         out = [-k * (x - value) for k, x, value in zip(self.given, along, self.value)]
         for law, k in zip(self.laws, self.held):
             out[k] = law.pressure(along[k])
@@ -84,7 +84,7 @@ class ConstraintForce(HostForce):
         return out
 
     def forces(self, u):
-        return self._spread(self._pushes(u), u.shape)
+        return self._spread(self._pushes(self._along(u)), u.shape)
 
     def energies(self, u):
         along = self._along(u)
@@ -95,13 +95,11 @@ class ConstraintForce(HostForce):
         return out
 
     def jvp(self, u, du, dv, moved=None):
-        k = self.k
-        push = [-stiff * x for stiff, x in zip(k, self._along(du))]
-        out = self._spread(push, u.shape)
+        k, along, out = self.k, self._along(u), -self.product(u, du)
         if moved is None:
             return out
         dvalue = self.instant.load * pressures_at(moved.relations, self.instant)
-        parts = zip(self.c, k, self.vertices, self._along(u), self._pushes(u), self.rows, dvalue, self.value)
+        parts = zip(self.c, k, self.vertices, along, self._pushes(along), self.rows, dvalue, self.value)
         for n, (c, stiff, at, x, p, row, dx, value) in enumerate(parts):
             change = moved.parameters[row]
             dc, dk = change[: c.size].reshape(-1, 3), 0.0 if n in self.held else change[-1]
@@ -109,15 +107,14 @@ class ConstraintForce(HostForce):
         return out
 
     def vjp(self, u, w, adj=None):
-        k, pulled = self.k, self._along(w)
         if adj is not None:
-            by_value = [self.instant.load * stiff * x for stiff, x in zip(k, pulled)]
-            for n, (stiff, at, p, row, x) in enumerate(zip(k, self.vertices, self._pushes(u), self.rows, pulled)):
+            k, pulled, along = self.k, self._along(w), self._along(u)
+            for n, (stiff, at, p, row, x) in enumerate(zip(k, self.vertices, self._pushes(along), self.rows, pulled)):
                 adj.parameters[row][: 3 * len(at)] += (p * w[at] - stiff * x * u[at]).ravel()
                 if n not in self.held:
-                    adj.parameters[row][-1] -= (self._along(u)[n] - self.value[n]) * x
-            self._add_values(adj, np.array(by_value))
-        return self._spread([-stiff * x for stiff, x in zip(k, pulled)], u.shape), 0.0
+                    adj.parameters[row][-1] -= (along[n] - self.value[n]) * x
+            self._add_values(adj, np.array([self.instant.load * stiff * x for stiff, x in zip(k, pulled)]))
+        return -self.product(u, w), 0.0
 
     def _add_values(self, adj, by_value: np.ndarray) -> None:
         at = self.instant

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from diffsim_ti.common.warn import warn
-from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces
+from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces, surface_edges
 from diffsim_ti.mesh.sets import components, places_of_triangles
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")  # files that hold surfaces alone
@@ -120,8 +120,7 @@ def split_to(points: np.ndarray, triangles: np.ndarray, size: float) -> tuple[np
     again and again; neighbours share the cuts."""
     of = np.arange(len(triangles))
     while True:
-        edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-        known, place = np.unique(edges, axis=0, return_inverse=True)
+        known, sides = surface_edges(triangles)
         long = np.linalg.norm(points[known[:, 1]] - points[known[:, 0]], axis=1) > 1.5 * size
         if not long.any():
             return points, triangles, of
@@ -130,7 +129,7 @@ def split_to(points: np.ndarray, triangles: np.ndarray, size: float) -> tuple[np
         middle = np.full(len(known), -1)
         middle[long] = len(points) + np.arange(long.sum())
         points = np.concatenate([points, points[known[long]].mean(1)])
-        cuts, parts, parents = middle[place.ravel()].reshape(-1, 3), [], []
+        cuts, parts, parents = middle[sides], [], []
         for pattern, pieces in CUTS.items():  # which of the edges 01, 12, 20 are cut; a, b, c: their middles
             own = np.nonzero(((cuts >= 0) == pattern).all(1))[0]
             nodes = np.concatenate([triangles[own], cuts[own]], 1)
@@ -273,9 +272,8 @@ def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
 def fault_of(points: np.ndarray, triangles: np.ndarray) -> str | None:
     """What is wrong with a surface that is not closed, and where: each edge belongs to two triangles, or to four, six ...
     where parts touch."""
-    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    known, count = np.unique(edges, axis=0, return_counts=True)
-    odd = known[count % 2 == 1]
+    known, sides = surface_edges(triangles)
+    odd = known[np.bincount(sides.ravel()) % 2 == 1]
     if len(triangles) >= 4 and not len(odd):
         return None
     at = f"; the first is at {np.array2string(points[odd[0]].mean(0), precision=4)}" if len(odd) else ""

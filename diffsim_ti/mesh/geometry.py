@@ -33,6 +33,15 @@ def inner_faces(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, 
     return np.stack([first // 4, second // 4], 1), corners[first]
 
 
+def surface_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(each edge of triangles once, the smaller index first, sorted, shape (k, 2); which of them each triangle has as its
+    sides 01, 12, 20, shape (t, 3))"""
+    low, high = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1).astype(np.int64).T
+    count = high.max(initial=0) + 1
+    keys, which = np.unique(low * count + high, return_inverse=True)
+    return np.stack(np.divmod(keys, count), 1), which.reshape(-1, 3)
+
+
 def squared_edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Squared edge lengths, shape (num_tetrahedra, 6) [m^2], edges in the order of EDGES."""
     out = np.empty((len(tetrahedra), 6))

@@ -31,7 +31,18 @@ class Window:
     passes: int = 0
 
 
-class EnergyBalance:
+class Gains:
+    """Energy that steps have `gained`, and the most that was `moving`: kinetic, of strains and of contacts [J]."""
+
+    gained = moving = 0.0
+
+    @property
+    def share(self) -> float:
+        """The one over the other."""
+        return self.gained / self.moving if self.moving > 0 else 0.0
+
+
+class EnergyBalance(Gains):
     """Follows T + V less the work of what is outside, as it is at checks, every few hundred passes.
 
     T is the kinetic energy of free vertices, V that of strains, with what plastic flow has dissipated, weight, contacts,
@@ -72,13 +83,8 @@ class EnergyBalance:
         self.window: Window | None = None
         self.steady, self._rows = True, None  # whether cables pull as they did at first, and with what (their rows)
         self._soon = self.first if self.ws.arrays.features().pulled else np.inf
-        self.gained, self.moving = 0.0, 0.0  # [J]
+        self.gained = self.moving = 0.0
         self._risen, self._lowest = 0.0, 0.0  # the level against that of the first check
-
-    @property
-    def share(self) -> float:
-        """Energy gained, over the largest that moved: kinetic, of strains and of contacts."""
-        return self.gained / self.moving if self.moving > 0 else 0.0
 
     def before(self, first: int, num_passes: int) -> None:
         """Passes from `first` on come next; whatever was done to the state since the last ones is outside the balance."""
@@ -170,7 +176,7 @@ class EnergyBalance:
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (ws.state.u, ws.state.v))
         free = runtime.fetch(a.inverse_mass) > 0
         mass, features = values.mass[:, None] * free[:, None], a.features()
-        weight = mass * values.parameters[features.gravity :][:3] if features.gravity >= 0 else 0 * mass
+        weight = mass * a.gravity_of(values)
         kinetic = 0.5 * float((mass * a.supports.free(v) ** 2).sum())
         stored = quantities.elastic_energy(ws) + sum(quantities.stored_energies(ws).values())
         if features.groups:  # a stage does not act on fixed vertices
@@ -204,7 +210,7 @@ class EnergyGained(CarriesMore, UserWarning):
         self.gained, self.share, self.step, self.time, self.substep = gained, share, step, time, substep
 
 
-class EnergyWatch:
+class EnergyWatch(Gains):
     """Sums what implicit midpoint and BDF2 steps add to the energy, against the largest energy that moved so far.
 
     Between u and u' = 2 u* - u the forces f(u*) = -dE/du do the work f(u*) . (u' - u), and kinetic energy changes by just
@@ -227,7 +233,7 @@ class EnergyWatch:
 
     def clear(self) -> None:
         """Forget what was seen."""
-        self.gained, self.moving = 0.0, 0.0  # [J]
+        self.gained = self.moving = 0.0
         self.begin()
 
     def begin(self) -> None:
@@ -273,11 +279,6 @@ class EnergyWatch:
         self.ws.collisions.put(places)
         return (energies[0] - energies[1]) / (2 * share)
 
-    @property
-    def share(self) -> float:
-        """Energy gained, over the largest that moved: kinetic, of strains and of contacts."""
-        return self.gained / self.moving if self.moving > 0 else 0.0
-
 
 class OwnWork:
     """Follows what explicit steps add to the energy of a run by themselves, apart from all that is done to it: the
@@ -314,9 +315,6 @@ class OwnWork:
         """V [J]; the weight of fixed vertices is carried by what holds them."""
         ws, a = self.ws, self.ws.arrays
         out = quantities.elastic_energy(ws) + sum(quantities.stored_energies(ws).values())
-        at = a.features().gravity
-        if at >= 0:
-            mass = a.values.mass * (runtime.fetch(a.inverse_mass) > 0)
-            u = runtime.fetch_row(ws.state.u, 0).astype(np.float64)
-            out -= float((mass[:, None] * a.values.parameters[at:][:3] * (a.values.rest + u)).sum())
-        return out
+        mass = a.values.mass * (runtime.fetch(a.inverse_mass) > 0)
+        u = runtime.fetch_row(ws.state.u, 0).astype(np.float64)
+        return out - float((mass[:, None] * a.gravity_of(a.values) * (a.values.rest + u)).sum())

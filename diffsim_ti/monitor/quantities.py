@@ -192,8 +192,7 @@ def energy(workspace: Workspace) -> Energy:
         parts["dissipated"] = elastic_energy(workspace) - parts["elastic"]
     features = a.features()
     if features.gravity >= 0:
-        g = values.parameters[features.gravity :][:3]
-        parts["gravity"] = float(-((values.rest + u) * (workspace.mass * g)).sum())
+        parts["gravity"] = float(-((values.rest + u) * (workspace.mass * a.gravity_of(values))).sum())
     if features.groups:
         parts["contact"] = float(barrier_energies(workspace).sum())
     if workspace.pairs:

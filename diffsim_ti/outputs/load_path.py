@@ -73,7 +73,7 @@ class Equilibria:
 
     @property
     def upright(self) -> bool:
-        return bool(np.all(self.potential.energy()[2] > 0))
+        return bool(np.all(self.potential.energy()[1] > 0))
 
     def by_factor(self) -> tuple[np.ndarray, np.ndarray]:
         """(dR/ds, dh/ds)"""

@@ -153,6 +153,12 @@ class SceneArrays:
             at += term.table.size
         return out
 
+    def gravity_of(self, values: Derived) -> np.ndarray:
+        """Gravity [m/s^2] among numbers that kernels read, or their changes or adjoints, as a view; zero where there is
+        none."""
+        at = self._features["gravity"]
+        return values.parameters[at : at + 3] if at >= 0 else np.zeros(3)
+
     def record_contacts(self) -> None:
         """Kernels are to note what contact stages do."""
         self._features["recorded"], self._known_features = True, {}

@@ -104,7 +104,7 @@ def pulled(ratio: float) -> Scene:
 
 
 def sliding_blocks(friction: float) -> Scene:
-    """A soft cube that comes down askew on another one and slides on it, as far as they rub."""
+    """A soft cube that comes down askew on another one and slides on it, as far as friction lets it."""
     mesh = TetrahedralMesh.create_box(3, 0.2, "five")
     velocity = 0.05 * np.random.default_rng(0).standard_normal((2 * mesh.num_vertices, 3))
     velocity[mesh.num_vertices :] += [1.0, -0.5, 0.2]

@@ -42,7 +42,7 @@ class HeldPressure(ChamberPressure):
         return by_u
 
 
-class VolumeConstraints:
+class Multipliers:
     """Of the chambers of a HeldPressure, and of relations between places that have no stiffness (constraints.py), whose g
     and value are in the place of V and its target.
 

@@ -178,11 +178,11 @@ class ChamberPressure(FollowerPressure):
 
     def _pressures_vjp(self, x, p_adj, adj):
         by_x = 0.0
-        for law, enclosure, rows, felt in zip(self.laws, self.enclosures, self.rows, p_adj):
+        for law, enclosure, rows, by_p in zip(self.laws, self.enclosures, self.rows, p_adj):
             V = enclosure.volume(x)
-            by_x = by_x + law.slope(V) * felt * enclosure.gradient(x)
+            by_x = by_x + law.slope(V) * by_p * enclosure.gradient(x)
             if adj is not None:
-                self.add_numbers(adj, rows, law.by_numbers(V) * felt)
+                self.add_numbers(adj, rows, law.by_numbers(V) * by_p)
         return by_x
 
     def work(self, u, step):

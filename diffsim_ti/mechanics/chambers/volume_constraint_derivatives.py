@@ -81,8 +81,7 @@ def recorded(held: VolumeConstraints, at: Passes, shows: bool = False) -> Volume
         j, now, walls, ends, None if kept is None else kept[2], held.frame(j, at.save_every, now)
     )
     if one.frame >= 0 or (shows and now.pre > 0):
-        a, gravity = ws.arrays.values, ws.arrays.features().gravity
-        weight = a.parameters[gravity:][:3] if gravity >= 0 else np.zeros(3)
+        weight = ws.arrays.gravity_of(ws.arrays.values)
         v = v + now.pre * walls.freed(walls.inverse * held.rows(history.f, slot) + weight)
         change, one.q = held.tangent_part(walls, v, held.rates(ws.arrays.rows[held.numbers], j))
         one.shown = v + change

@@ -79,11 +79,15 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_tetrahedra):
             self.elastic_energies(e, scene, at, out)
+        self.contact_energies(scene, pass_, at, out, plan, True)
+
+    @ti.func
+    def contact_energies(self, scene: A, pass_: A, at: A, out: A, plan: A, friction: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             value = ti.cast(0, self.fp)
             if self.meets_obstacles(i, scene):
-                value = self.obstacles.total_energy(i, at.u[0, i], scene, pass_, plan, True)
+                value = self.obstacles.total_energy(i, at.u[0, i], scene, pass_, plan, friction)
             out.contact[i] = value
 
     @cached_property
@@ -94,12 +98,7 @@ class PotentialKernels:
 
     @ti.func
     def barrier_energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            value = ti.cast(0, self.fp)
-            if self.meets_obstacles(i, scene):
-                value = self.obstacles.total_energy(i, at.u[0, i], scene, pass_, plan, False)
-            out.contact[i] = value
+        self.contact_energies(scene, pass_, at, out, plan, False)
 
     @cached_property
     def barrier_energy(self) -> Kernel:

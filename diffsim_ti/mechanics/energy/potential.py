@@ -17,6 +17,17 @@ from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 
+@contextmanager
+def replaced(array, numbers):
+    """Other numbers in an array of the device, for a while."""
+    kept = runtime.fetch(array)
+    runtime.fill(array, numbers)
+    try:
+        yield
+    finally:
+        runtime.fill(array, kept)
+
+
 class Potential:
     """Elastic and contact energy E(u) of a scene; displacements and results are NumPy arrays, shape (num_vertices, 3).
 
@@ -137,17 +148,9 @@ class Potential:
             for array, numbers in kept:
                 runtime.fill(array, numbers)
 
-    @contextmanager
     def without_viscosity(self):
         """What the law stores alone."""
-        rate = None if self.rate is None else runtime.fetch(self.rate)
-        if rate is not None:
-            runtime.fill(self.rate, 0)
-        try:
-            yield
-        finally:
-            if rate is not None:
-                runtime.fill(self.rate, rate)
+        return nullcontext() if self.rate is None else replaced(self.rate, 0)
 
     @contextmanager
     def without_friction(self):
@@ -157,22 +160,17 @@ class Potential:
         if not (rough or self.surface_friction):
             yield
             return
-        kept = runtime.fetch(a.parameters)
-        smooth = kept.copy()
+        smooth = runtime.fetch(a.parameters).copy()
         smooth[rough] = 0
-        runtime.fill(a.parameters, smooth)
-        try:
-            with self.surface_friction.without() if self.surface_friction else nullcontext():
-                yield
-        finally:
-            runtime.fill(a.parameters, kept)
+        friction = self.surface_friction.without() if self.surface_friction else nullcontext()
+        with replaced(a.parameters, smooth), friction:
+            yield
 
-    def energy(self) -> tuple[float, float, np.ndarray]:
-        """(energy [J], the sum of its absolute parts, J at each point)."""
+    def energy(self) -> tuple[float, np.ndarray]:
+        """(energy [J], J at each point)."""
         self.launch("energy", lanes=False)
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
-        contact = np.concatenate([contact, self.energies_beside()])
-        return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
+        return elastic.sum() + np.concatenate([contact, self.energies_beside()]).sum(), J
 
     def energies_beside(self) -> np.ndarray:
         """Those of pairs, from the host and of joints [J]."""
@@ -303,20 +301,22 @@ class Potential:
         on_host = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None
         if not (self.arrays.contacts or self.pairs):
             return on_host
-        self.launch("contact_blocks", lanes=False, out=self.barriers)
-        if self.pairs:
-            self.pairs.add_blocks(self.u, self.barriers.blocks)
+        self._find_contact_blocks()
         blocks = np.swapaxes(runtime.fetch(self.barriers.blocks).astype(np.float64), 0, 1)
         return blocks if on_host is None else blocks + on_host
 
     def put_contact_blocks(self) -> None:
         """All of them, on the device."""
-        self.launch("contact_blocks", lanes=False, out=self.barriers)
-        if self.pairs:
-            self.pairs.add_blocks(self.u, self.barriers.blocks)
+        self._find_contact_blocks()
         for part in self._on_host():
             blocks = np.swapaxes(part.blocks(self.held_at), 0, 1)
             runtime.fill(self.barriers.blocks, runtime.fetch(self.barriers.blocks) + blocks)
+
+    def _find_contact_blocks(self) -> None:
+        """Those of obstacles at vertices and of pairs."""
+        self.launch("contact_blocks", lanes=False, out=self.barriers)
+        if self.pairs:
+            self.pairs.add_blocks(self.u, self.barriers.blocks)
 
     def obstacle_blocks(self) -> np.ndarray:
         """The part of obstacles at vertices in `blocks`."""

@@ -118,6 +118,6 @@ class DraggedTriangle(ItemForce):
                 adjoint.dragged_rest[3 * t + a] = adjoint.dragged_rest[3 * t + a] + by
         by_k, by_c = along * over * across, L * straight
         by_rho = -size * w.dot(B) * self.number(1.0 / 12.0)
-        felt = self.vector(by_rho, by_k, by_c - by_k, self.number(0))
-        adjoint.fluid_adjoint[2 * t] = adjoint.fluid_adjoint[2 * t] + felt
+        by_numbers = self.vector(by_rho, by_k, by_c - by_k, self.number(0))
+        adjoint.fluid_adjoint[2 * t] = adjoint.fluid_adjoint[2 * t] + by_numbers
         adjoint.fluid_adjoint[2 * t + 1] = adjoint.fluid_adjoint[2 * t + 1] - by_v

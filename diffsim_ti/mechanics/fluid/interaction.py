@@ -48,7 +48,7 @@ class FluidDrag(Interaction):
 
     def collect(self, found, out, shape):
         numbers = self.first_number[:, None] + np.arange(6)
-        felt = found["fluid_adjoint"]
-        np.add.at(out.parameters, (..., numbers.ravel()), felt.reshape(*felt.shape[:-2], -1))
+        by_numbers = found["fluid_adjoint"]
+        np.add.at(out.parameters, (..., numbers.ravel()), by_numbers.reshape(*by_numbers.shape[:-2], -1))
         if shape:
             add_at(out.rest, self.vertices, found["dragged_rest"])

@@ -18,7 +18,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.errors import NotConverged
-from diffsim_ti.mechanics.joints.joints import Joints, moved
+from diffsim_ti.mechanics.joints.joints import Joints, balanced, moved
 from diffsim_ti.mechanics.joints.sweeps import JointAdjoint, JointSweep, JointTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import copy_slot
@@ -39,16 +39,6 @@ class ExplicitJoints(Joints):
         """Stand there, with the velocities of links in rows of obstacles."""
         self.w, self.q = w, self.q_n + self.h * w
         self.put_rates(rows, w)
-
-    def put_rates(self, rows: np.ndarray, w: np.ndarray) -> None:
-        self._put_rates(rows, w)
-
-    def own_forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(-dPhi/dq, sizes of what it adds up, what digits of places leave)"""
-        return *self._own_forces(), self._rounding()
-
-    def effort(self) -> np.ndarray:
-        return sum(self._efforts())
 
 
 class JointStage(Stage):
@@ -76,8 +66,7 @@ class JointStage(Stage):
         J.now, J.u_n = at.history.joints[at.slot], runtime.fetch_row(at.history.u, at.slot)
         J.begin(at.j, SimpleNamespace(gamma=at.now.h), self.rows)
         self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
-        self.near, self.given = np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3))
-        self.wrenches = self.wrenches_of(self.given)
+        self._note(np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3)))
 
     def go(self, w: np.ndarray) -> None:
         """Links move with w in the pass; nothing is noted of it."""
@@ -109,16 +98,21 @@ class JointStage(Stage):
                 copy_slot(source, 1, target, at.end)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
-        history.joints[at.end] = J.q, J.w - self.rebound(), J.effort()
+        history.joints[at.end] = J.q, J.w - self.rebound(), sum(J.efforts())
         self.met[at.end] = J.w, touches
 
     def look(self) -> bool:
         """Note what links have done to vertices, and say whether that is anything."""
         impulses = runtime.look(self.ws.impulses.impulse)
-        self.near = np.flatnonzero(impulses[self.own].any((0, 2)))
-        self.given = impulses[:, self.near].astype(np.float64)
-        self.wrenches = self.wrenches_of(self.given)
-        return bool(self.near.size)
+        near = np.flatnonzero(impulses[self.own].any((0, 2)))
+        self._note(near, impulses[:, near].astype(np.float64))
+        return bool(near.size)
+
+    def _note(self, near: np.ndarray, given: np.ndarray) -> None:
+        """near: vertices that links touch, at x where the pass begins; given: what all obstacles give them."""
+        J, self.near, self.given = self.joints, near, given
+        self.x = J.a.values.rest[near] + J.u_n[near]
+        self.wrenches = self.wrenches_of(given)
 
     def launch(self, name: str, **numbers) -> None:
         """A kernel on the vertices, from the first state of the pair to the second."""
@@ -134,11 +128,10 @@ class JointStage(Stage):
     def wrenches_of(self, impulses: np.ndarray) -> np.ndarray:
         """Sums of impulses of each link, and of their moments about the origin, shape (links, 2, 6)."""
         own = impulses[self.own]
-        x = self.joints.places(self.joints.u_n)[1][self.near]
-        return np.concatenate([own.sum(1), np.cross(x, own).sum(1)], 1).reshape(-1, 2, 6)
+        return np.concatenate([own.sum(1), np.cross(self.x, own).sum(1)], 1).reshape(-1, 2, 6)
 
-    def felt(self, wrenches: np.ndarray) -> np.ndarray:
-        """What joints feel of them, by push and by friction, shape (2, joints): J^T."""
+    def on_joints(self, wrenches: np.ndarray) -> np.ndarray:
+        """What they do to joints, by push and by friction, shape (2, joints): J^T."""
         return np.einsum("la,ad,lkd->ka", self.carried, self.joints.S_n, wrenches)
 
     def bent(self) -> np.ndarray:
@@ -146,47 +139,43 @@ class JointStage(Stage):
         turns = self.joints.turns(self.joints.S_n)
         return np.einsum("la,lb,bad,lkd->kba", self.carried, self.carried, turns, self.wrenches)
 
-    def weighed(self, felt: np.ndarray) -> np.ndarray:
+    def weighed(self, acting: np.ndarray) -> np.ndarray:
         """What counts of it in the equation of w."""
-        return self.blend * felt[0] + felt[1]
+        return self.blend * acting[0] + acting[1]
 
     def left(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(what is left of that equation, sizes of what it adds up, what digits of places leave)"""
+        """(what is left of that equation, by its sign a force, sizes of what it adds up, what digits of places leave)"""
         J = self.joints
-        own, size, noise = J.own_forces()
-        x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
-        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
+        own, size = J.own_forces()
+        given = np.abs(self.given[self.own])
+        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(self.x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
-        return self.weighed(self.felt(self.wrenches)) - J.h * own, J.h * size + met, J.h * noise
+        return J.h * own - self.weighed(self.on_joints(self.wrenches)), J.h * size + met, J.h * J.rounding()
 
     def find(self, meets: bool = False) -> None:
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
-        J, (F, size, noise), best, stalled = self.joints, self.left(), np.inf, 0
-        for _ in range(ROUNDS):
-            share = float(np.max(np.abs(F) / (max(1e-14, 4 * J.eps) * size + noise)))
-            stalled = 0 if share < 0.5 * best else stalled + 1
-            if share <= 1 or (stalled > 3 and np.all(np.abs(F) <= J.loose * size + noise)) or stalled > 20:
-                break
-            best = min(best, share)
-            step = -np.linalg.solve(self.slope(meets), F)
-            if not step @ F < 0:  # which friction alone can do
-                step = -np.linalg.solve(self.slope(), F)
-            w, slope, t = J.w, step @ F, 1.0
-            while True:
-                self.go(w + t * step)
-                if meets:
-                    self.launch("press")
-                    self.look()
-                F, size, noise = self.left()
-                if step @ F <= -J.falls * slope or t < 1e-12:
-                    break
-                t *= 0.5
-        share = float(np.max(np.abs(F) / (size + noise / J.loose)))
+        J = self.joints
+
+        def stand(w):
+            self.go(w)
+            if meets:
+                self.launch("press")
+                self.look()
+            return self.left()
+
+        def direction(R):
+            step, w = np.linalg.solve(self.slope(meets), R), J.w
+            if not step @ R > 0:  # which friction alone can do
+                step = np.linalg.solve(self.slope(), R)
+            return step, 1.0, lambda t: stand(w + t * step)
+
+        R, size, noise = balanced(self.left(), direction, max(1e-14, 4 * J.eps), J.loose, ROUNDS)
+        share = float(np.max(np.abs(R) / (size + noise / J.loose)))
         if not share <= J.loose:
             remedy = "take smaller steps, or begin with links outside of the body"
             error = NotConverged(f"joints of robots are out of balance by {share:.2g}: {remedy}", [share])
             raise self.ws.dated(error, self.at.j, self.at.num_passes)
-        J.w = J.w - np.linalg.solve(self.slope(), F)  # so that momentum is kept to round-off
+        J.w = J.w + np.linalg.solve(self.slope(), R)  # so that momentum is kept to round-off
         J.q = J.q_n + J.h * J.w
 
     def slope(self, meets: bool = False) -> np.ndarray:
@@ -197,10 +186,10 @@ class JointStage(Stage):
 
     def rebound(self) -> np.ndarray:
         """(1 - b) A^-1 J^T P"""
-        return (1 - self.blend) * np.linalg.solve(self.inertia, self.felt(self.wrenches)[0])
+        return (1 - self.blend) * np.linalg.solve(self.inertia, self.on_joints(self.wrenches)[0])
 
     def answers(self) -> np.ndarray:
-        """Changes of what joints feel by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
+        """Changes of what acts on joints, by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
         displacements, velocities and impulses of the vertices that are near."""
         J, change = self.joints, self.change
         out = np.zeros((2, J.count, J.count))
@@ -214,7 +203,7 @@ class JointStage(Stage):
             self.launch("press_jvp", rate_dot=0.0)
             du, dv = (runtime.fetch_row(x, 0)[self.near] for x in (change.u, change.v))
             given = runtime.look(change.impulse)[:, self.near].astype(np.float64)
-            out[:, :, b] = self.felt(self.wrenches_of(given))
+            out[:, :, b] = self.on_joints(self.wrenches_of(given))
             self.moves.append((b, du, dv, given))
         return out
 
@@ -274,13 +263,13 @@ class JointStageTangent(Stage):
             wrenches = stage.wrenches_of(given[:, near])
             dx = (du_n + own.tangent.rest)[near]
             wrenches[..., 3:] += np.cross(dx, stage.given[stage.own]).sum(1).reshape(-1, 2, 3)
-            felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
-            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers), dF + stage.weighed(felt))
-            felt = felt[0] + answers[0] @ dw
+            acting = stage.on_joints(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
+            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers), dF + stage.weighed(acting))
+            acting = acting[0] + answers[0] @ dw
             _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
             by_q, by_m = stage.mass_derivatives(z)
             dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
-            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * felt - dA)
+            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * acting - dA)
             u, v = runtime.fetch(run.u), runtime.fetch(run.v)
             for b, du_b, dv_b, given_b in stage.moves:
                 u[0, near] += du_b * dw[b]
@@ -340,7 +329,7 @@ class JointStageAdjoint(JointAdjoint):
         w = np.linalg.solve(K.T, by_w)
         self.w, self._to_q_n, by_x = h * w, np.zeros(len(w)), np.zeros_like(self.by_rest)
         if touches:
-            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what joints feel
+            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what acts on joints
             seeds = self._with(seeds, by)
             own = stage.carried[:, None] * by  # (links, 2, joints)
             turn = np.repeat((own @ J.S_n[:, 3:]).reshape(-1, 1, 3), len(near), 1)
@@ -363,10 +352,10 @@ class JointStageAdjoint(JointAdjoint):
             self.add_frame(frame)
 
     def _with(self, seeds, by: np.ndarray) -> np.ndarray:
-        """Adjoints of all impulses, with those by what joints feel."""
+        """Adjoints of all impulses, with those by what acts on joints."""
         stage, J = self.stage, self.joints
         out = np.zeros((2 * len(stage.ws.arrays.obstacles), *self.by_rest.shape)) + seeds
-        arms = moved(J.S_n, J.places(J.u_n)[1][stage.near])  # (near, joints, 3)
+        arms = moved(J.S_n, stage.x)  # (near, joints, 3)
         for link, k in enumerate(stage.own[::2] // 2):
             for side in range(2):
                 out[2 * k + side, stage.near] += np.einsum("a,iad->id", stage.carried[link] * by[side], arms)
@@ -375,9 +364,8 @@ class JointStageAdjoint(JointAdjoint):
     def collect(self, out) -> None:
         """Add what was summed up."""
         super().collect(out)
-        at = self.ws.arrays.features().gravity
-        if at >= 0:
-            out.parameters[at : at + 3] += self.by_gravity
+        gravity_adj = self.ws.arrays.gravity_of(out)
+        gravity_adj += self.by_gravity
         out.joints += self.by_steps.joints
         if out.rest is not None:
             out.rest = out.rest + self.by_rest

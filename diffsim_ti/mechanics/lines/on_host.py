@@ -127,12 +127,19 @@ class LinesOnHost(HostForce):
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
         t, length, _, _, k, T = self._state(u)
-        row, data = self._entries
-        g = np.stack([np.bincount(self._pair, data * t[row, d], len(self._pair_path)) for d in range(3)], 1)
-        out = np.zeros((self.num_vertices, 3, 3))
+        g, out = self._along_paths(t), np.zeros((self.num_vertices, 3, 3))
         np.add.at(out, self._pair_vertex, k[self._pair_path, None, None] * g[:, :, None] * g[:, None, :])
-        bare = np.stack([self._across(t, length, T, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
-        return out + (self._squared @ bare.reshape(-1, 9)).reshape(-1, 3, 3)
+        across = self._stiffness_across(t, length, T)
+        return out + (self._squared @ across.reshape(-1, 9)).reshape(-1, 3, 3)
+
+    def _along_paths(self, t) -> np.ndarray:
+        """dL/du of each pair of a path and a vertex, shape (pairs, 3)."""
+        row, data = self._entries
+        return np.stack([np.bincount(self._pair, data * t[row, d], len(self._pair_path)) for d in range(3)], 1)
+
+    def _stiffness_across(self, t, length, T) -> np.ndarray:
+        """`_across` as a matrix of each segment, shape (segments, 3, 3)."""
+        return np.stack([self._across(t, length, T, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
 
     def turning(self, u: np.ndarray, w: np.ndarray) -> float:
         """The largest |C w| / |d| of segments that have a length."""
@@ -144,7 +151,7 @@ class LinesOnHost(HostForce):
         from scipy.sparse import block_diag, csr_matrix, diags, identity, kron
 
         t, length, _, _, k, T = self._state(u)
-        across = np.stack([self._across(t, length, T, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
+        across = self._stiffness_across(t, length, T)
         C = kron(self.parted, identity(3), "csr")
         places = np.repeat(self.paths.path_of, 3), np.arange(t.size)
         g = csr_matrix((t.ravel(), places), shape=(len(self.paths), t.size)) @ C  # dL/du of each path
@@ -153,9 +160,7 @@ class LinesOnHost(HostForce):
     def row_sums(self, u: np.ndarray) -> np.ndarray:
         """A bound of the sums of |d2E/du2| over the block row of each vertex [N/m]."""
         t, length, _, _, k, T = self._state(u)
-        row, data = self._entries
-        g = np.stack([np.bincount(self._pair, data * t[row, d], len(self._pair_path)) for d in range(3)], 1)
-        size = np.linalg.norm(g, axis=1)
+        size = np.linalg.norm(self._along_paths(t), axis=1)
         whole = np.bincount(self._pair_path, size, len(self.paths))
         out = np.bincount(self._pair_vertex, (k * whole)[self._pair_path] * size, self.num_vertices)
         T, k = T[self.paths.path_of], self.k[self.paths.path_of]
@@ -167,11 +172,6 @@ class LinesOnHost(HostForce):
         """Change of the lengths."""
         dd = segments_dot[self.paths.starts] + self.parted @ du
         return self._sums((self._state(u)[0] * dd).sum(1))
-
-    def lengths_vjp(self, u, L_adj) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of u and segments for that of the lengths."""
-        d_adj = L_adj[self.paths.path_of, None] * self._state(u)[0]
-        return self.together @ d_adj, self._of_points(d_adj)
 
     def tensions_jvp(self, u, du, segments_dot, tension_dot, slack_dot, stiffness_dot) -> np.ndarray:
         """Change of T for changes of everything."""

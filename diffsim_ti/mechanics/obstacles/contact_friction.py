@@ -78,10 +78,10 @@ class ContactFriction(ObstacleStages):
     @ti.func
     def slide(self, o, i, v, ratio, scene: A, state: A):
         """Velocity after the friction of an obstacle, whose push is noted."""
-        pushed, felt, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + NUMBERS, i], v
-        if pushed.x > 0 and felt.z > 0:
+        pushed, law, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + NUMBERS, i], v
+        if pushed.x > 0 and law.z > 0:
             plane, v_obstacle = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + VELOCITY, i]
-            after = stage.slide(self.fp, plane, pushed.x, v, v_obstacle, ratio, felt.z, felt.w)
+            after = stage.slide(self.fp, plane, pushed.x, v, v_obstacle, ratio, law.z, law.w)
             if ti.static(self.features.partly_fixed):
                 after = v + self.along(i, self.normal(plane), after - v, scene)
         return after
@@ -142,7 +142,7 @@ class ContactFriction(ObstacleStages):
     def slide_jvp_of(self, g: A, k, i, u, du, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
         """Velocity after the friction of one obstacle, and its change."""
         row, first = ROWS * (g.number + k), g.first + k * g.size
-        pushed, felt = state.stage[row + PUSH, i], state.stage[row + NUMBERS, i]
+        pushed, law = state.stage[row + PUSH, i], state.stage[row + NUMBERS, i]
         if pushed.x > 0:
             plane, v_obstacle = state.stage[row + PLANE, i], state.stage[row + VELOCITY, i]
             X = self.seen_now(g, k, scene.rest[i], now, scene)
@@ -151,22 +151,9 @@ class ContactFriction(ObstacleStages):
             dmu = tangent.parameters[first + g.force.index.friction]
             deps = tangent.parameters[first + g.force.index.friction_speed]
             dafter = stage.slide_jvp(
-                self.fp,
-                plane,
-                pushed.x,
-                v,
-                v_obstacle,
-                ratio,
-                felt.z,
-                felt.w,
-                change,
-                dv,
-                dv_obstacle,
-                dratio,
-                dmu,
-                deps,
+                self.fp, plane, pushed.x, v, v_obstacle, ratio, law.z, law.w, change, dv, dv_obstacle, dratio, dmu, deps
             )
-            after = stage.slide(self.fp, plane, pushed.x, v, v_obstacle, ratio, felt.z, felt.w)
+            after = stage.slide(self.fp, plane, pushed.x, v, v_obstacle, ratio, law.z, law.w)
             if ti.static(self.features.partly_fixed):
                 n, dn, e = self.normal(plane), self.normal(change), after - v
                 dafter = dv + self.along_jvp(i, n, dn, e, dafter - dv, scene)
@@ -216,8 +203,8 @@ class ContactFriction(ObstacleStages):
         for back in range(ti.static(self.features.num_staged)):
             before = ti.static(self.features.num_staged) - 1 - back
             row = ROWS * (ti.static(self.features.first_staged) + before)
-            pushed, felt, by_v_obstacle = state.stage[row + PUSH, i], state.stage[row + NUMBERS, i], self.vector(0)
-            if pushed.x > 0 and felt.z > 0:
+            pushed, law, by_v_obstacle = state.stage[row + PUSH, i], state.stage[row + NUMBERS, i], self.vector(0)
+            if pushed.x > 0 and law.z > 0:
                 start, held_adj = self.slide_by(before, i, v, ratio, scene, state), self.vector(0)
                 if ti.static(self.features.partly_fixed):
                     held_adj = self.sliding_supports.held(i, v_adj, scene)
@@ -227,12 +214,12 @@ class ContactFriction(ObstacleStages):
                     v_adj += share * seed_of_friction(self, before, i, now, scene, adjoint)
                 by_n = self.vector(0)
                 if ti.static(self.features.partly_fixed):
-                    raw = stage.slide(self.fp, plane, pushed.x, start, v_obstacle, ratio, felt.z, felt.w)
+                    raw = stage.slide(self.fp, plane, pushed.x, start, v_obstacle, ratio, law.z, law.w)
                     by_e, by_n = self.along_vjp(i, self.normal(plane), raw - start, v_adj, scene)
                     held_adj += v_adj - by_e
                     v_adj = by_e
                 by_plane, by_v, of_v_obstacle, more, by_mu, by_eps = stage.slide_vjp(
-                    self.fp, plane, pushed.x, start, v_obstacle, ratio, felt.z, felt.w, v_adj
+                    self.fp, plane, pushed.x, start, v_obstacle, ratio, law.z, law.w, v_adj
                 )
                 v_adj, by_v_obstacle = by_v + held_adj if ti.static(self.features.partly_fixed) else by_v, of_v_obstacle
                 if ti.static(self.features.recorded):

@@ -72,20 +72,20 @@ class ContactStage(ObstacleStages):
                         else:
                             row = ROWS * (g.number + k)
                             state.stage[row + PLANE, i] = plane
-                            felt = stage.numbers(g.force, scene.parameters, first)
-                            felt.x = self.on_area(g, i, felt.x, scene)
-                            state.stage[row + NUMBERS, i] = felt
+                            law = stage.numbers(g.force, scene.parameters, first)
+                            law.x = self.on_area(g, i, law.x, scene)
+                            state.stage[row + NUMBERS, i] = law
                             state.stage[row + VELOCITY, i] = v_obstacle
         return near
 
     @ti.func
     def push(self, o, i, z, now: A, state: A, plan: A):
         """Note the push of an obstacle for the move z; returns (n, P, -dP/dy, the smaller one of d and y)."""
-        plane, felt = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + NUMBERS, i]
-        n, width = self.normal(plane), felt.y
+        plane, law = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + NUMBERS, i]
+        n, width = self.normal(plane), law.y
         y = plane.w + n.dot(z - now.h * state.stage[ROWS * o + VELOCITY, i])
         p, by_t = secant.push_by_end(plane.w / width, y / width, plan.contact_damping, self.fp)
-        P, K, zero = felt.x * width * p, felt.x * by_t, ti.cast(0, self.fp)
+        P, K, zero = law.x * width * p, law.x * by_t, ti.cast(0, self.fp)
         state.stage[ROWS * o + PUSH, i] = self.vector(P, K, zero, zero)
         return n, P, K, ti.min(plane.w, y)
 

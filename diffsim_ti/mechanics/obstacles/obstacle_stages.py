@@ -150,28 +150,28 @@ class ObstacleStages(ObstacleFunctions):
         return self.turned.obstacle_velocity_jvp(self.turned.short(dv), omega, domega, now.h, arm, darm)
 
     @traced
-    def spread(self, g, k, i, X, u, by, by_v_obstacle, now, scene, adjoint, felt, column=None):
+    def spread(self, g, k, i, X, u, by, by_v_obstacle, now, scene, adjoint, paths, column=None):
         """Adjoint of u for those of the changed place and of the obstacle's velocity there; adds those of its path to column
-        `column` of felt.path_adjoint, and of the point that it turns about to column i of the sums."""
+        `column` of paths.path_adjoint, and of the point that it turns about to column i of the sums."""
         column = i if column is None else column
         if g.force.turns:
-            return self.spread_turned(g, k, i, column, X, u, by, by_v_obstacle, now, scene, adjoint, felt)
-        self.add_to_path(g, k, column, now, by, by_v_obstacle, felt)
+            return self.spread_turned(g, k, i, column, X, u, by, by_v_obstacle, now, scene, adjoint, paths)
+        self.add_to_path(g, k, column, now, by, by_v_obstacle, paths)
         return by
 
     @ti.func
-    def spread_turned(self, g: A, k, i, column, X, u, by, by_v_obstacle, now: A, scene: A, adjoint: A, felt: A):
+    def spread_turned(self, g: A, k, i, column, X, u, by, by_v_obstacle, now: A, scene: A, adjoint: A, paths: A):
         first, b = g.first + k * g.size, self.turned.short(by_v_obstacle)
         r, omega = self.turned.arm(g, first, X, u, scene), self.spin(g, k, now, scene)
         by_omega, by_arm = self.turned.obstacle_velocity_vjp(omega, now.h, r, b)
         by_u, _, by_theta = self.turned.spread(g, first, i, X, u, by, by_arm, scene, adjoint.sums)
-        self.add_to_path(g, k, column, now, by_u, by_v_obstacle, felt)
+        self.add_to_path(g, k, column, now, by_u, by_v_obstacle, paths)
         if ti.static(g.led):
             row = self.turning_row(g, k)
-            felt.offsets[row + AT_BEGIN, column] = felt.offsets[row + AT_BEGIN, column] + self.turned.long(by_theta)
-            felt.offsets[row + RATE, column] = felt.offsets[row + RATE, column] + self.turned.long(by_omega)
+            paths.offsets[row + AT_BEGIN, column] = paths.offsets[row + AT_BEGIN, column] + self.turned.long(by_theta)
+            paths.offsets[row + RATE, column] = paths.offsets[row + RATE, column] + self.turned.long(by_omega)
         else:
-            self.add_to_turn(g, k, column, now, by_theta, by_omega, scene, felt)
+            self.add_to_turn(g, k, column, now, by_theta, by_omega, scene, paths)
         return by_u
 
     @ti.func
@@ -216,7 +216,7 @@ class ObstacleStages(ObstacleFunctions):
 
     @traced
     def noting(self, now, plan):
-        """A pass on the way back with `felt`: where vertices accumulate adjoints of paths in its step."""
+        """A pass on the way back, with where vertices accumulate adjoints of paths in its step."""
         moving = self.features.moving
         return Bundle(**vars(now), path_adjoint=let(2 * moving * (now.row % plan.steps)) if moving else 0)
 
@@ -265,14 +265,14 @@ class ObstacleStages(ObstacleFunctions):
             reached = g.force.reached(scene.parameters, first, X, u, move, d, approach)
             if reached < width:
                 rigidity = self.on_area(g, i, g.force.rigidity(scene.parameters, first, X, u), scene)
-                omega2 = self.felt_by(i, scene) * rigidity
+                omega2 = self.inverse_mass(i, scene) * rigidity
                 state.seen[at, i] = ti.min(state.seen[at, i], reached)
                 state.seen[at + 1, i] = ti.max(state.seen[at + 1, i], now.h * now.h * omega2)
                 state.seen[at + 2, i] = ti.max(state.seen[at + 2, i], ti.abs(approach) / width)
 
     @traced
-    def felt_by(self, i, scene):
-        """An inverse mass [1/kg] as a push on vertex i feels it, of a body's at the most."""
+    def inverse_mass(self, i, scene):
+        """The inverse mass [1/kg] that a push on vertex i meets, of a body's at the most."""
         return let(at(scene.body_reach if self.features.reduced else scene.inverse_mass, i))
 
     # ---- forces ------------------------------------------------------------------------------------------------------

@@ -1,9 +1,9 @@
 """A vertex as an obstacle that turns sees it: its place, changes of that, the obstacle's velocity there, and adjoints.
 
 The obstacle takes a point z of its own, as it was made, to c + t + R (z - c). A vertex at X + u, from which t is taken, lies
-at the arm r = X + u - c from the point c. Changes of t, of R by dR = [theta]x R and of c are felt as a change of place
+at the arm r = X + u - c from the point c. Changes of t, of R by dR = [theta]x R and of c act as a change of place
 
-    - dt - theta x r + (R - 1) dc,    besides the turn theta of what is felt.
+    - dt - theta x r + (R - 1) dc,    besides the turn theta of what acts.
 
 The obstacle's velocity is that of the obstacle's point at the vertex, on the chord that it goes in a time tau,
 

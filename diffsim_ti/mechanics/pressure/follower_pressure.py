@@ -134,10 +134,10 @@ class FollowerPressure(HostForce):
             self.add_numbers(adj, slice(len(p_adj)), self.instant.load * p_adj)
         return 0.0
 
-    def add_numbers(self, adj, rows, felt: np.ndarray) -> None:
+    def add_numbers(self, adj, rows, by_numbers: np.ndarray) -> None:
         """Add to the adjoints of `Derived.follower`, in some rows."""
         whole, instant = np.zeros(adj.follower.shape[1]), self.instant
-        whole[rows] = felt
+        whole[rows] = by_numbers
         instant.schedule.add_pressure(adj.follower, instant.j, instant.share, whole)
 
 

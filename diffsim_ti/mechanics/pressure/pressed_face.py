@@ -60,21 +60,21 @@ class PressedFace(PressedTriangle):
 
     @traced
     def push_vjp(self, t, p, scene, state, s, adjoint, first):
-        """Writes and adds adjoints of places; returns w . sum of products, by which p is felt."""
+        """Writes and adds adjoints of places; returns w . sum of products, which p multiplies."""
         w = [let(at(adjoint.w, 0, at(scene.pressed, 6 * t + a))) for a in range(6)]
-        by_s, by_t, felt = [], [], []
+        by_s, by_t, products = [], [], []
         for q, (e, f) in enumerate(self.tangents(t, state.u, scene.rest, s, scene)):
             own = self.times(SHARES[q], w)
             by_s.append(let(self.cross(f, own) * p))
             by_t.append(let(self.cross(own, e) * p))
             n = self.cross(e, f)
-            felt += [at(own, d) * at(n, d) for d in range(3)]
+            products += [at(own, d) * at(n, d) for d in range(3)]
         for a in range(6):
             by = let(self.times(BY[:, a, 0], by_s) + self.times(BY[:, a, 1], by_t))
             assign(at(adjoint.corner, first + 6 * t + a), by)
             if self.shape:
                 assign(at(adjoint.pressed_rest, 6 * t + a), at(adjoint.pressed_rest, 6 * t + a) + by)
-        return let(sum_of(felt))
+        return let(sum_of(products))
 
     @ti.func
     def forces(self, t, now: A, scene: A, state: A, s, plan: A):
@@ -88,8 +88,8 @@ class PressedFace(PressedTriangle):
     @ti.func
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
         p = self.factor(t, now, scene.follower, scene)
-        felt = self.push_vjp(t, p, scene, state, s, adjoint, self.first(plan))
-        self.add_mean(t, ti.cast(-1.0 / 6.0, self.fp) * felt, now, adjoint.pressure_adjoint)
+        products = self.push_vjp(t, p, scene, state, s, adjoint, self.first(plan))
+        self.add_mean(t, ti.cast(-1.0 / 6.0, self.fp) * products, now, adjoint.pressure_adjoint)
 
 
 def pressed_element(order: int, precision: str, per_step: bool, shape: bool) -> PressedTriangle:

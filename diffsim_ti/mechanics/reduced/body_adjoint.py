@@ -181,16 +181,16 @@ class BodyStage(Bodies):
                     y, u = self.arm(m, b, scene), source[s, i]
                     v, p_adj = self.narrow(self.at_arm(w, y)), self.narrow(self.at_arm(by, y))
                     by_load = ti.cast(by_total * self.reach(b, y, scene), self.fp)
-                    by_u, by_v, felt = self.friction.vjp(i, u, v, small, p_adj, by_load, now, scene, adjoint)
+                    by_u, by_v, impulse = self.friction.vjp(i, u, v, small, p_adj, by_load, now, scene, adjoint)
                     adjoint.u[0, i] = adjoint.u[0, i] + by_u
                     wide = self.wide(by_v)
                     o += wide
                     p += y.x * wide
                     q += y.y * wide
                     r += y.z * wide
-                    by_y = self.along(by, self.wide(felt)) + self.along(w, wide)
+                    by_y = self.along(by, self.wide(impulse)) + self.along(w, wide)
                     self.add_adjoint(m, by_y, ti.cast(0, ti.f64), adjoint)
-                    self.add_reach(m, b, y, self.double(felt.w) * by_total, scene, adjoint)
+                    self.add_reach(m, b, y, self.double(impulse.w) * by_total, scene, adjoint)
         return o, p, q, r
 
     @traced
@@ -295,11 +295,11 @@ class BodyStage(Bodies):
         turn = self.turn(b, u, slip.after, now, scene)
         displaced, moving = self.moved(b, u, slip.after, turn, now, scene)
         by_v = self.field_of(self.spread_vjp(b, 0, adjoint.v, moving, scene, adjoint))
-        by_u = self.field_of(self.spread_u(b, displaced, now, scene, adjoint))
+        by_u = self.field_of(self.spread_if(now.alpha > 0, b, 0, adjoint.u, displaced, scene, adjoint))
         self.start_u(b, now, scene, adjoint)
         of_u, of_after = self.moved_vjp(b, u, slip.after, turn, by_u, by_v, now, scene, adjoint)
         more_u, of_kicked = self.apply_friction_vjp(b, slip, u, kicked, of_after, state.u, s, now, scene, adjoint)
-        of_seen = self.field_of(self.spread_frame(b, seen, now, scene, adjoint))
+        of_seen = self.field_of(self.spread_if(now.frame >= 0, b, now.frame, adjoint.frames_v, seen, scene, adjoint))
         w = self.kicked(v, now.pre, f)
         shown_u, of_w = self.spun_vjp(b, self.unless(halts, now.pre), u, w, of_seen, scene, adjoint)
         by_field_v, by_field_u = self.sum_of(of_kicked, of_w), self.sum_of(self.sum_of(of_u, more_u), shown_u)
@@ -322,17 +322,10 @@ class BodyStage(Bodies):
         return out
 
     @ti.func
-    def spread_u(self, b, q: A, now: A, scene: A, adjoint: A):
-        """The same of displacements; a pass that only kicks leaves these as they are."""
+    def spread_if(self, condition, b, slot, source: A, q: A, scene: A, adjoint: A):
+        """`spread_vjp` where a condition holds: of displacements, which a pass that only kicks leaves as they are, and of
+        what a frame shows."""
         o, x, y, z = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
-        if now.alpha > 0:
-            o, x, y, z = self.spread_vjp(b, 0, adjoint.u, q, scene, adjoint)
-        return o, x, y, z
-
-    @ti.func
-    def spread_frame(self, b, q: A, now: A, scene: A, adjoint: A):
-        """The same of what a frame shows."""
-        o, x, y, z = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
-        if now.frame >= 0:
-            o, x, y, z = self.spread_vjp(b, now.frame, adjoint.frames_v, q, scene, adjoint)
+        if condition:
+            o, x, y, z = self.spread_vjp(b, slot, source, q, scene, adjoint)
         return o, x, y, z

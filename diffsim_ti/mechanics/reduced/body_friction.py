@@ -108,7 +108,7 @@ class BodyFriction(ObstacleStages):
     def vjp(self, i, u, v, total, w, load_adj, now: A, scene: A, adjoint: A):
         """(adjoint of u, of v, the impulse with the load as a fourth component) for the adjoints of the impulse and of the
         load; adds those of all else."""
-        u_adj, v_adj, felt = self.vector(0), self.vector(0), self.vector(0)
+        u_adj, v_adj, impulse = self.vector(0), self.vector(0), self.vector(0)
         for g in ti.static(self.features.rough):
             for k in range(g.count):
                 first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
@@ -121,8 +121,8 @@ class BodyFriction(ObstacleStages):
                     by_u = self.spread(g, k, i, X, u, by_place, by_v_obstacle, now, scene, adjoint, adjoint)
                     u_adj += by_u
                     v_adj += by_v
-                    felt += own
+                    impulse += own
                     self.add_to_numbers(g, k, i, by, adjoint)
                     self.add_to_area(g, i, now.h * by_time, adjoint)
                     self.add_to_rest(i, by_u, adjoint)
-        return u_adj, v_adj, felt
+        return u_adj, v_adj, impulse

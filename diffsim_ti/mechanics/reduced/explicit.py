@@ -202,10 +202,10 @@ class Bodies(BodySums):
                 self.vertex.obstacles.note(i, u, u_next, now, scene, state)
         if ti.static(self.vertex.counts_work):
             kicked = v_next / now.decay
-            felt = (kicked - v) / ((now.pre + now.post) * scene.inverse_mass[i])  # with what holds it
+            force = (kicked - v) / ((now.pre + now.post) * scene.inverse_mass[i])  # with what holds it
             if ti.static(self.vertex.features.gravity >= 0):
-                felt += -1 * self.vertex.gravity(scene.parameters) / scene.inverse_mass[i]
-            add_work_of_pass(self.vertex, i, u, v, kicked, felt, u_next, v_next, now, scene, state, plan)
+                force += -1 * self.vertex.gravity(scene.parameters) / scene.inverse_mass[i]
+            add_work_of_pass(self.vertex, i, u, v, kicked, force, u_next, v_next, now, scene, state, plan)
         state.u[t, i] = u_next
         state.v[t, i] = v_next
 

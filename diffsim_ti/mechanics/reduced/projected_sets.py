@@ -77,9 +77,8 @@ class ProjectedSets(Stage):
 
     def shown(self, at: Passes) -> np.ndarray:
         """v + pre a of a recorded pass."""
-        values, gravity, history = self.ws.arrays.values, self.ws.arrays.features().gravity, at.history
-        weight = values.parameters[gravity:][:3] if gravity >= 0 else np.zeros(3)
-        a = self.rows(history.f, at.slot) / self.mass[:, None] + weight
+        arrays, history = self.ws.arrays, at.history
+        a = self.rows(history.f, at.slot) / self.mass[:, None] + arrays.gravity_of(arrays.values)
         return self.rows(history.v, at.slot) + at.now.pre * a
 
     def alone(self, at: Passes):

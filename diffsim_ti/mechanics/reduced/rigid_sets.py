@@ -14,7 +14,7 @@ Newton's method goes along du*, then to the nearest place whose end is rigid. It
 between both spaces, what turning y* changes of the torque of the forces that the shape resists.
 
 A vector of all vertices w stands for t = mean w and omega = J^-1 sum y* x w, J = sum |y*|^2 - y* y*^T: of residuals it is
-what the set feels of them, of directions the motion t + omega x y'.
+their resultant, of directions the motion t + omega x y'.
 """
 
 import numpy as np
@@ -53,7 +53,7 @@ class RigidSet:
         self.y, self.y_end = self._apart(u), self._apart(end)
         self.inverse = np.linalg.inv(inertia(self.y))
 
-    def feel(self, F: np.ndarray, symmetric: bool) -> None:
+    def take_forces(self, F: np.ndarray, symmetric: bool) -> None:
         """Take the forces that are out of balance, which turning changes: C omega is what comes to their torque, less."""
         self.F = F
         C = (self.y_end * F).sum() * np.eye(3) - self.y_end.T @ F
@@ -63,7 +63,7 @@ class RigidSet:
         """J^-1 sum y* x w."""
         return self.inverse @ torque(self.y, w)
 
-    def felt(self, t: np.ndarray, turning: np.ndarray) -> np.ndarray:
+    def resultant(self, t: np.ndarray, turning: np.ndarray) -> np.ndarray:
         """The vector of vertices that stands for t and omega = J^-1 turning."""
         return t + crossed(self.inverse @ turning, self.y)
 
@@ -79,7 +79,7 @@ class RigidSet:
         return np.swapaxes(np.concatenate([np.tile(np.eye(3), (len(turns), 1, 1)) / len(turns) ** 0.5, turns], 1), 1, 2)
 
     def stiffness_of_turns(self) -> np.ndarray:
-        """What turning changes of what is felt, less, for those turns, shape (3, 3)."""
+        """What turning changes of resultants, less, for those turns, shape (3, 3)."""
         return 0.5 * (self.C + self.C.T) / self._size**2
 
     def rotation(self) -> Nearest:
@@ -143,16 +143,16 @@ class RigidSets:
             at = own.vertices
             own.place(u[at], self.c0 * u[at] + (1 - self.c0) * self.before[at])
 
-    def feel(self, forces: np.ndarray) -> None:
+    def take_forces(self, forces: np.ndarray) -> None:
         """Take the forces that are out of balance there, with those that the shape resists."""
         for own in self.sets:
-            own.feel(forces[own.vertices], self.symmetric)
+            own.take_forces(forces[own.vertices], self.symmetric)
 
     # ---- what they may do ----------------------------------------------------------------------------------------------
 
-    def felt(self, x: np.ndarray) -> np.ndarray:
-        """What the sets feel of forces, a projection."""
-        return self._each(x, lambda own, w: own.felt(w.mean(0), torque(own.y, w)))
+    def resultants(self, x: np.ndarray) -> np.ndarray:
+        """Resultants of forces on the sets, a projection."""
+        return self._each(x, lambda own, w: own.resultant(w.mean(0), torque(own.y, w)))
 
     def motion(self, w: np.ndarray) -> np.ndarray:
         """The motion that w stands for."""
@@ -160,24 +160,24 @@ class RigidSets:
 
     def motion_vjp(self, d: np.ndarray) -> np.ndarray:
         """Its transpose."""
-        return self._each(d, lambda own, part: own.felt(part.mean(0), torque(own.y_end, part)))
+        return self._each(d, lambda own, part: own.resultant(part.mean(0), torque(own.y_end, part)))
 
     def stiffness(self, w: np.ndarray, transposed: bool = False, convex: bool = False) -> np.ndarray:
-        """What turning changes of what is felt, less, for the motion that w stands for; zero elsewhere."""
+        """What turning changes of resultants, less, for the motion that w stands for; zero elsewhere."""
         out = np.zeros_like(w)
         for own in self.sets:
             C = own.convex if convex else own.C.T if transposed else own.C
-            out[own.vertices] = own.felt(np.zeros(3), C @ own.omega(w[own.vertices]))
+            out[own.vertices] = own.resultant(np.zeros(3), C @ own.omega(w[own.vertices]))
         return out
 
     # ---- derivatives ---------------------------------------------------------------------------------------------------
 
     def turned(self, d: np.ndarray) -> np.ndarray:
-        """What is felt of the forces out of balance for a change d of places."""
+        """Resultants of the forces out of balance for a change d of places."""
         out = np.zeros_like(d)
         for own in self.sets:
             part = d[own.vertices]
-            out[own.vertices] = own.felt(np.zeros(3), torque(part - part.mean(0), own.F))
+            out[own.vertices] = own.resultant(np.zeros(3), torque(part - part.mean(0), own.F))
         return out
 
     def turned_vjp(self, w: np.ndarray) -> np.ndarray:

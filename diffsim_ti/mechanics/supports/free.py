@@ -53,7 +53,7 @@ class FreeDirections:
 class FreeBodies(FreeDirections):
     """The same where some vertices go together (reduced.py): none of these is held.
 
-    rigid: of what sets that do not deform feel where they stand (rigid_sets.py); None: of all motions of their vertices.
+    rigid: of what acts on sets that do not deform where they stand (rigid_sets.py); None: of all motions of their vertices.
     """
 
     def __init__(self, mask: np.ndarray, partly_fixed: np.ndarray, sliding_supports: np.ndarray, reduced, rigid=None):
@@ -62,7 +62,7 @@ class FreeBodies(FreeDirections):
 
     def __rmul__(self, x: np.ndarray) -> np.ndarray:
         x = self.reduced.of(super().__rmul__(x))
-        return self.rigid.felt(x) if self.rigid else x
+        return self.rigid.resultants(x) if self.rigid else x
 
     __mul__ = __rmul__
 

@@ -1,7 +1,7 @@
 """Motions without strain that a scene leaves its body: rigid ones, and those about hinges.
 
 At rest, without load, the energy of a displacement vanishes where each part, tetrahedra that are joined by faces, moves
-rigidly and nothing that holds the parts feels it. Each thing that does is a row, a wrench (F, X x F) on one part or more:
+rigidly and nothing that holds the parts resists it. Each thing that does is a row, a wrench (F, X x F) on one part or more:
 a support or a foundation in a direction F, a spring or an elastic cable along its path, a vertex that parts share, in three.
 Pellegrino, Calladine 1986, Matrix analysis of statically and kinematically indeterminate frameworks,
 doi:10.1016/0020-7683(86)90014-4.
@@ -99,16 +99,16 @@ class Rows:
             least, most = np.full(self.num_rows, self.count), np.full(self.num_rows, -1)
             np.minimum.at(least, self.row[free], self.part[free])
             np.maximum.at(most, self.row[free], self.part[free])
-            own = np.flatnonzero(free & (least == most)[self.row])  # of rows that feel one part alone
+            own = np.flatnonzero(free & (least == most)[self.row])  # of rows that act on one part alone
             own = own[np.argsort(self.part[own], kind="stable")]
             parts = np.split(own, np.flatnonzero(np.diff(self.part[own])) + 1) if len(own) else []
-            new = [self.part[k[0]] for k in parts if not motions_left(self._felt(k, self.part[k[:1]]))]
+            new = [self.part[k[0]] for k in parts if not motions_left(self._resistance(k, self.part[k[:1]]))]
             if not new:
                 return ground
             ground[new] = True
 
-    def _felt(self, entries, parts, together: bool = True) -> np.ndarray:
-        """What rows feel of motions about the middle of parts, scaled by their size: shape (rows, 6) of all together, or
+    def _resistance(self, entries, parts, together: bool = True) -> np.ndarray:
+        """What rows resist of motions about the middle of parts, scaled by their size: shape (rows, 6) of all together, or
         (rows, parts, 6) of each."""
         rows, row = np.unique(self.row[entries], return_inverse=True)
         mine = np.isin(self.parts, parts)
@@ -127,20 +127,20 @@ class Rows:
         from scipy.sparse.csgraph import connected_components
 
         free, shape = ~ground[self.part], (self.num_rows, self.count)
-        felt = coo_matrix((np.ones(free.sum()), (self.row[free], self.part[free])), shape).tocsr()
-        label = connected_components(felt.T @ felt, directed=False)[1]
+        acts = coo_matrix((np.ones(free.sum()), (self.row[free], self.part[free])), shape).tocsr()
+        label = connected_components(acts.T @ acts, directed=False)[1]
         left = np.flatnonzero(~ground)
         return [left[label[left] == k] for k in np.unique(label[left])]
 
     def described(self, component: np.ndarray, ground: np.ndarray) -> str:
         """The motions that a component has, in words; "" if none."""
         entries = np.flatnonzero(np.isin(self.part, component))
-        felt = self._felt(entries, component, together=False).reshape(-1, 6 * len(component))
-        sizes = np.linalg.svd(felt, compute_uv=False)
-        left = felt.shape[1] - int((sizes > 1e-8 * max(sizes.max(initial=0.0), 1.0)).sum())
+        rows = self._resistance(entries, component, together=False).reshape(-1, 6 * len(component))
+        sizes = np.linalg.svd(rows, compute_uv=False)
+        left = rows.shape[1] - int((sizes > 1e-8 * max(sizes.max(initial=0.0), 1.0)).sum())
         if not left:
             return ""
-        whole = motions_left(self._felt(entries, component))
+        whole = motions_left(self._resistance(entries, component))
         mine, shared = np.isin(self.parts, component), self.shared[np.unique(self.row[entries])]
         outside = np.intersect1d(self.vertices[mine], self.vertices[ground[self.parts]])
         hinge = np.unique(outside if len(outside) else shared[shared >= 0])

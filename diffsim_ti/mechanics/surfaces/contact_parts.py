@@ -27,7 +27,7 @@ for any h, P, mu and eps, and no node depends on the order of the pairs. Where a
 the value, and s the speed of sliding at the end: it creeps no faster than eps.
 
 Beneath WALL of its width a pair meets a second barrier of stiffness (mean mass) / h^2, whose push is of the end alone and
-stops what comes at a width in h: as stiff as the part can feel, and without effect on what is as far apart as contact should
+stops what comes at a width in h: as stiff as the part resolves, and without effect on what is as far apart as contact should
 be. So surfaces stay apart whatever the stiffness, and what it cannot hold is lost as in an inelastic impact.
 """
 
@@ -80,7 +80,7 @@ class NearPairs:
         for near, own, by in zip(self.sets, of.sets, adj.sets):
             own.lightened_vjp(by, a[near.at], x[near.at])
 
-    def felt(self, of, x: np.ndarray) -> np.ndarray:
+    def lightened_sizes(self, of, x: np.ndarray) -> np.ndarray:
         """The same of numbers, by bounds of inverse masses."""
         out = of.inverse * x
         for near, own in zip(self.sets, of.sets):
@@ -88,7 +88,7 @@ class NearPairs:
             out[at] = own.sizes @ x[at]
         return out
 
-    def felt_vjp(self, of, adj, a: np.ndarray, x: np.ndarray) -> None:
+    def lightened_sizes_vjp(self, of, adj, a: np.ndarray, x: np.ndarray) -> None:
         adj.inverse += a * x
         for near, by in zip(self.sets, adj.sets):
             at = near.at[: len(near.here)]
@@ -293,7 +293,7 @@ class PartSolver:
         at.sizes = at.B.copy()
         at.sizes.data = np.where(at.B.data.real < 0, -at.B.data, at.B.data)
         at.S = at.sizes.T @ at.load
-        at.bound = at.h * (at.sizes @ near.felt(of, at.S))
+        at.bound = at.h * (at.sizes @ near.lightened_sizes(of, at.S))
         at.kappa, at.share_of_mu, at.ratio, at.slip = slip(at.s, at.bound, of.speed, ARRAYS)
         at.impulse = (-at.h * at.load * at.kappa)[:, None] * at.t
         at.friction_sum = at.B.T @ at.impulse
@@ -400,12 +400,12 @@ class PartSolver:
         V_adj = at.B.T @ v_adj
         # the bound
         back = at.sizes.T @ by_bound
-        S_adj = at.h * near.felt(of, back)
-        near.felt_vjp(of, adj, at.h * back, at.S)
+        S_adj = at.h * near.lightened_sizes(of, back)
+        near.lightened_sizes_vjp(of, adj, at.h * back, at.S)
         by_load += at.sizes @ S_adj
         row = np.repeat(np.arange(at.B.shape[0]), np.diff(at.B.indptr))
         column = at.B.indices
-        met = near.felt(of, at.S)
+        met = near.lightened_sizes(of, at.S)
         of_entries = at.h * by_bound[row] * met[column] + at.load[row] * S_adj[column]
         entries = at.B.copy()
         entries.data = np.sign(at.B.data) * of_entries

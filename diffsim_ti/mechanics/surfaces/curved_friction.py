@@ -57,7 +57,7 @@ class CurvedLaggedFriction:
             given = obstacles.changes(self.pairs.parameters_of(numbers), poses_dot)
             for change, corners in zip(changes, (given[0], given[0] - given[2] / self.inner.per_gamma, given[1])):
                 change[self.pairs.finer.mesh.first :] = corners
-        return C.T @ self.inner.jvp(self._fine(u), *changes, self.pairs.fine_numbers(numbers), only)
+        return C.T @ self.inner.jvp(self._fine(u), *changes, self.pairs.fine_numbers(numbers), only=only)
 
     def vjp(self, u: np.ndarray, forces_adj: np.ndarray, only: int | None = None) -> tuple[np.ndarray, ...]:
         found, obstacles = self.inner.vjp(self._fine(u), self.C @ forces_adj, only), self.pairs.obstacles

@@ -13,8 +13,8 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.curved_friction import CurvedLaggedFriction
 from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleMotion, SurfaceWithObstacles
-from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
+from diffsim_ti.mesh.geometry import surface_edges
 from diffsim_ti.runtime import Kernel, kernels_of, vector_type
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
@@ -135,16 +135,17 @@ class CurvedPairs:
     """
 
     def __init__(self, kind: type, arrays, parallel: bool, body, nearby: NearCorners | None):
-        self.a, self.nearby, self._kind, self._body = arrays, nearby, kind, (body, nearby and surface_edges(body))
+        self.a, self.nearby, self._kind, self._body = arrays, nearby, kind, body
+        self._edges = surface_edges(body.surface_triangles) if nearby else None
         self.kernels = kernels_of(Transfer, arrays.precision, parallel, nearby is not None)
         self._began, self._sums = None, None  # what a pass began with, in Newton's method; adjoints of who went
         self._hold()
 
     def _hold(self) -> None:
         """Have the corners that are near."""
-        arrays, parallel, (surface, edges) = self.a, self.kernels.parallel, self._body
+        arrays, parallel, surface = self.a, self.kernels.parallel, self._body
         if self.nearby:
-            surface = SurfaceWithObstacles(surface, edges, self.nearby.corners, arrays.self_contact)
+            surface = SurfaceWithObstacles(surface, self._edges, self.nearby.corners, arrays.self_contact)
         self.finer, self.matrix = FinerArrays(arrays, surface), surface.matrix
         self.obstacles = ObstacleMotion(surface, arrays) if self.nearby else None
         self.inner = self._kind(self.finer, parallel)
@@ -202,11 +203,11 @@ class CurvedPairs:
         self.launch([self._refining(*what)])
         return what[2]
 
-    def _covered(self, u, slot: int = 0):
-        """Displacements of the finer surface, from those of a slot, with all that is near."""
+    def _covered(self, u):
+        """Displacements of the finer surface, from u[0], with all that is near, for which `inner` may be made anew."""
         if self.nearby:
-            self.cover(runtime.fetch_row(u, slot))
-        return self.fine(u, slot)
+            self.cover(runtime.fetch_row(u, 0))
+        return self.fine(u, 0)
 
     def fine(self, u, slot: int):
         """Displacements of the finer surface, from those of a slot."""
@@ -257,10 +258,6 @@ class CurvedPairs:
     # ---- as of pairs of nodes ----------------------------------------------------------------------------------------
 
     @property
-    def width(self) -> float:
-        return self.inner.width
-
-    @property
     def list(self):
         return self.inner.list
 
@@ -285,10 +282,6 @@ class CurvedPairs:
         fine = self._covered(u)
         self.inner.forget(fine)
 
-    def ensure(self, u, slot: int) -> None:
-        fine = self._covered(u, slot)
-        self.inner.ensure(fine, 0)
-
     def look(self, u) -> tuple[float, float]:
         fine = self._covered(u)
         return self.inner.look(fine)
@@ -296,8 +289,8 @@ class CurvedPairs:
     def unbind(self) -> None:
         self.inner.unbind()
 
-    def forces(self, u, slot: int, out, exact: bool = False) -> None:
-        self.inner.forces(self.fine(u, slot), 0, self.finer.corner, exact)
+    def forces(self, u, slot: int, out) -> None:
+        self.inner.forces(self.fine(u, slot), 0, self.finer.corner)
         self._gather(out)
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, poses_dot=None) -> None:
@@ -381,9 +374,9 @@ class CurvedPairs:
         obstacle = surface.corners.parts[numbers.max() - 1].k if numbers.any() else None
         return tuple(int(i) for i in dict.fromkeys(nodes.tolist())), obstacle
 
-    def is_collision_free(self, u: np.ndarray, step: np.ndarray, to=None) -> bool:
-        self.cover(u, u + step, to=to)
-        return self.inner.is_collision_free(self.spread(u), self._step(step, to))
+    def is_collision_free(self, u: np.ndarray, step: np.ndarray) -> bool:
+        self.cover(u, u + step)
+        return self.inner.is_collision_free(self.spread(u), self._step(step, None))
 
     def check_end(self, u: np.ndarray, u_next: np.ndarray, to=None) -> None:
         self.cover(u, u_next, to=to)

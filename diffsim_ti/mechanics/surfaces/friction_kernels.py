@@ -60,15 +60,6 @@ class FrictionKernels(ListedPair):
         return out
 
     @ti.func
-    def entry(self, x, k):
-        """x[k], k known when the kernel runs."""
-        out = x[0]
-        for a in ti.static(range(1, 4)):
-            if k == a:
-                out = x[a]
-        return out
-
-    @ti.func
     def sum_of_corners(self, s, scene: A):
         """What the pairs of surface vertex s with friction have stored for it."""
         total = self.vec4(0)

@@ -9,8 +9,8 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, SAFE, ListedPair, behind, between, first_of, three
-from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
+from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, SAFE, ListedPair, between, three
+from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.terms.obstacles import barrier
 
@@ -71,10 +71,7 @@ class HessianKernels(ListedPair):
 
     @ti.func
     def add_blocks(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                self.root(kind, p, scene, at, plan)
+        self.each_pair(self.root, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             for d in ti.static(range(3)):
@@ -103,7 +100,7 @@ class HessianKernels(ListedPair):
     @ti.func
     def share(self, kind: A, p, scene: A, at: A, plan: A):
         """The share of the step w, if below `most`, after which the pair has closed all but 1 - SAFE of its gap, or half of
-        the width if that is less, and half as much again: planes that part it on the way say how far it may go on.
+        the width if that is less, and half as much again, to out: planes that part it on the way say how far it may go on.
         Li, Kaufman, Jiang 2021, Codimensional Incremental Potential Contact, doi:10.1145/3450626.3459767, algorithm 1."""
         plane, one = scene.plane[p], ti.cast(1, self.fp)
         radius, half = self.radius_of(p, scene), ti.cast(0.5, self.fp) * self.width(p, scene)
@@ -122,14 +119,11 @@ class HessianKernels(ListedPair):
                     if goes_on:
                         share += room / self.closing(kind, (one / length) * r, p, scene, at)
                         goes_on = share < plan.most
-        return share
+        at.out[p] = share
 
     @ti.func
     def all_shares(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                at.out[p] = self.share(kind, p, scene, at, plan)
+        self.each_pair(self.share, scene, at, plan)
 
     @cached_property
     def shares(self) -> Kernel:

@@ -20,7 +20,7 @@ TINY = 1e-300
 class LaggedFriction:
     """Of the pairs that press with N at the first displacement of a pass, with the weights w and the normal n there.
 
-    A pair slides with t = (I - n n^T) sum_i w_i v_i, v = (u - x) / gamma, and its corners feel
+    A pair slides with t = (I - n n^T) sum_i w_i v_i, v = (u - x) / gamma, and on its corners act
     -w_i mu N f(|t| / eps) t / |t| (terms/obstacles/friction.py). Displacements, directions and
     results are NumPy arrays, shape (num_vertices, 3).
     """
@@ -59,12 +59,12 @@ class LaggedFriction:
         self.u_begin, self.x, self.per_gamma = u, x, per_gamma
         self._measure_here()
         pressing, count = whole(self.own.pressing), self.pairs.list.count
-        self.felt = felt = np.flatnonzero(presses & (pressing[:count, 3] > 0))
-        self.corners = runtime.fetch(self.pairs.list.pairs)[: 4 * count].reshape(-1, 4)[felt]
-        self.w, pressing = whole(self.own.weights)[felt].astype(np.float64), pressing[felt].astype(np.float64)
+        self.pressed = pressed = np.flatnonzero(presses & (pressing[:count, 3] > 0))
+        self.corners = runtime.fetch(self.pairs.list.pairs)[: 4 * count].reshape(-1, 4)[pressed]
+        self.w, pressing = whole(self.own.weights)[pressed].astype(np.float64), pressing[pressed].astype(np.float64)
         self.n, self.L = pressing[:, :3], pressing[:, 3]
         surface = self.pairs.kinematic
-        self.contact = surface.numbers[self.corners[:, [0, 2]]].max(1) if surface else np.zeros(len(felt), int)
+        self.contact = surface.numbers[self.corners[:, [0, 2]]].max(1) if surface else np.zeros(len(pressed), int)
         self._product.begin(self.corners, self.w)
         self._is_put = False
 
@@ -184,15 +184,13 @@ class LaggedFriction:
             at |= dict(numbers_dot=self.pairs.contacts.numbers_dot)
         self.pairs.run(self.kernels.measure_jvp, at, self.own, slot=0)
 
-    def jvp(
-        self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers, only=None
-    ) -> np.ndarray:
+    def jvp(self, u: np.ndarray, du, dx, du_begin, numbers, poses_dot=None, only: int | None = None) -> np.ndarray:
         """Change of the forces for those of u, of x, of where the pass begins, and of `numbers`, a Tangent."""
         self._back_to_begin()
         runtime.fill(self.pairs.step, du_begin[None])
         self._change_here(numbers)
-        d_pressing = whole(self.own.pressing_dot)[self.felt].astype(np.float64)
-        dw, dn, dL = whole(self.own.weights_dot)[self.felt].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
+        d_pressing = whole(self.own.pressing_dot)[self.pressed].astype(np.float64)
+        dw, dn, dL = whole(self.own.weights_dot)[self.pressed].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
         d_speed = runtime.fetch(numbers.parameters)[self.speeds_at][self.contact]
         v, relative, t, s, e, kappa, slope = self._sliding(u)
         dv = (self.per_gamma * (du - dx))[self.corners]
@@ -230,7 +228,7 @@ class LaggedFriction:
         self.take("mu_adj", scalar=True)
         for array, data in ((self.own.weights_adj, w_adj), (self.own.pressing_adj, pressing_adj)):
             every = np.zeros((array.shape[0], 4))
-            every[self.felt] = data
+            every[self.pressed] = data
             runtime.fill(array, every)
         at = dict(u=self.pairs.next, **self.adjoints)
         self.pairs.run(self.kernels.measure_vjp, at, self.own, slot=0, num_rows=self.num_rows)

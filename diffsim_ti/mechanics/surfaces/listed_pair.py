@@ -163,6 +163,15 @@ class ListedPair(Pair):
         return scale
 
     @ti.func
+    def entry(self, x, k):
+        """x[k], k known when the kernel runs."""
+        out = x[0]
+        for a in ti.static(range(1, 4)):
+            if k == a:
+                out = x[a]
+        return out
+
+    @ti.func
     def four(self, y):
         return self.vec4(y[0], y[1], y[2], ti.cast(0, self.fp))
 
@@ -205,10 +214,15 @@ class ListedPair(Pair):
             out[plan.first_out + s] = total
 
     @ti.func
-    def all_products(self, scene: A, at: A, plan: A):
-        """`product` of every pair, which a subclass has, and their sums by vertex."""
+    def each_pair(self, act: A, scene: A, at: A, plan: A):
+        """act(kind, p, scene, at, plan) of every pair."""
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
             for p in range(first_of(kind, plan), behind(kind, plan)):
-                self.product(kind, p, scene, at, plan)
+                act(kind, p, scene, at, plan)
+
+    @ti.func
+    def all_products(self, scene: A, at: A, plan: A):
+        """`product` of every pair, which a subclass has, and their sums by vertex."""
+        self.each_pair(self.product, scene, at, plan)
         self.sum_corners(scene, at.out, plan)

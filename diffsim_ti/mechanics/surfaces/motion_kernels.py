@@ -10,8 +10,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, behind, between, first_of, three
-from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
+from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, between, three
 from diffsim_ti.runtime import Kernel
 
 A = ti.template()
@@ -122,15 +121,16 @@ class MotionKernels(ListedPair):
     def find_all(self, scene: A, at: A, plan: A):
         self.hold_all(scene, at, plan)
         self.find_farthest(scene, at, plan)
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                left, near = scene.plane[p][3] - self.width(p, scene), 0
-                if not scene.farthest[0] < left:
-                    if not ti.max(self.closing(kind, p, scene, at, plan), ti.cast(0, self.fp)) < left:
-                        near = 1
-                        scene.flags[2] = 1
-                scene.near[p] = near
+        self.each_pair(self.flag, scene, at, plan)
+
+    @ti.func
+    def flag(self, kind: A, p, scene: A, at: A, plan: A):
+        left, near = scene.plane[p][3] - self.width(p, scene), 0
+        if not scene.farthest[0] < left:
+            if not ti.max(self.closing(kind, p, scene, at, plan), ti.cast(0, self.fp)) < left:
+                near = 1
+                scene.flags[2] = 1
+        scene.near[p] = near
 
     @cached_property
     def find(self) -> Kernel:
@@ -139,7 +139,7 @@ class MotionKernels(ListedPair):
         return self._kernel("find", self.find_all, near="ints")
 
     @ti.func
-    def measure(self, kind: A, p, scene: A):
+    def measure(self, kind: A, p, scene: A, at: A, plan: A):
         """Distance at rest of pair p, D, its unit normal and the weights of the corners; far for two bodies."""
         one, two = scene.place[scene.pairs[4 * p]], scene.place[scene.pairs[4 * p + 2]]
         plane, weights = self.vec4(0, 0, 0, ti.cast(1e30, self.fp)), self.vec4(0)
@@ -153,14 +153,11 @@ class MotionKernels(ListedPair):
         if ti.static(self.mixed):
             if scene.per_area[self.contact_of(p, scene)] == 0:
                 scene.area[p] = ti.cast(1, self.fp)
+        scene.plane[p] = self.vec4(0)
 
     @ti.func
     def begin_all(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                scene.plane[p] = self.vec4(0)
-                self.measure(kind, p, scene)
+        self.each_pair(self.measure, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             scene.built[s] = at.u[plan.slot, scene.surface[s]]

@@ -63,6 +63,7 @@ class NearbyContact(Stage):
                 stage = self._cover(*begin, far.more)
                 stage.prepare(at, *begin, anew=True)
         if at.stride:
+            self.by_end = self.by_end if at.slot else {}  # a record begins in slot 0
             self.by_end[at.end] = stage
 
     def tangent(self, at: Passes):

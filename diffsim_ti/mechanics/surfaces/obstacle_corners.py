@@ -41,15 +41,12 @@ class ObstacleCorners:
                 self.parts.append(SimpleNamespace(**part, primitives=primitives))
         self.count = end
 
-    def _numbers(self, part, parameters: np.ndarray) -> np.ndarray:
-        return parameters[part.shape]
-
     def made(self, parameters: np.ndarray) -> np.ndarray:
         """Where corners are as obstacles were made, shape (count, 3) [m]."""
-        return np.concatenate([x.primitives.at(self._numbers(x, parameters))[0] for x in self.parts])
+        return np.concatenate([x.primitives.at(parameters[x.shape])[0] for x in self.parts])
 
     def radii(self, parameters: np.ndarray) -> np.ndarray:
-        return np.array([x.primitives.at(self._numbers(x, parameters))[1] for x in self.parts])
+        return np.array([x.primitives.at(parameters[x.shape])[1] for x in self.parts])
 
     # ---- poses -------------------------------------------------------------------------------------------------------
 
@@ -64,7 +61,7 @@ class ObstacleCorners:
 
     def _arms(self, part, parameters, rows, m: int, p=None, c=None) -> np.ndarray:
         """R (p - c) of an obstacle that turns."""
-        p = part.primitives.at(self._numbers(part, parameters))[0] if p is None else p
+        p = part.primitives.at(parameters[part.shape])[0] if p is None else p
         c = self.about(part, parameters) if c is None else c
         return rotations.turned(rotations.from_rodrigues(rows[self.row_of(part, m)]), p - c)
 
@@ -72,7 +69,7 @@ class ObstacleCorners:
         """Where corners are at the rows number m of poses."""
         out = []
         for x in self.parts:
-            p, _ = x.primitives.at(self._numbers(x, parameters))
+            p, _ = x.primitives.at(parameters[x.shape])
             if self.row_of(x, m) is not None:
                 p = self.about(x, parameters) + self._arms(x, parameters, rows, m, p)
             out.append(p + rows[3 * x.k + m])
@@ -82,7 +79,7 @@ class ObstacleCorners:
         """Its change for those of the parameters and of the rows (rotations: theta)."""
         out = []
         for x in self.parts:
-            dp, _ = x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))
+            dp, _ = x.primitives.jvp(parameters[x.shape], change[x.shape])
             row = self.row_of(x, m)
             if row is not None:
                 dc, arms = self.about(x, change), self._arms(x, parameters, rows, m)
@@ -116,9 +113,7 @@ class ObstacleCorners:
             self._add_shape(x, parameters, np.zeros((x.own.stop - x.own.start, 3)), by_parameters, float(by))
 
     def radii_jvp(self, parameters, change) -> np.ndarray:
-        return np.array(
-            [x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[1] for x in self.parts]
-        )
+        return np.array([x.primitives.jvp(parameters[x.shape], change[x.shape])[1] for x in self.parts])
 
     # ---- velocities, on the chord of a time tau from where the pass begins (mechanics/obstacles/turned.py) --------------
 
@@ -144,10 +139,7 @@ class ObstacleCorners:
             out[x.own], row = rows_dot[3 * x.k + RATE], self.row_of(x, AT_BEGIN)
             if row is not None:
                 (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
-                J, dp = (
-                    rotations.left_jacobian(turn),
-                    x.primitives.jvp(self._numbers(x, parameters), self._numbers(x, change))[0],
-                )
+                J, dp = (rotations.left_jacobian(turn), x.primitives.jvp(parameters[x.shape], change[x.shape])[0])
                 darms = np.cross(rows_dot[row], arms)
                 darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self.about(x, change))
                 turned = rotations.turned(rotations.quaternion(turn), arms)
@@ -177,8 +169,9 @@ class SurfaceWithObstacles:
     meeting_edges meet each other. areas: of each triangle and each edge.
     """
 
-    def __init__(self, body, edges: np.ndarray, corners: ObstacleCorners, self_contact):
-        n, given = body.num_vertices, [x.as_given for x in corners.parts]
+    def __init__(self, body, of_body: tuple, corners: ObstacleCorners, self_contact):
+        """of_body: `surface_edges` of its triangles."""
+        (edges, sides), n, given = of_body, body.num_vertices, [x.as_given for x in corners.parts]
         self.num_vertices, self.first, self.vertices = n + corners.count, n, np.concatenate([body.vertices, *given])
         self.body, self.corners, self.surface_triangles = body, corners, body.surface_triangles
         self.surface_vertices = np.concatenate([body.surface_vertices, np.arange(n, self.num_vertices)])
@@ -189,8 +182,7 @@ class SurfaceWithObstacles:
         self.own_edges, self.meeting_edges = len(edges), len(edges) if self_contact else 0
         self.acting = np.concatenate([body.surface_vertices[: None if self_contact else 0], points])
         size = np.linalg.norm(triangle_normals(body.vertices, body.surface_triangles), axis=1)
-        keys = np.sort(body.surface_triangles[:, [[0, 1], [1, 2], [2, 0]]], 2).reshape(-1, 2) @ [n, 1]
-        of_edges = np.bincount(np.searchsorted(edges @ [n, 1], keys), np.repeat(size / 3, 3), len(edges))
+        of_edges = np.bincount(sides.ravel(), np.repeat(size / 3, 3), len(edges))
         self.areas = size, np.concatenate([of_edges, np.zeros(len(self.edges) - len(edges))])
         self.numbers = np.zeros(self.num_vertices, int)
         for number, part in enumerate(corners.parts, start=1):
@@ -308,8 +300,8 @@ class ContactNumbers:
         self.rows_of_bodies = len(mu)
         rough = [x.first + x.force.index.friction for x in parts if x.force.friction]
         self.mu = np.concatenate([mu, rough]).astype(int)
-        felt = np.array([x.force.friction for x in parts])
-        self.row_of = np.where(felt, self.rows_of_bodies + np.cumsum(felt) - 1, -1)
+        rough = np.array([x.force.friction for x in parts])
+        self.row_of = np.where(rough, self.rows_of_bodies + np.cumsum(rough) - 1, -1)
         per_area = [0, *(int(x.force.per_area) for x in parts)]
         self.owner = runtime.upload(surface.owner, ti.i32)
         self.at_number = runtime.upload(self.rows.ravel(), ti.i32)

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, behind, first_of, three
-from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
+from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, three
+from diffsim_ti.mechanics.surfaces.proximity import VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
 
 A = ti.template()
@@ -71,10 +71,7 @@ class PairKernels(ListedPair):
 
     @ti.func
     def all_forces(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                self.force(kind, p, scene, at, plan)
+        self.each_pair(self.force, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             total = self.vec4(0)
@@ -157,10 +154,8 @@ class PairKernels(ListedPair):
                 if corner == self.corner_of_contact(p, scene):
                     total += numbers
                 if numbers[2] != 0:
-                    n = three(scene.rest_plane[p])
-                    for a in ti.static(range(4)):
-                        if corner == a:
-                            by_rest += self.four(numbers[2] * scene.rest_weights[p][a] * n)
+                    weight = numbers[2] * self.entry(scene.rest_weights[p], corner)
+                    by_rest += self.four(weight * three(scene.rest_plane[p]))
             scene.sums[s] = scene.sums[s] + total
             scene.rest_adj[s] = scene.rest_adj[s] + by_rest
 

@@ -20,7 +20,7 @@ class PairShares:
             self.parts.append((len(a.obstacles), 0 if self.parts else None))
         self.shape = a.num_contact_rows, 2, a.num_vertices, 3
 
-    def _felt(self) -> np.ndarray:
+    def _of_all(self) -> np.ndarray:
         """What all pairs have put into the last corners, of vertices."""
         a, out = self.p.arrays, np.zeros(self.shape[2:])
         surface = a.mesh.surface_vertices
@@ -30,7 +30,7 @@ class PairShares:
     def _pushes(self, number: int | None, all_pairs: bool) -> np.ndarray:
         """What the pairs of a contact have stored for their corners, of vertices; of those that press, or all."""
         if number is None:
-            return self._felt()
+            return self._of_all()
         inner, surface = self.pairs.inner, self.pairs.finer.mesh
         count = inner.list.count
         corners = runtime.fetch(inner.list.pairs)[: 4 * count].reshape(-1, 4)
@@ -58,13 +58,12 @@ class PairShares:
         """Their change for those of u*, of x, of where the pass begins, of `numbers`, a Tangent, and of rows of poses."""
         out, friction = np.zeros(self.shape), self.pairs.friction
         runtime.fill(self.p.w, d_star[None])
-        moved = numbers.rest, parameters_dot
-        more = dict(poses_dot=poses_dot) if self.pairs.obstacles else {}
-        self.pairs.product(self.p.u, 0, self.p.w, self.p.arrays.corner, *moved, **more)
+        moved = numbers.rest, parameters_dot, poses_dot
+        self.pairs.product(self.p.u, 0, self.p.w, self.p.arrays.corner, *moved)
         for row, number in self.parts:
             out[row, 0] = self._pushes(number, all_pairs=True)
         for row, number in self.parts if friction else ():
-            out[row, 1] = friction.jvp(self.p.held_at, d_star, dx, du_begin, numbers, only=number, **more)
+            out[row, 1] = friction.jvp(self.p.held_at, d_star, dx, du_begin, numbers, poses_dot, number)
         return out
 
     def vjp(self, seed: np.ndarray) -> np.ndarray:
@@ -74,7 +73,7 @@ class PairShares:
             if seed[row, 0].any():
                 runtime.fill(self.p.w, seed[row, :1])
                 self.pairs.vjp(self.p.u, 0, self.p.w, a.corner, only=number)
-                out[0] += self._felt()
+                out[0] += self._of_all()
         for row, number in self.parts if friction else ():
             if seed[row, 1].any():
                 out += friction.vjp(self.p.held_at, seed[row, 1], number)

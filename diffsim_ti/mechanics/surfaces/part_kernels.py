@@ -35,7 +35,7 @@ NODES |= dict(inverse="scalars", free="vectors", set="ints", sets="ints", factor
 OF_SETS = FIRST, COUNT, MEMBER, MEMBERS, FACTOR, SIZES, TWIST = range(7)  # what stands in `sets` of each
 STATE = dict.fromkeys(("e", "b", "e_next", "b_next", "xi"), "vectors")
 OF_NODES = dict.fromkeys(("f", "residual", "step", "sum"), "vectors") | dict.fromkeys(
-    ("root", "load", "felt"), "scalars"
+    ("root", "load", "met"), "scalars"
 )
 OF_POINTS = dict.fromkeys(("at_begin", "at_look", "moved", "at_end"), "vectors")
 OF_PAIRS = dict(filled="ints", open="ints", n="vectors")
@@ -464,13 +464,13 @@ class PartKernels(Pair):
                 work.load[work.node[m]] += ti.abs(work.share[m]) * pairs.mu[p] * work.P[p]
         if plan.rough > 0:
             for i in range(plan.num_nodes):
-                work.felt[i] = self.lightened_sizes(i, work.load, nodes)
+                work.met[i] = self.lightened_sizes(i, work.load, nodes)
         for k in range(plan.num_pairs * plan.rough):
             p, v, bound = pairs.acting[k], self.vec4(0), ti.cast(0, self.fp)
             for m in range(p * plan.room, p * plan.room + work.filled[p]):
                 i = work.node[m]
                 v += work.share[m] * work.step[i]
-                bound += h * ti.abs(work.share[m]) * work.felt[i]
+                bound += h * ti.abs(work.share[m]) * work.met[i]
             t = v - work.n[p].dot(v) * work.n[p]
             kappa, f, y, slip = slip_in_kernels(ti.sqrt(t.norm_sqr()), bound, pairs.speed[p], KERNELS)
             impulse = (-1.0 * h * pairs.mu[p] * work.P[p] * kappa) * t

@@ -13,6 +13,7 @@ from diffsim_ti.mechanics.surfaces.listed_pair import MANY
 from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ContactNumbers, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
+from diffsim_ti.mesh.geometry import surface_edges
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.terms.self_contact import SelfContact
@@ -33,6 +34,8 @@ class Tunnelling(FloatingPointError, metaclass=Public):
 
 class Overlap(ValueError):
     """A state in which surfaces touch or pass through each other, or an obstacle reaches into a face."""
+
+    apart = None  # displacements that static solves begin from instead (solvers/implicit/overlap.py)
 
 
 class SurfacePairs:
@@ -63,7 +66,7 @@ class SurfacePairs:
         self.first = MANY if self.kinematic else arrays.parameters_of_self_contact.start
         self.kernels = kernels_of(PairKernels, arrays.precision, self.first, parallel)
         self.motion = kernels_of(MotionKernels, arrays.precision, self.first, parallel)
-        edges = mesh.edges if self.kinematic else surface_edges(mesh)
+        edges = mesh.edges if self.kinematic else surface_edges(mesh.surface_triangles)[0]
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
         self.edges, self.term = edges, term
         self.body = np.full(mesh.num_vertices, -1)
@@ -265,10 +268,10 @@ class SurfacePairs:
         """Contact forces at u[slot], to the last corners of `out`."""
         self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
 
-    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, only=None) -> None:
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, poses_dot=None, only=None) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of the rest shape and all parameters).
 
-        only: of the pairs of one contact.
+        poses_dot: changes of the rows of poses, which only CurvedPairs has; only: of the pairs of one contact.
         """
         at, numbers = self._of_product(u, w, out, rest_dot, parameters_dot, only)
         self.run(self.kernels.products, at, slot=slot, **numbers)
@@ -327,11 +330,6 @@ class SurfacePairs:
         gaps, _ = self._distances(u)
         energies = runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
         return float(energies.sum()), float(gaps.min(initial=np.inf))
-
-
-def surface_edges(mesh) -> np.ndarray:
-    """Each edge of the surface once, the smaller index first, sorted; shape (k, 2)."""
-    return np.unique(np.sort(mesh.surface_triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
 
 
 def spread(body: np.ndarray, count: int) -> np.ndarray:

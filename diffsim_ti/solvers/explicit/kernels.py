@@ -400,7 +400,7 @@ class ExplicitKernels:
         """The adjoint of passes first + count - 1 .. first.
 
         halt: the pass at whose state the sweep stops, between its two kicks; kick: only the kick before the state.
-        steps: those for which there is room in `felt`; num_parts: sums over vertices that are made for each path.
+        steps: those for which adjoints of paths have room; num_parts: sums over vertices that are made for each path.
         """
         numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
         own = adjoints(self.with_record(CHANGE) | ADJOINT | OF_STEPS, self.vertex.features) | self.corners

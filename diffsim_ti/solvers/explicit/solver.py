@@ -184,7 +184,7 @@ class ExplicitWorkspace(Workspace):
             self.joints = self.joint_stage.joints
             self.start_joints()
             self.place_obstacles(0)
-            if features.led:  # joints feel what contact does
+            if features.led:  # contact acts on joints
                 self.record_contacts(frozenset())
         self.hosts = host_forces(self.scene)  # for what is evaluated between passes
         self.probe = None  # room for a pass that is not taken

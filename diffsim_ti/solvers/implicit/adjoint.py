@@ -111,8 +111,8 @@ class ImplicitAdjoint(RecordedPasses):
 
     def _pull_back_growth(self, j: int) -> None:
         """The adjoint of growth by tetrahedra in pass j goes to its step."""
-        felt = self.ws.arrays.from_growth_blocks(runtime.fetch(self.numbers.growths).astype(np.float64))
-        self.ws.growth_vjp(self.growth, j, self.stage, felt[0].sum(0))
+        by_blocks = self.ws.arrays.from_growth_blocks(runtime.fetch(self.numbers.growths).astype(np.float64))
+        self.ws.growth_vjp(self.growth, j, self.stage, by_blocks[0].sum(0))
         runtime.fill(self.numbers.growths, 0)
 
     def _pull_back_law(self, j: int, slot: int) -> None:
@@ -183,7 +183,7 @@ class ImplicitAdjoint(RecordedPasses):
             ws.add_loads(self.forces, j, s, share * by_star)
         # where inertia starts from
         inertial = self.mass * by_star
-        reaction = reaction - inertial  # fixed vertices are felt by their neighbours' inertia too
+        reaction = reaction - inertial  # the inertia of neighbours acts on fixed vertices, too
         x_adj = inertial - s.e0 / s.gamma * q_free + by_x
         if ws.potential.has_friction:
             by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
@@ -283,8 +283,7 @@ class ImplicitAdjoint(RecordedPasses):
         a, features, out = self.ws.arrays, self.features, self.numbers.collect()
         out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
         out.element_masses = self.element_masses
-        if features.gravity >= 0:
-            out.parameters[features.gravity :][:3] = self.gravity
+        a.gravity_of(out)[:] = self.gravity
         if features.drag >= 0:
             out.parameters[features.drag] = self.rate
         rest = self.frames[0].sum(0)

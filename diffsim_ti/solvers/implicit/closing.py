@@ -58,7 +58,8 @@ class Closing:
         """A place from where Newton's method finds the equilibrium of a problem (`Newton.solve`). Raises NotConverged."""
         ws, (_, _, loads) = self.ws, problem
         newton, place = ws.newton, start
-        R, left, way = self._out_of_balance(start, problem), self.left(start), self.first * self.size
+        ws.potential.place(start)
+        R, left, way = newton.residual_of(problem), self.left(start), self.first * self.size
         pull = max((abs(float((m * R).sum())) / float((m * (ws.mass * m)).sum()) for m in left), default=0.0)
         while len(left):
             if not pull > 0 or way > 4 * self.size or np.abs(place - start).max() > self.size:
@@ -83,8 +84,3 @@ class Closing:
         places, held = (x, x[supports.vertices]), (stiff @ np.swapaxes(stiff, 1, 2), supports.held)
         words = rigid_motions_left(np.concatenate(places), np.concatenate(held))
         return words or f"{len(left)} rigid motion{'s' if len(left) > 1 else ''} of its pieces together"
-
-    def _out_of_balance(self, u, problem) -> np.ndarray:
-        newton = self.ws.newton
-        newton.pose(problem)
-        return newton.residual_at(u)

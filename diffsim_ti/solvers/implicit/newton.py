@@ -47,7 +47,7 @@ class NewtonReport:
 class Newton:
     """Minimises Phi from a start. From iterate to iterate the surface meets no obstacle
     (obstacles/collision_detection.py) and does not pass through itself. If the start has no J <= 0, J falls by a factor
-    of ten at most, so that the energy's own resistance is felt in time; only where no share of a direction down to
+    of ten at most, so that the energy's own resistance acts in time; only where no share of a direction down to
     `insist` lowers Phi so (a law that is finite at J = 0, pressed beyond it) may it fall further.
 
     tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
@@ -223,7 +223,7 @@ class Newton:
         """(R, shape (num_vertices, 3); the root of the squares of the forces at each vertex that it is measured by)"""
         R, sizes = self.balance(u, self.mass, self.inertial, self.loads)
         inertia = self.mass * (u - self.inertial)
-        self.rigid.feel(R)
+        self.rigid.take_forces(R)
         return R * self.free, np.sqrt(sizes**2 + (self.loads**2 + inertia**2 * self.moves).sum(1))
 
     def step(self, u, R, forcing):

@@ -17,6 +17,7 @@ from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.supports.free import projectors_of
 from diffsim_ti.mechanics.surfaces.curved_pairs import CurvedPairs
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
+from diffsim_ti.mesh.geometry import surface_edges
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree, nearest_of_triangles
 
@@ -29,7 +30,29 @@ ASIDE = 0.5  # how far beside a triangle a vertex may lie, over its distance fro
 
 
 def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
-    """Displacements near u [m] at which surfaces are apart. Raises the error where none are found within an edge of u."""
+    """Displacements near u [m] at which surfaces are apart, which the error keeps. Raises it where there are none within an
+    edge of u."""
+    pairs, potential, is_new = workspace.pairs, workspace.potential, error.apart is None
+    place, deepest = _apart(workspace, u, error) if is_new else (error.apart, 0.0)
+    pairs.begin(place, np.zeros_like(place))
+    runtime.fill(potential.u, place[None])
+    try:
+        pairs.check_apart(potential.u)
+    except Overlap:
+        raise error from None
+    if not np.all((workspace.volume_ratios(place) > 0) | (workspace.volume_ratios(u) <= 0)):
+        raise error
+    if is_new:
+        error.apart = place
+        warn(
+            f"static solve: surfaces overlap by up to {deepest:.3g} m where it begins; they are pressed apart first, and "
+            "friction between them acts from the next step on"
+        )
+    return place
+
+
+def _apart(workspace, u: np.ndarray, error: Overlap) -> tuple[np.ndarray, float]:
+    """(displacements at which vertices and edges are apart, how deep they were [m])"""
     from scipy.sparse import block_diag, diags, identity, kron
     from scipy.sparse.linalg import splu
 
@@ -49,19 +72,7 @@ def pressed_apart(workspace, u: np.ndarray, error: Overlap) -> np.ndarray:
         if missing.max(initial=0.0) < 0.5 * gap:  # vertices are apart: are edges?
             rows, missing = _crossed(inner, x, gap, max(deepest, gap))
         if missing.max(initial=0.0) < 0.5 * gap:
-            pairs.begin(place, np.zeros_like(place))
-            runtime.fill(potential.u, place[None])
-            try:
-                pairs.check_apart(potential.u)
-            except Overlap:
-                raise error from None
-            if not np.all((workspace.volume_ratios(place) > 0) | (workspace.volume_ratios(u) <= 0)):
-                raise error
-            warn(
-                f"static solve: surfaces overlap by up to {deepest:.3g} m where it begins; they are pressed apart first, "
-                "and friction between them acts from the next step on"
-            )
-            return place
+            return place, deepest
         rows = rows @ moves
         place = place + splu((K + stiff * (rows.T @ rows)).tocsc()).solve(stiff * (rows.T @ missing)).reshape(-1, 3)
     raise error
@@ -111,10 +122,9 @@ def _crossed(pairs, x: np.ndarray, gap: float, most: float):
 
     t = pairs.mesh.surface_triangles
     normals = np.cross(x[t[:, 1]] - x[t[:, 0]], x[t[:, 2]] - x[t[:, 0]])
-    sides = np.sort(t[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-    edges, which = np.unique(sides, axis=0, return_inverse=True)
+    edges, sides = surface_edges(t)
     out = np.zeros((len(edges), 3))
-    np.add.at(out, which.ravel(), np.repeat(normals / np.linalg.norm(normals, axis=1, keepdims=True), 3, 0))
+    np.add.at(out, sides.ravel(), np.repeat(normals / np.linalg.norm(normals, axis=1, keepdims=True), 3, 0))
     out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
     middles, along = x[edges].mean(1), x[edges[:, 1]] - x[edges[:, 0]]
     tree = cKDTree(middles)

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
-from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, VolumeConstraints
+from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, Multipliers
 from diffsim_ti.mechanics.constraints import ConstraintForce
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
@@ -89,11 +89,11 @@ class PrescribedInPasses(Workspace):
         """Places of those that hold a volume among the scene's."""
         return self.volumes.places if self.volumes else []
 
-    def volume_constraints(self, eps: float) -> VolumeConstraints | None:
+    def volume_constraints(self, eps: float) -> Multipliers | None:
         """The scene's chambers that hold a volume, and relations without a stiffness."""
         forces = [force for force in self.hosts if isinstance(force, HeldPressure | ConstraintForce) and force.laws]
         given = self.linear, self.arrays.values.rest, self.solver.tolerance, eps
-        return VolumeConstraints(forces, *given) if forces else None
+        return Multipliers(forces, *given) if forces else None
 
     def start_multipliers(self, j: int, u: np.ndarray) -> None:
         """Begin pass j with the pressures of constrained volumes that the pass before it ended with."""
@@ -146,16 +146,10 @@ class PrescribedInPasses(Workspace):
         """Number of pass j, also of the steps of a run that come one by one."""
         return self.first_step * int(np.max(self.solver.schedule.substeps)) + j
 
-    def gravity_of(self, values: Derived) -> np.ndarray:
-        """Gravity [m/s^2], one vector or one for each vertex; there is some."""
-        return values.parameters[self.arrays.features().gravity :][:3]
-
     def loads(self, j: int, stage: Stage) -> np.ndarray:
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
-        values, features = self.arrays.values, self.arrays.features()
-        out = np.zeros_like(values.displacement)
-        if features.gravity >= 0:
-            out += self.mass * self.gravity_of(values)
+        values = self.arrays.values
+        out = np.zeros_like(values.displacement) + self.mass * self.arrays.gravity_of(values)
         out = self._add_forces(self.arrays.rows["forces"], out, j, stage)
         return out * self.load_share(j, stage)
 
@@ -166,9 +160,7 @@ class PrescribedInPasses(Workspace):
             loads = self.loads(j, stage)
             shift = np.divide(loads, mass, out=np.zeros_like(loads), where=mass > 0)
             return inertial + shift, np.zeros_like(loads)
-        values, features = self.arrays.values, self.arrays.features()
-        if features.gravity >= 0:
-            inertial = inertial + self.gravity_of(values) / stage.inertia
+        inertial = inertial + self.arrays.gravity_of(self.arrays.values) / stage.inertia
         return inertial, self.applied_forces(self.arrays.rows["forces"], j, stage)
 
     def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:

@@ -62,10 +62,8 @@ class RecordedPasses:
 
     def weight(self, share: float) -> np.ndarray:
         """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""
-        out = -self.stage.inertia * (self.u_star - self.x - self.stage.gamma * self.y)
-        if self.ws.arrays.features().gravity >= 0:
-            out = out + share * self.ws.gravity_of(self.ws.arrays.values)
-        return out
+        a = self.ws.arrays
+        return share * a.gravity_of(a.values) - self.stage.inertia * (self.u_star - self.x - self.stage.gamma * self.y)
 
     @property
     def v_star(self) -> np.ndarray:

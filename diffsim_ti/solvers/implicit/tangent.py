@@ -72,9 +72,8 @@ class ImplicitTangent(RecordedPasses):
             held[ws.joints.at] = self.joints.led()
             poses = self.joints.rows_jvp(0.0 * self.joints.dq, self.joints.dq) + (0.0 if poses is None else poses)
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
-        of_obstacles = dict(poses_dot=poses) if ws.pairs and ws.pairs.obstacles else {}
         if surface_friction:
-            from_friction = surface_friction.jvp(ws.potential.held_at, held, dx, self.du, self.numbers, **of_obstacles)
+            from_friction = surface_friction.jvp(ws.potential.held_at, held, dx, self.du, self.numbers, poses)
             ws.potential.place(self.u_star)
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
@@ -87,14 +86,13 @@ class ImplicitTangent(RecordedPasses):
         if ws.strains:
             ws.strains.jvp(s, (self.u, self.du), (self.before, self.tangent_before), self)
         if ws.pairs:
-            moved = self.numbers.rest, tangent.parameters
-            ws.pairs.product(ws.potential.u, 0, ws.potential.w, a.corner, *moved, **of_obstacles)
+            moved = self.numbers.rest, tangent.parameters, poses
+            ws.pairs.product(ws.potential.u, 0, ws.potential.w, a.corner, *moved)
         self._jvp(**ws.potential.sizes())
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + self.mass_dot * self.weight(share)
         dR += from_friction
-        if a.features().gravity >= 0:
-            dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
+        dR += share * ws.mass * a.gravity_of(tangent)
         dR += ws.applied_forces(tangent.forces, j, s)
         dR += ws.hosts.jvp(ws.potential.held_at, held, (held - dx) / self.gamma, tangent)
         if ws.rigid:

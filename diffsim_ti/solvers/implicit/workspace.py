@@ -40,12 +40,25 @@ from diffsim_ti.terms import Growth
 
 
 class TwoStepHistory(History):
-    """States with the one before each, for two-step solvers; fresh[k]: slot k has none."""
+    """States with the one before each, for two-step solvers; fresh[k]: slot k has none. In a record it is in the slot
+    before, but for the first."""
 
     def __init__(self, arrays, num_slots: int, record: bool):
         super().__init__(arrays, num_slots, record=False)
+        self.is_record, self.fresh = record, [True] * num_slots
         self.before = History(arrays, 1 if record else num_slots, record=False, remembers=False)
-        self.fresh = [True] * num_slots
+
+    def before_slot(self, slot: int) -> tuple[History, int]:
+        """Where the state before that of a slot is: (history, slot)."""
+        return (self, slot - 1) if self.is_record and slot > 0 else (self.before, slot)
+
+    def copy(self, slot, target, to):
+        super().copy(slot, target, to)
+        target.fresh[to] = self.fresh[slot]
+        if not (target.is_record and to > 0):
+            source, s = self.before_slot(slot)
+            copy_slot(source.u, s, target.before.u, to)
+            copy_slot(source.v, s, target.before.v, to)
 
 
 class ImplicitWorkspace(PrescribedInPasses):
@@ -143,27 +156,6 @@ class ImplicitWorkspace(PrescribedInPasses):
         if self.solver.multistep:
             self.state.fresh[0] = True
 
-    def save(self, target, slot) -> None:
-        super().save(target, slot)
-        if self.solver.multistep and not (target is self.record and slot > 0):  # its slots follow one another
-            self._copy_before(self.state, 0, target, slot)
-
-    def restore(self, source, slot) -> None:
-        super().restore(source, slot)
-        if self.solver.multistep:
-            if source is self.record and slot > 0:  # its slots follow one another
-                copy_slot(source.u, slot - 1, self.state.before.u, 0)
-                copy_slot(source.v, slot - 1, self.state.before.v, 0)
-                self.state.fresh[0] = False
-            else:
-                self._copy_before(source, slot, self.state, 0)
-
-    @staticmethod
-    def _copy_before(source, s, target, t) -> None:
-        copy_slot(source.before.u, s, target.before.u, min(t, target.before.num_slots - 1))
-        copy_slot(source.before.v, s, target.before.v, min(t, target.before.num_slots - 1))
-        target.fresh[t] = source.fresh[s]
-
     # ---- a pass -----------------------------------------------------------------------------------------------------
 
     @one_blas_thread
@@ -205,8 +197,6 @@ class ImplicitWorkspace(PrescribedInPasses):
             self.state.beside[0] = self.preconditioner.following
             if base is not None:
                 self.state.copy(0, self.record, j + 1 - base)
-                if self.solver.multistep:
-                    self.record.fresh[j + 1 - base] = False
 
     def launch_law_state(self, name: str, features, j: int, slot: int, end: int, **records) -> None:
         """Launch one of the LawStateKernels for pass j, from z in `slot` and u in slot `end`."""
@@ -217,14 +207,10 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     def read(self, history, slot: int) -> tuple:
         """(u, v, (u-, v-) or None) of a slot, in float64."""
-        get = runtime.fetch_row
-        before = None
+        get, before = runtime.fetch_row, None
         if self.solver.multistep and not history.fresh[slot]:
-            if history is self.record and slot > 0:
-                before = get(history.u, slot - 1), get(history.v, slot - 1)
-            else:
-                at = min(slot, history.before.num_slots - 1)
-                before = get(history.before.u, at), get(history.before.v, at)
+            source, s = history.before_slot(slot)
+            before = get(source.u, s), get(source.v, s)
         return get(history.u, slot), get(history.v, slot), before
 
     def inertial(self, stage: Stage, u, v, before) -> tuple:
@@ -301,7 +287,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     def _kinetic_added(self, u, v, u_next, v_star, y, stage: Stage) -> float:
         """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, of which drag is a
         part, for y is what inertia would lead to without; what keeps a shape does none."""
-        way = self.rigid.felt(u_next - u)
+        way = self.rigid.resultants(u_next - u)
         after, before, way, rate = (x * mask_of(self.free) for x in (v_star, v, way, (v_star - y) / stage.gamma))
         added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)
         return added - float((rate * (self.mass * way)).sum())
@@ -353,7 +339,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     def volume_ratios(self, u: np.ndarray) -> np.ndarray:
         """J of each tetrahedron at a displacement."""
         self.potential.place(u)
-        return self.potential.energy()[2]
+        return self.potential.energy()[1]
 
     # ---- what obstacles do -------------------------------------------------------------------------------------------
 

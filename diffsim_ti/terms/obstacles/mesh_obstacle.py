@@ -13,7 +13,7 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
 from diffsim_ti.materials.calculus.tensor import sum_of
-from diffsim_ti.mesh.geometry import cross
+from diffsim_ti.mesh.geometry import cross, surface_edges
 from diffsim_ti.runtime import assign, at, let, traced, variable
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
@@ -25,7 +25,7 @@ from diffsim_ti.terms.obstacles.turning import rotation_matrix
 from diffsim_ti.terms.pose import brought_back
 from diffsim_ti.terms.term import place
 
-MOST_HELD = 256  # edges and points that act by pairs, from which on a run has those near bodies alone
+FEW = 256  # edges and points that act by pairs, from which on a run has those near bodies alone
 
 
 class MeshObstacle(Obstacle):
@@ -124,8 +124,7 @@ class MeshObstacle(Obstacle):
         out = super().settled(scene, density, initial_positions, initial_velocities)
         if "barrier_width" in self.left_to_scene:
             out._check_rounding()
-        sides = np.sort(scene.mesh.surface_triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-        out._edges_of_bodies = np.unique(sides, axis=0)
+        out._edges_of_bodies, _ = surface_edges(scene.mesh.surface_triangles)
         return out
 
     def check_start(self, positions, surface, offset=(0.0, 0.0, 0.0)):
@@ -186,7 +185,7 @@ class MeshPrimitives(Primitives):
 
     @property
     def many(self):
-        return len(self.points) + len(self.edges) > MOST_HELD
+        return len(self.points) + len(self.edges) > FEW
 
     def of_some(self, points: np.ndarray, edges: np.ndarray) -> "MeshPrimitives":
         """These points and edges alone, by their places among all."""
@@ -290,7 +289,7 @@ class MeshForce(ObstacleForce):
         own = ti.types.vector(3, self.fp)(*self.turned(X, [k * at(w, a) for a in range(3)], True))
         let(self.over_parts(VJP, parameters, first, X, u, let(own), parameters, sums, i))
 
-    # friction of implicit passes, by the normal force of each part, as both sides of a crease rub
+    # friction of implicit passes, by the normal force of each part, as friction acts on both sides of a crease
 
     @ti.func
     def each_part(self, act: A, parameters: A, first, X, u):

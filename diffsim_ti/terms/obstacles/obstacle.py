@@ -120,7 +120,7 @@ class Obstacle(Term):
             shape = [Input(plain, value) for plain, value in shape.items()]
         stiff = self._stiffness(stiffness, stiffness_per_area)
         self.left_to_scene = (PER_AREA,) * self.chooses_stiffness + ("barrier_width",) * (width is None)
-        felt = positive("width", 1.0 if width is None else width, "m", "barrier_width")
+        wide = positive("width", 1.0 if width is None else width, "m", "barrier_width")
         speed = positive("friction_speed", friction_speed, "m/s")
         friction_of = Input("friction", friction, ((),), range=NOT_NEGATIVE), speed
         for described in friction_of:  # also of what is smooth
@@ -137,7 +137,7 @@ class Obstacle(Term):
         rows = [
             Input("path", None, (("steps + 1", self.path_width),), unit, change=length_per_step, plain=self.path_name)
         ]
-        super().__init__(*shape, stiff, felt, *rough, *centre, *(rows if path is not None else []), name=name)
+        super().__init__(*shape, stiff, wide, *rough, *centre, *(rows if path is not None else []), name=name)
 
     def _stiffness(self, of_vertex: float | None, per_area: float | None) -> Input:
         """How stiff the barrier is: per area, or of each vertex."""

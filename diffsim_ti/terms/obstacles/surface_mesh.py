@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.common.checked import numbers, shown, wholes
-from diffsim_ti.mesh.geometry import cross
+from diffsim_ti.mesh.geometry import cross, surface_edges
 from diffsim_ti.mesh.sets import components
 
 CORNERS = dict(triangles=3, segments=2, points=1)
@@ -66,10 +66,7 @@ class SurfaceMesh:
 
     @cached_property
     def _edges_of_triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """(edges of triangles, sorted, shape (e, 2); of each triangle's sides ab, bc, ca the number, shape (t, 3))"""
-        sides = np.sort(self.one[self.triangles[:, [0, 1, 1, 2, 2, 0]]].reshape(-1, 2), 1)
-        keys, which = np.unique(sides[:, 0] * len(self.vertices) + sides[:, 1], return_inverse=True)
-        return np.stack(np.divmod(keys, len(self.vertices)), 1), which.reshape(-1, 3)
+        return surface_edges(self.one[self.triangles])
 
     def sharp_edges(self, length: float, bow: float) -> np.ndarray:
         """Edges that act on a flat face of this length [m]: segments, edges of one triangle or of more than two, and
@@ -108,21 +105,19 @@ class SurfaceMesh:
         (t, s, p), n = (self.one[x] for x in (self.triangles, self.segments, self.points)), len(self.vertices)
         corners = np.concatenate([t, s[:, [0, 1, 1]], p[:, None][:, [0, 0, 0]]])
         a, b, c = corners.T
-        sides = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 3, 2), 2) @ [n, 1]
-        keys, which = np.unique(sides, return_inverse=True)
-        which = which.reshape(-1, 3)
+        edges, which = surface_edges(corners)
         side = np.stack([a != b, (b != c) & (a != c), (c != a) & (a != b) & (b != c)], 1)
         corner = np.stack([a == a, a != b, (c != a) & (c != b)], 1)
         faces = np.flatnonzero(side.all(1))
         two = np.sort(which[faces], 1)
-        _, same, times = np.unique(two[:, 0] * len(keys) + two[:, 1], return_inverse=True, return_counts=True)
+        _, same, times = np.unique(two[:, 0] * len(edges) + two[:, 1], return_inverse=True, return_counts=True)
         out = np.zeros((len(corners), 7))
         out[faces, 0] = 1 / times[same]
-        count = np.bincount(which.ravel(), side.ravel(), len(keys))
-        of_side = np.where(count > 0, 1 - np.bincount(which.ravel(), np.repeat(out[:, 0], 3), len(keys)), 0)
+        count = np.bincount(which.ravel(), side.ravel(), len(edges))
+        of_side = np.where(count > 0, 1 - np.bincount(which.ravel(), np.repeat(out[:, 0], 3), len(edges)), 0)
         out[:, 1:4] = side * (of_side / np.maximum(count, 1))[which]
         of_corner = 1 - np.bincount(corners.ravel(), np.repeat(out[:, 0], 3), n)
-        for end in np.divmod(keys, n):
+        for end in edges.T:
             of_corner -= np.bincount(end, of_side, n)
         out[:, 4:] = corner * (of_corner / np.maximum(np.bincount(corners.ravel(), corner.ravel(), n), 1))[corners]
         return out
