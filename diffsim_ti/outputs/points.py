@@ -43,8 +43,6 @@ class MaterialPoints(Output):
     [1.0, 0.9614]
     """
 
-    linear = True
-
     def __init__(self, points: ArrayLike, name: str = "material_points", nearest: bool = False):
         self.points, self.name, self.nearest = numbers("MaterialPoints: points", points), name, bool(nearest)
 
@@ -124,8 +122,6 @@ class CenterOfMass(Output):
     """
 
     unit = "m"
-
-    linear = True
 
     def __init__(self, of: str | ArrayLike | None = None, name: str = "center_of_mass"):
         self.of, self.name = of, name
