@@ -264,15 +264,9 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     sizes = np.abs(shares) if shares.any() else scene.mesh.volumes
     error = value - exact + of_solver
     shares = shares + (error - shares.sum()) * sizes / sizes.sum()  # what is of no place, and not of first order
-    uncancelled = max(np.abs(shares).sum(), number.largest(frames, at))
     contact = bool(scene.obstacles or scene.term(SelfContact))
-    known = dict(
-        vertices=mesh.num_vertices,
-        rounding=rounding,
-        contact=contact,
-        unplaced=unplaced,
-        uncancelled=float(uncancelled),
-    )
+    known = dict(vertices=mesh.num_vertices, rounding=rounding, contact=contact, unplaced=unplaced)
+    known["uncancelled"] = max(float(np.abs(shares).sum()), number.largest(frames, at))
     return error, 0.0 - of_solver, shares, known
 
 
@@ -309,10 +303,10 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
             "that point inwards and ends of supports, errors fall slowly, and this one may be larger than estimated: refine "
             "there, as ds.refine does"
         )
-    if matters and found.uncancelled > CANCELS * abs(found.mesh):
+    if found.uncancelled > max(CANCELS * abs(found.mesh), FELT * found.size):
         notes.append(
-            f"errors of the mesh cancel: by size they are {found.uncancelled / abs(found.mesh):.2g} times their sum, and "
-            "the estimate may be off by as much as it is, for which the bar is wider: refine the mesh once, and compare"
+            f"errors of the mesh cancel: by size they sum up to {found.uncancelled:.2g}, and the estimate may be off by as "
+            "much as it is, for which the bar is wider: refine the mesh once, and compare"
         )
     if exact["unplaced"]:
         notes.append(f"{exact['unplaced']}: shares are by volume alone")
