@@ -36,10 +36,11 @@ class Accuracy(metaclass=Public):
     value: the number on the rollout's own mesh, in its own steps and precision; size: how much the corrected value differs
         from that of the first frame.
     mesh: what the mesh costs; the number of elements of ten nodes, or of halved edges, is taken for the truth.
-    uncancelled: the sum of what `mesh` is made of by size, in the body, or the most of any frame if that is more.
     step: what steps of this length cost (zero of equilibria). solver: what the solver's tolerance leaves.
     rounding: what rounding may cost: of float32 the distance from float64, of float64 a bound without sign; of explicit
         steps as if each rounded the number.
+    uncancelled: {"mesh": ..., "step": ...}, how large these are before they cancel: the most of any frame, or the sum of
+        the shares by size.
     shares: of `mesh` by tetrahedron; their sum is `mesh`. `save_picture(path, mesh, positions, accuracy.shares)` shows them.
     cost: seconds of the run itself and of the finer mesh; unknowns of both.
     notes: why the estimate may be off.
@@ -49,10 +50,10 @@ class Accuracy(metaclass=Public):
     value: float
     size: float
     mesh: float
-    uncancelled: float
     step: float
     solver: float
     rounding: float
+    uncancelled: dict
     shares: np.ndarray = field(repr=False)
     cost: dict
     notes: tuple[str, ...] = ()
@@ -66,12 +67,13 @@ class Accuracy(metaclass=Public):
 
     @property
     def bar(self) -> float:
-        """How far the truth may be from the value: |mesh| + 0.43 uncancelled + |step| / 0.7 + |solver| + |rounding|.
+        """How far the truth may be from the value: |mesh| + |step| + 0.43 uncancelled + |solver| + |rounding|.
 
-        Where no errors cancel that is |mesh| / 0.7: estimates were at least 0.7 times the error of problems with known
-        answers (examples/benchmarks/error_bars.py). What they missed was at most 0.43 of what cancels. It is no bound."""
-        of_mesh = abs(self.mesh) + (1 / LEAST - 1) * self.uncancelled
-        return of_mesh + abs(self.step) / LEAST + abs(self.solver) + abs(self.rounding)
+        Where no errors cancel that is (|mesh| + |step|) / 0.7: estimates were at least 0.7 times the error of problems with
+        known answers (examples/benchmarks/error_bars.py). What they missed was mostly below 0.43 of what cancels. It is no
+        bound."""
+        known = abs(self.mesh) + abs(self.step) + abs(self.solver) + abs(self.rounding)
+        return known + (1 / LEAST - 1) * sum(self.uncancelled.values())
 
     @property
     def corrected(self) -> float:
@@ -186,9 +188,10 @@ def estimated(
         rounding = value - number.of(frames)[0]
     else:
         rounding = exact["rounding"]
-    step = _of_steps(own, frames, number, values)
+    step, most = _of_steps(own, frames, number, values)
     size = abs(value - mesh - step - solver - number.start(frames))
-    errors = dict(mesh=mesh, uncancelled=exact["uncancelled"], step=step, solver=solver, rounding=rounding)
+    errors = dict(mesh=mesh, step=step, solver=solver, rounding=rounding)
+    errors["uncancelled"] = dict(mesh=exact["uncancelled"], step=most)
     found = Accuracy(number.output, value, size or abs(value), **errors, shares=shares, cost=cost)
     found.notes = tuple(_doubts(rollout.scene, found, exact))
     return found, own
@@ -280,16 +283,17 @@ def _by_element(mesh: TetrahedralMesh, nodal: np.ndarray, parents: np.ndarray, c
     return np.bincount(parents, each, count)
 
 
-def _of_steps(own: Replay, frames: "Frames", number: Number, values: dict) -> float:
-    """Error of the steps: by as many steps of half the length, and the order of the solver."""
+def _of_steps(own: Replay, frames: "Frames", number: Number, values: dict) -> tuple[float, float]:
+    """Errors of the steps, in the end and in the worst frame: by steps of half the length, and the order of the solver."""
     rollout, solver = own.rollout, own.rollout.solver
     if not solver.order:
-        return 0.0
+        return 0.0, 0.0
     if rollout.schedule is not None:
         finer = solver.on(UnequalSteps(rollout.schedule.lengths, 2 * np.asarray(rollout.schedule.substeps)))
     else:
         finer = solver.for_scene(rollout.scene, substeps=2 * solver.substeps)
-    return (number.of(frames)[0] - number.of(rollout.on(finer).forward(**values))[0]) / (1 - 0.5**solver.order)
+    halved, part = rollout.on(finer).forward(**values), 1 - 0.5**solver.order
+    return (number.of(frames)[0] - number.of(halved)[0]) / part, number.largest(frames, halved) / part
 
 
 def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
@@ -303,11 +307,13 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
             "that point inwards and ends of supports, errors fall slowly, and this one may be larger than estimated: refine "
             "there, as ds.refine does"
         )
-    if found.uncancelled > max(CANCELS * abs(found.mesh), FELT * found.size):
-        notes.append(
-            f"errors of the mesh cancel: by size they sum up to {found.uncancelled:.2g}, and the estimate may be off by as "
-            "much as it is, for which the bar is wider: refine the mesh once, and compare"
-        )
+    for name, remedy in dict(mesh="refine the mesh once", step="halve the steps").items():
+        size = found.uncancelled[name]
+        if size > max(CANCELS * abs(getattr(found, name)), 0.1 * abs(found.error), FELT * found.size):
+            notes.append(
+                f"errors of the {name} cancel: before they do they are {size:.2g}, and the estimate may be off by as much "
+                f"as it is, for which the bar is wider: {remedy}, and compare"
+            )
     if exact["unplaced"]:
         notes.append(f"{exact['unplaced']}: shares are by volume alone")
     if exact["contact"]:
