@@ -315,7 +315,7 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
                 f"as it is, for which the bar is wider: {remedy}, and compare"
             )
     if exact["unplaced"]:
-        notes.append(f"{exact['unplaced']}: shares are by volume alone")
+        notes.append(f"{exact['unplaced']}: shares are by volume alone, and whether they cancel is not known")
     if exact["contact"]:
         notes.append("parts in contact: the estimate is of the finer mesh's own contacts, and jumps where these change")
     locks = scene.mesh.order == 1 and scene.volume == "tetrahedra"
