@@ -22,7 +22,7 @@ from diffsim_ti.terms import SelfContact
 if TYPE_CHECKING:
     from diffsim_ti.rollout import Frames, Rollout
 
-CANCELS = 1.5  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
+CANCELS = 2.0  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
 FELT = 1e-6  # of the number's change: what is less is left over by solvers
 LEAST = 0.7  # of the true error: what estimates were on problems with known answers (examples/benchmarks/error_bars.py)
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
