@@ -72,10 +72,14 @@ def test_le10():
 
 
 def test_le10_has_its_target_within_its_error_bar():
-    """On this mesh; on others with two cells through the thickness the estimate is down to a quarter of the error."""
+    """On this mesh, and on one that is far too coarse, where errors cancel, which is said."""
     places = grid((0.2, 0.2, 0.25), (0.0057, 0.0026, 0.0119)) * [1, 1, -1] + [0, 0, 1]
-    found = bar_of_mean(*le10_with_coordinates((4, 6, 2)), le10_shape, places, (2, 0, 0.6), 1)
-    assert found.value == pytest.approx(-5.38, rel=0.02) and abs(found.value + 5.38) < found.bar < 0.02 * 5.38
+    found, coarse = (
+        bar_of_mean(*le10_with_coordinates(cells), le10_shape, places, (2, 0, 0.6), 1)
+        for cells in ((4, 6, 2), (2, 3, 1))
+    )
+    assert found.value == pytest.approx(-5.38, rel=0.02) and abs(found.value + 5.38) < found.bar < 0.05 * 5.38
+    assert abs(coarse.value + 5.38) < coarse.bar and any("cancel" in note for note in coarse.notes)
 
 
 def le11_shape(x: np.ndarray) -> np.ndarray:
@@ -110,7 +114,7 @@ def le11_with_coordinates(cells) -> tuple[ds.Scene, np.ndarray]:
 def test_le11_has_its_target_within_its_error_bar():
     places = grid((0.5, 0.1, 0.3), (0.034, 0.00455, 0.0159))
     found = bar_of_mean(*le11_with_coordinates((2, 4, 8)), le11_shape, places, (1, 0, 0), 2)
-    assert found.value == pytest.approx(-105, rel=0.02) and abs(found.value + 105) < found.bar < 0.02 * 105
+    assert found.value == pytest.approx(-105, rel=0.02) and abs(found.value + 105) < found.bar < 0.05 * 105
 
 
 def test_le11():

@@ -213,7 +213,6 @@ class Output(metaclass=Public):
     name: str
     _shown: tuple[str, ...] = ()  # arguments that `repr` shows, beside the name
     unit = ""  # for pictures
-    linear = False  # whether it is linear in positions and velocities
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
     # whether runs must note frames.contact_forces for it: what obstacles do (True), or "surfaces" to each other
     reads_contact_forces: bool | Literal["surfaces"] = False
@@ -300,7 +299,6 @@ def force_or_moment(forces: np.ndarray, places: np.ndarray, about: np.ndarray | 
 class _States(Output):
     """Vectors of all vertices in all frames."""
 
-    linear = True
     num_vertices: int
     part = "positions"  # of a Change
 

@@ -44,8 +44,6 @@ class MaterialPoints(Output):
     [1.0, 0.9614]
     """
 
-    linear = True
-
     def __init__(self, points: ArrayLike, name: str = "material_points", nearest: bool = False):
         self.points, self.name, self.nearest = numbers("MaterialPoints: points", points), name, bool(nearest)
 
@@ -98,7 +96,7 @@ class CenterOfMass(Output):
     [2.5, 0.5, 0.5]
     """
 
-    unit, linear, _shown = "m", True, ("of",)
+    unit, _shown = "m", ("of",)
 
     def __init__(self, of: str | ArrayLike | None = None, name: str = "center_of_mass"):
         self.of, self.name = of, name

@@ -339,11 +339,10 @@ class Rollout(metaclass=Public):
             tetrahedra, `TetrahedralMesh.refined` of ten nodes by default.
         values: of inputs, as in `forward`.
 
-        The run's states are put on the finer mesh. Forces that are out of balance there, times the adjoint of the number,
-        are its error to first order, and say the share of each tetrahedron; where that is more than a fifth of how far the
-        number moved, or less than an eighth of what the shares are by size, or it is not linear in places, or parts are in
-        contact, the finer mesh is solved. So it is for explicit steps and for chambers that hold their volume, where shares
-        are by volume alone. Steps of half the length say what steps cost.
+        The finer mesh is solved, from the run's states on. Forces that are out of balance where these are put on it, times
+        the adjoint of the number, are the error to first order, and say the share of each tetrahedron. Where shares cancel,
+        or something else makes the estimate unsure, `Accuracy.notes` say so, and the bar is wider. Shares of explicit steps
+        and of what is held exactly are by volume alone. Steps of half the length say what steps cost.
         Raises ValueError for what a finer mesh cannot have.
         Becker, Rannacher 2001, doi:10.1017/S0962492901000010.
 

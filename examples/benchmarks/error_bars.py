@@ -9,6 +9,7 @@ small as the solver's tolerance.
 
 import sys
 import time
+from functools import partial
 
 import numpy as np
 from scipy.linalg import expm
@@ -42,6 +43,15 @@ def uniaxial(n, order):
     mu, lam, s = 1e5 / 2.6, 0.3e5 / 1.3 / 0.4, 1.5
     width = np.sqrt(np.max(np.roots([lam * s * s, mu - lam * s, -mu])))
     return *statics(mesh, ds.StableNeoHookean(1e5, 0.3), side, order, **options), (0, 1, 0), width
+
+
+def stretched_bar(n, order):
+    """Where the end of a bar of 2 m is that hangs by its weight, rho g L = 2.4 E, nu 0.3: at 6.66 m (meshes of 96 and 320
+    ten-node tetrahedra)."""
+    mesh = ds.TetrahedralMesh.create_box((n + 1, n // 2 + 1, n // 2 + 1), (2.0, 0.5, 0.5), "five")
+    options = dict(terms=ds.Gravity((12.0, 0, 0)), fixed="xmin")
+    end = ds.MaterialPoints([[2.0, 0.25, 0.25]], name="end")
+    return *statics(mesh, ds.StableNeoHookean(1e4, 0.3), end, order, **options), (1, 0, 0), 6.66
 
 
 def beam(n, order):
@@ -167,11 +177,12 @@ class ModeShare(ds.MaterialPoints):
         return ds.outputs.Change(positions=seed[:, None, None] * self.weights)
 
 
-def lame(n, order):
-    """Share of the Lame mode of a free cube after a fifth of its period, which is cos(2 pi / 5), with BDF2 in 24 steps."""
-    scene, steps = lame_scene(0.3, n, "kuhn", "f64", order), 24
-    solver = ds.BDF2Solver(scene, dt=2 * np.pi / 5 / lame_omega(0.3) / steps, tolerance=1e-8)
-    return ds.Rollout(solver, steps, outputs=ModeShare()), None, None, np.cos(2 * np.pi / 5)
+def lame(n, order, kind=ds.BDF2Solver, periods=0.2, steps=24, **options):
+    """Share of the Lame mode of a free cube after some periods, which is cos(2 pi periods). After a half, a small error of
+    the frequency has no effect to first order."""
+    scene = lame_scene(0.3, n, "kuhn", "f64", order)
+    solver = kind(scene, dt=2 * np.pi * periods / lame_omega(0.3) / steps, **options)
+    return ds.Rollout(solver, steps, outputs=ModeShare()), None, None, np.cos(2 * np.pi * periods)
 
 
 PROBLEMS = {  # name: (problem, sizes of linear meshes, of ten nodes)
@@ -182,7 +193,12 @@ PROBLEMS = {  # name: (problem, sizes of linear meshes, of ten nodes)
     "elastica": (elastica, (8, 12, 20), (1, 2, 3)),
     "thick sphere": (thick_sphere, (2, 3, 4), (2, 3, 4)),
     "thick plate": (thick_plate, (3, 4, 5), (1, 2, 3)),
-    "lame": (lame, (3, 4, 6), (1, 2, 3)),
+    "stretched bar": (stretched_bar, (2, 3, 5), ()),
+    "lame": (partial(lame, tolerance=1e-8), (3, 4, 6), (1, 2, 3)),
+    "lame, half a period": (partial(lame, periods=0.5, tolerance=1e-8), (3, 4, 6), (1, 2)),
+    "lame, midpoint": (partial(lame, kind=ds.ImplicitMidpointSolver, tolerance=1e-8), (3, 4, 6), (1, 2)),
+    "lame, backward Euler": (partial(lame, kind=ds.ImplicitEulerSolver, tolerance=1e-8), (3, 4, 6), (1, 2)),
+    "lame, explicit": (partial(lame, kind=ds.VelocityVerletSolver), (3, 4, 6), (1, 2)),
 }
 
 
@@ -226,7 +242,7 @@ def refine() -> None:
 
 
 def main(names) -> None:
-    print("| problem | nodes | mesh | value | estimate | bar | true error | effectivity | by | s |")
+    print("| problem | nodes | mesh | value | estimate | bar | true error | effectivity | cancels | s |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for name in names or PROBLEMS:
         for order in (1, 2):
@@ -238,7 +254,7 @@ def main(names) -> None:
                     f"{found.bar:.3g}",
                     f"{true:.3g}",
                     f"{found.error / true:.2f}",
-                    found.by,
+                    "cancel" in " ".join(found.notes),
                     f"{time.perf_counter() - begin:.1f}",
                 ]
                 print("|", " | ".join(map(str, cells)), "|", flush=True)
