@@ -22,9 +22,12 @@ from diffsim_ti.terms import SelfContact
 if TYPE_CHECKING:
     from diffsim_ti.rollout import Frames, Rollout
 
-CANCELS = 2.0  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
+CANCELS = 1.5  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
+CANCEL = "errors of the {} cancel"  # how its note begins
 FELT = 1e-6  # of the number's change: what is less is left over by solvers
-LEAST = 0.7  # of the true error: what estimates were on problems with known answers (examples/benchmarks/error_bars.py)
+# estimates were at least 0.7 times the error of problems with known answers (examples/benchmarks/error_bars.py), so that they
+# missed this share of what they are made of
+MISSED = 1 / 0.7 - 1
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
 PER_VERTEX = ("positions", "velocities", "displacements")  # outputs that count vertices, of which a finer mesh has more
 
@@ -73,7 +76,7 @@ class Accuracy(metaclass=Public):
         known answers (examples/benchmarks/error_bars.py). What they missed was mostly below 0.43 of what cancels. It is no
         bound."""
         known = abs(self.mesh) + abs(self.step) + abs(self.solver) + abs(self.rounding)
-        return known + (1 / LEAST - 1) * sum(self.uncancelled.values())
+        return known + MISSED * sum(self.uncancelled.values())
 
     @property
     def corrected(self) -> float:
@@ -311,7 +314,7 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
         size = found.uncancelled[name]
         if size > max(CANCELS * abs(getattr(found, name)), 0.1 * abs(found.error), FELT * found.size):
             notes.append(
-                f"errors of the {name} cancel: before they do they are {size:.2g}, and the estimate may be off by as much "
+                f"{CANCEL.format(name)}: before they do they are {size:.2g}, and the estimate may be off by as much "
                 f"as it is, for which the bar is wider: {remedy}, and compare"
             )
     if exact["unplaced"]:
