@@ -51,8 +51,8 @@ class Robots(Interaction):
         if self.scene.reduced:
             raise ValueError("robots do not support reduced sets and ties beside them: leave out reduced= and Tie")
         held = [vertices for term in self.terms for _, vertices in term.holds]
-        if held and (solver.explicit or solver.order > 1):
-            raise ValueError("attached= of a robot is for backward Euler steps alone: take ImplicitEulerSolver")
+        if held and solver.explicit:
+            raise ValueError("attached= of a robot is for implicit steps alone: take ImplicitEulerSolver or BDF2Solver")
         if held and (
             self.scene.holds_volumes or any(t.primitives or isinstance(t, SelfContact) for t in self.scene.terms)
         ):

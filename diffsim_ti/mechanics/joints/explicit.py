@@ -24,6 +24,7 @@ from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.history import History
 from diffsim_ti.state.numbers import Tangent
+from diffsim_ti.state.stage import Stage
 
 ROUNDS = 100
 
@@ -74,7 +75,7 @@ class JointStage(Stage):
         """Joints stand where the pass begins."""
         J, self.at = self.joints, at
         J.now, J.u_n = at.history.joints[at.slot], runtime.fetch_row(at.history.u, at.slot)
-        J.begin(at.j, SimpleNamespace(gamma=at.now.h), self.rows)
+        J.begin(at.j, Stage(at.now.h), self.rows)
         self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
         self.near, self.given = np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3))
         self.wrenches = self.wrenches_of(self.given)
@@ -109,7 +110,7 @@ class JointStage(Stage):
                 copy_slot(source, 1, target, at.end)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
-        history.joints[at.end] = J.q, J.w - self.rebound(), J.effort()
+        history.joints[at.end] = J.q, J.w - self.rebound(), J.effort(), J.q_n, J.v_n
         self.met[at.end] = J.w, touches
 
     def look(self) -> bool:
@@ -262,9 +263,10 @@ class JointStageTangent(Stage):
             yield
             return
         touches, h = stage.reopen(at), at.now.h
+        own.begin()
         du_n = runtime.fetch_row(run.u, 0)
         if stage.own.size:
-            runtime.fill(run.offsets, own.rows_jvp(own.dq, own.dq))
+            runtime.fill(run.offsets, own.rows_jvp(own.dq, own.dq, own.dq))
             runtime.clear([run.impulses.impulse])
         yield
         dF = stage.slope() @ own.dq / h - h * own.force()  # for w as it is

@@ -32,6 +32,7 @@ from diffsim_ti.mechanics.obstacles.contact_record import Shares
 from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.state.numbers import Tangent
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
+from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms.robots.model import bracket
 
 STIFF = 1e6  # of a prescribed joint's drive, and of a limit, over inertia / h^2
@@ -93,14 +94,14 @@ class Joints:
                 self.holding = np.concatenate([self.holding, moving])
 
     def start(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(positions, velocities, efforts) where a run begins."""
+        """(positions, velocities, efforts, positions and velocities before) where a run begins."""
         values = self.a.values
         q, v, *_ = self.robots.numbers(values.parameters)
         for robot, own in zip(self.robots.terms, self.slices):
             robot.check_limits(q[own])
         x = (values.rest + values.displacement)[self.at]
         self.local = self._each_held(q, lambda turn, t, rows: rotations.turned(rotations.conjugate(turn), x[rows] - t))
-        return q.copy(), v.copy(), np.zeros(self.count)
+        return q.copy(), v.copy(), np.zeros(self.count), q.copy(), v.copy()
 
     # ---- kinematics --------------------------------------------------------------------------------------------------
 
@@ -164,16 +165,25 @@ class Joints:
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 
-    def begin(self, j: int, stage, rows: np.ndarray) -> None:
+    def led_on(self, q, v, q_before, v_before) -> tuple[np.ndarray, ...]:
+        """(x, y) where inertia starts from, as of vertices, and where the joints are and how fast they are as the pass ends,
+        to its order, of the states now and before; linear in these."""
+        (a0, a1), (b0, b1) = self.weights
+        return tuple(m * one + n * other for m, n in ((a0, a1), (b0, b1)) for one, other in ((q, q_before), (v, v_before)))
+
+    def begin(self, j: int, stage: Stage, rows: np.ndarray) -> None:
         """Pass j from `now`; rows: of obstacles, which links write into."""
-        (self.q_n, self.v_n, *_), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
+        (self.q_n, self.v_n, _, *before), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
+        r = np.sqrt(-stage.a1 / stage.a0)  # w / (1 + w) of a step that is w times as long as the one before
+        self.weights = (stage.a0, stage.a1), (1 / (1 - r), -r / (1 - r))
+        self.x, self.y, self.q_on, self.v_on = self.led_on(self.q_n, self.v_n, *before)
         self.poses_n, self.S_n = self.kinematics(self.q_n)
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
         at = a.features().gravity
         self.gravity = a.values.parameters[at : at + 3].copy() if at >= 0 else np.zeros(3)
         self.M, self.bias = np.zeros((self.count, self.count)), np.zeros(self.count)
         for robot, own in zip(self.robots.terms, self.slices):
-            numbers = self.q_n[own], self.v_n[own], self.masses[own], self.gravity
+            numbers = self.q_on[own], self.v_on[own], self.masses[own], self.gravity
             self.M[own, own], self.bias[own] = robot.model.dynamics(*numbers)
         schedule, self.j = self.ws.solver.schedule, j
         self.share = self.ws.share_at_stage(j, stage)
@@ -225,16 +235,21 @@ class Joints:
         turned = np.abs(self.q - self.q_n) * np.linalg.norm(self.S_n[:, 3:], axis=1)
         if any(turned @ carried >= np.pi for _, carried in self.links):
             raise NotConverged("a link of a robot turns by more than half a turn: take smaller steps", [self.left])
-        self.now = self.q.copy(), (self.q - self.q_n) / self.h, sum(self._efforts())
+        self.now = self.q.copy(), self.rate, sum(self._efforts()), *self.now[:2]
 
     def forget(self) -> None:
         """Rows of obstacles were written by others."""
         self._placed = None
 
     @property
+    def rate(self) -> np.ndarray:
+        """Velocities of the joints as the pass ends."""
+        return (self.q - self.x) / self.h
+
+    @property
     def acceleration(self) -> np.ndarray:
         """Of the joints in the pass."""
-        return (self.q - self.q_n - self.h * self.v_n) / self.h**2
+        return (self.rate - self.y) / self.h
 
     def _own_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(-dPhi/dq but for contact, sizes of what it adds up)"""
@@ -244,7 +259,7 @@ class Joints:
 
     def _efforts(self) -> tuple[np.ndarray, ...]:
         """Of torques, drives, damping and limits [N m or N]."""
-        drive, damping = -self.k * (self.q - self.targets), -self.c * (self.q - self.q_n) / self.h
+        drive, damping = -self.k * (self.q - self.targets), -self.c * self.rate
         return self.torques, drive, damping, -self._limits()[1]
 
     def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -274,7 +289,7 @@ class Joints:
             return np.zeros(1)
         a, d = self.acceleration, self.q - self.q_n
         inertia = 0.5 * self.h**2 * a @ self.M @ a
-        drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * d**2 / self.h
+        drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * self.h * self.rate**2
         return np.array([inertia, self.bias @ d, drives.sum(), -self.torques @ d, self._limits()[0].sum()])
 
     def _stand(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -282,7 +297,7 @@ class Joints:
         self.q, self._linear = q, None
         u = self._carry(u)
         self.put(self.rows, q)
-        self._put_rates(self.rows, (q - self.q_n) / self.h)
+        self._put_rates(self.rows, self.rate)
         if len(self.rows):
             runtime.fill(self.p.poses, self.rows)
         R, size = self._own_forces()

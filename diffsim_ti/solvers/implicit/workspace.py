@@ -57,7 +57,8 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     def __init__(self, solver, derived, bend=0.0):
         self.potential, self._length, self.hosts = None, solver.substep, host_forces(solver.scene)
-        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.term(Growth) else None
+        watched = solver.may_gain_energy and not (solver.scene.term(Growth) or solver.scene.interaction(Robots))
+        self.energy_watch = EnergyWatch(self) if watched else None
         super().__init__(solver, derived, bend)
 
     def history(self, num_slots, record=False):
