@@ -24,7 +24,7 @@ from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.history import History
 from diffsim_ti.state.numbers import Tangent
-from diffsim_ti.state.stage import Stage
+from diffsim_ti.state.stage import Stage as Pass
 
 ROUNDS = 100
 
@@ -75,7 +75,7 @@ class JointStage(Stage):
         """Joints stand where the pass begins."""
         J, self.at = self.joints, at
         J.now, J.u_n = at.history.joints[at.slot], runtime.fetch_row(at.history.u, at.slot)
-        J.begin(at.j, Stage(at.now.h), self.rows)
+        J.begin(at.j, Pass(at.now.h), self.rows)
         self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
         self.near, self.given = np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3))
         self.wrenches = self.wrenches_of(self.given)

@@ -173,12 +173,11 @@ class JointAdjoint(JointSweep):
 
     def clear(self) -> None:
         """The joints where the sweep stands are no start of theirs."""
-        self.scale(0.0)
-        self.by_effort = np.zeros(self.joints.count)
+        self.by_q, self.by_v, self.by_effort, *self.pending = np.zeros((5, self.joints.count))
 
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint."""
-        self.by_q, self.by_v, self.pending = factor * self.by_q, factor * self.by_v, factor * self.pending
+        self.by_q, self.by_v, self.pending = factor * self.by_q, factor * self.by_v, [factor * x for x in self.pending]
 
     def add_frame(self, frame: int) -> None:
         """Add the adjoints of a frame."""
