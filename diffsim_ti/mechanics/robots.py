@@ -39,8 +39,8 @@ class Robots(Interaction):
     def check_solver(self, solver) -> None:
         if not solver.moves_robots:
             raise ValueError(
-                f"{type(solver).__name__}: robots move in backward Euler and explicit steps: take ImplicitEulerSolver, "
-                "SemiImplicitSolver or VelocityVerletSolver"
+                f"{type(solver).__name__}: robots move in steps that end where forces are taken: take BDF2Solver or "
+                "ImplicitEulerSolver"
             )
         if solver.explicit and solver.contact == "force" and any(term.companions for term in self.terms):
             raise ValueError('links of robots act in a stage of explicit steps: leave out contact="force"')

@@ -170,9 +170,7 @@ class LinkEnergy(JointPositions):
         M, _ = model.dynamics(q, 0 * v, masses, none)
         _, weight = model.dynamics(q, 0 * v, masses, g)
         by_q, _, by_masses, _ = model.derivatives(q, 0 * v, v, masses, none)
-        c = np.array(
-            [t + rotations.turned(turn, i.lever) for (turn, t), i in zip(model.kinematics(q)[0], model.inertias)]
-        )
+        c = model.centres(q)
         energies = np.array([0.5 * v @ M @ v, -masses @ c @ g])
         own = [0.5 * v @ by_q, weight], [M @ v, 0 * v], [0.5 * v @ by_masses, -c @ g], [none, -masses @ c]
         return energies, tuple(np.stack(rows) for rows in own)

@@ -30,12 +30,16 @@ from diffsim_ti.common import rotations
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mechanics.obstacles.contact_record import Shares
 from diffsim_ti.mechanics.robots import Robots
+from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.state.numbers import Tangent
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
 from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms.robots.model import bracket
 
 STIFF = 1e6  # of a prescribed joint's drive, and of a limit, over inertia / h^2
+AT_REST = 0.01  # [s], h of these in equilibria
+FIRM = 1e-9  # stiffness of what is held in an equilibrium, over the largest that a joint meets, or inertia / s^2
+HELD = "hold the joint by drive_stiffness, prescribe it, or take a solver with inertia"
 
 
 def moved(S: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -76,7 +80,7 @@ class Joints:
         self.shares = Shares(workspace) if self.links and self.p else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
         self.loose = max(1e-6, 1e3 * self.eps)  # of their forces, what rounding of the vertices' places may leave
-        self._known, self._zero, self._held, self._placed, self._back, self._anchor = [None] * 6
+        self._known, self._zero, self._held, self._placed, self._back, self._anchor, self.problem = [None] * 7
         self.q, self.left, self.now = None, 0.0, self.start()
 
     def _take_held(self) -> None:
@@ -174,28 +178,44 @@ class Joints:
     def begin(self, j: int, stage: Stage, rows: np.ndarray) -> None:
         """Pass j from `now`; rows: of obstacles, which links write into."""
         (self.q_n, self.v_n, _, *before), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
+        self.moves = 0.0 if stage.static else 1.0  # without which there is neither inertia nor damping
         r = np.sqrt(-stage.a1 / stage.a0)  # w / (1 + w) of a step that is w times as long as the one before
-        self.weights = (stage.a0, stage.a1), (1 / (1 - r), -r / (1 - r))
+        self.weights = (stage.a0, stage.a1), (self.moves / (1 - r), -self.moves * r / (1 - r))
         self.x, self.y, self.q_on, self.v_on = self.led_on(self.q_n, self.v_n, *before)
         self.poses_n, self.S_n = self.kinematics(self.q_n)
+        self.reach = np.where(self.S_n[:, 3:].any(1), 0.5, np.ptp(a.values.rest, 0).max())  # of a round at rest
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
-        at = a.features().gravity
-        self.gravity = a.values.parameters[at : at + 3].copy() if at >= 0 else np.zeros(3)
-        self.M, self.bias = np.zeros((self.count, self.count)), np.zeros(self.count)
-        for robot, own in zip(self.robots.terms, self.slices):
-            numbers = self.q_on[own], self.v_on[own], self.masses[own], self.gravity
-            self.M[own, own], self.bias[own] = robot.model.dynamics(*numbers)
-        schedule, self.j = self.ws.solver.schedule, j
-        self.share = self.ws.share_at_stage(j, stage)
-        given = a.rows["joints"]
-        self.targets = schedule.pressure(given, j, self.share)
-        self.torques = given[schedule.load_row(given, j)][:, 2]
-        self.k = np.where(self.robots.prescribed, STIFF * self.robots.typical / self.h**2, self.k)
-        self.c = self.c + self.robots.damping
+        self.load(j, stage)
+        self.stiff = STIFF * self.robots.typical / (self.h if self.moves else AT_REST) ** 2
+        self.k = np.where(self.robots.prescribed, self.stiff, self.k)
+        self.c = self.moves * (self.c + self.robots.damping)
         self.q, self._held, self._placed, self._anchor, self.felt = self.q_n.copy(), None, None, None, 0.0
         self._back = None
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
         self._put_rates(rows, np.zeros(self.count))
+
+    def load(self, j: int, stage: Stage) -> None:
+        """Take targets, torques and weight of pass j; statics lay on a share of these."""
+        schedule, given, at, self.j = self.ws.solver.schedule, self.a.rows["joints"], self.a.features().gravity, j
+        self.share, self.laid = self.ws.share_at_stage(j, stage), 1.0 if self.moves else self.ws.load_share(j, stage)
+        self.targets = schedule.pressure(given, j, self.share)
+        self.torques = self.laid * given[schedule.load_row(given, j)][:, 2]
+        self.gravity = self.laid * self.a.values.parameters[at : at + 3] if at >= 0 else np.zeros(3)
+        self._weigh()
+        self.forget()
+
+    def _weigh(self) -> None:
+        """Inertia M, and bias b of Coriolis forces and weight, where they are taken."""
+        self.M, self.bias = np.zeros((self.count, self.count)), np.zeros(self.count)
+        for robot, own in zip(self.robots.terms, self.slices):
+            numbers = self.q_on[own], self.v_on[own], self.masses[own], self.gravity
+            self.M[own, own], self.bias[own] = robot.model.dynamics(*numbers)
+
+    def take(self, problem: tuple) -> None:
+        """What is solved: mass, inertial and loads of `Newton.solve`."""
+        if problem is not self.problem:
+            self.problem = problem
+            self.forget()
 
     def hold(self, q: np.ndarray) -> None:
         """Stand at q wherever the body is, as a recorded pass does."""
@@ -221,11 +241,13 @@ class Joints:
             )
 
     def end(self) -> None:
-        """The pass is over. Raises NotConverged where the joints are not in balance."""
+        """The pass is over. Raises NotConverged where the joints are not in balance, or nothing holds them at rest."""
+        if not self.moves:
+            self._check_firm()
         if not self.left <= max(self.ws.solver.tolerance, self.loose):
+            remedy = "take smaller steps" if self.moves else HELD
             raise NotConverged(
-                f"the joints of robots are out of balance by {self.left:.2g} of their forces: take smaller steps",
-                [self.left],
+                f"the joints of robots are out of balance by {self.left:.2g} of their forces: {remedy}", [self.left]
             )
         meets = self.links or len(self.at) and len(self.rows)
         met = self.ws.collisions.detection.nearest(self.p.held_at, self.rows[::3]) if meets else None
@@ -235,7 +257,7 @@ class Joints:
         turned = np.abs(self.q - self.q_n) * np.linalg.norm(self.S_n[:, 3:], axis=1)
         if any(turned @ carried >= np.pi for _, carried in self.links):
             raise NotConverged("a link of a robot turns by more than half a turn: take smaller steps", [self.left])
-        self.now = self.q.copy(), self.rate, sum(self._efforts()), *self.now[:2]
+        self.now = self.q.copy(), self.moves * self.rate, sum(self._efforts()), *self.now[:2]
 
     def forget(self) -> None:
         """Rows of obstacles were written by others."""
@@ -249,7 +271,31 @@ class Joints:
     @property
     def acceleration(self) -> np.ndarray:
         """Of the joints in the pass."""
-        return (self.rate - self.y) / self.h
+        return self.moves * (self.rate - self.y) / self.h
+
+    def derivatives(self, robot, own: slice) -> tuple[np.ndarray, ...]:
+        """Of inertia and bias of a robot (RobotModel.derivatives), where they are taken."""
+        return robot.model.derivatives(
+            self.q_on[own], self.v_on[own], self.acceleration[own], self.masses[own], self.gravity
+        )
+
+    def _check_firm(self) -> None:
+        """Raise NotConverged where an equilibrium resists no motion of the joints that pieces of the body on links follow."""
+        columns, K = self.linear
+        scale = np.sqrt(np.abs(np.diag(K)) + self.robots.typical)
+        if len(self.at):
+            x, piece = self.places(self.p.held_at)[0], pieces(self.ws.scene.mesh)
+            led = np.zeros((len(x), self.count, 1))
+            for rows, _, carried in self.grips:
+                led[np.isin(piece, piece[self.at[rows]])] = carried[:, None]
+            ways = np.swapaxes(led * moved(self.S, x), 0, 1) * self.ws.linear
+            crossed = np.einsum("bid,ida->ab", ways, columns[-1][1])
+            K = K + crossed + crossed.T + np.einsum("aid,bid->ab", ways, [self.of_places(w) for w in ways])
+        values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
+        if not values[0] > FIRM:
+            name = np.concatenate([robot.joints for robot in self.robots.terms])[np.argmax(np.abs(vectors[:, 0]))]
+            how = "nothing holds" if values[0] > -FIRM else "the equilibrium is unstable along"
+            raise NotConverged(f"static solve: {how} joint {str(name)!r} of a robot: {HELD}", [self.left])
 
     def _own_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(-dPhi/dq but for contact, sizes of what it adds up)"""
@@ -265,7 +311,7 @@ class Joints:
     def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Energies of the limits of joints, and their first two derivatives: k d^3 / (6 w) of what is beyond by d < w, and
         beyond w with the constant stiffness k; prescribed joints have none."""
-        k, w = np.where(self.robots.prescribed, 0.0, STIFF * self.robots.typical / self.h**2), self.robots.soft
+        k, w = np.where(self.robots.prescribed, 0.0, self.stiff), self.robots.soft
         past = np.maximum(self.q - self.robots.upper, 0) - np.maximum(self.robots.lower - self.q, 0)
         s = np.abs(past) / w
         c = np.minimum(s, 1.0)
@@ -288,13 +334,18 @@ class Joints:
         if self.q is None:
             return np.zeros(1)
         a, d = self.acceleration, self.q - self.q_n
-        inertia = 0.5 * self.h**2 * a @ self.M @ a
+        inertia, weight = 0.5 * self.h**2 * a @ self.M @ a, self.bias @ d if self.moves else 0.0
+        for robot, own in zip(self.robots.terms, [] if self.moves else self.slices):
+            weight -= self.masses[own] @ robot.model.centres(self.q[own]) @ self.gravity
         drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * self.h * self.rate**2
-        return np.array([inertia, self.bias @ d, drives.sum(), -self.torques @ d, self._limits()[0].sum()])
+        return np.array([inertia, weight, drives.sum(), -self.torques @ d, self._limits()[0].sum()])
 
     def _stand(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Go to q; (-dPhi/dq, sizes of what it adds up)."""
         self.q, self._linear = q, None
+        if not self.moves:  # the weight is that at rest
+            self.q_on = q
+            self._weigh()
         u = self._carry(u)
         self.put(self.rows, q)
         self._put_rates(self.rows, self.rate)
@@ -365,8 +416,10 @@ class Joints:
             best = min(best, left)
             _, K = self.linear
             values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
-            values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max())
+            values = np.maximum(np.abs(values), 1e-12 * max(np.abs(values).max(), 1.0))
             step = vectors @ ((vectors.T @ (R / scale)) / values) / scale
+            if not self.moves:
+                step = step * min(1.0, 1 / np.max(np.abs(step) / self.reach))
             slope, q = float(R @ step), self.q
             t = self._free_share(u, q, step)
             while True:
@@ -395,7 +448,9 @@ class Joints:
         return self._linear
 
     def _linearise(self) -> tuple[list, np.ndarray]:
-        K, columns = self.M / self.h**2 + np.diag(self.yielding), []
+        K, columns = self.moves * self.M / self.h**2 + np.diag(self.yielding), []
+        for robot, own in zip(self.robots.terms, [] if self.moves else self.slices):
+            K[own, own] += self.derivatives(robot, own)[0] + 1e-14 * np.diag(robot.typical)
         if any(len(part.at) for part in self.pushed):
             blocks = self._blocks()
             turns, x = self.turns(self.S), self.places(self.p.held_at)[0]

@@ -72,10 +72,6 @@ class JointSweep:
         """(robot, its joints)"""
         return zip(self.joints.robots.terms, self.joints.slices)
 
-    def _derivatives(self, robot, own: slice) -> tuple[np.ndarray, ...]:
-        J = self.joints
-        return robot.model.derivatives(J.q_on[own], J.v_on[own], J.acceleration[own], J.masses[own], J.gravity)
-
     def _of_friction(self) -> list:
         """(vertices, joints that move the link, f, f', sum over vertices of f' . change of J' by q_b, [b, a])"""
         J, out = self.joints, []
@@ -125,13 +121,13 @@ class JointTangent(JointSweep):
         at = J.a.features().gravity
         dg = moved_numbers.parameters[at : at + 3] if at >= 0 else np.zeros(3)
         for robot, own in self._each():
-            by_q, by_v, by_m, by_g = self._derivatives(robot, own)
-            out[own] -= by_q @ self.dq_on[own] + by_v @ self.dv_on[own] + by_m @ dm[own] + by_g @ dg
+            by_q, by_v, by_m, by_g = J.derivatives(robot, own)
+            out[own] -= by_q @ self.dq_on[own] + by_v @ self.dv_on[own] + by_m @ dm[own] + J.laid * by_g @ dg
         schedule, rows = self.ws.solver.schedule, moved_numbers.joints
         dtargets = schedule.pressure(rows, J.j, J.share)
-        self._given = J.k * dtargets - dk * (J.q - J.targets) - dc * J.rate + J.c * self.dx / J.h
-        self._given += rows[schedule.load_row(rows, J.j)][:, 2]
-        out += J.M @ (self.dx / J.h**2 + self.dy / J.h) + self._given
+        self._given = J.k * dtargets - dk * (J.q - J.targets) + J.c * self.dx / J.h
+        self._given += J.laid * rows[schedule.load_row(rows, J.j)][:, 2] - J.moves * dc * J.rate
+        out += J.moves * J.M @ (self.dx / J.h + self.dy) / J.h + self._given
         if held is None:
             return out
         x, x_n = J.places(J.p.held_at)
@@ -149,7 +145,7 @@ class JointTangent(JointSweep):
 
     def step(self, dq: np.ndarray) -> None:
         """The pass has changed the joints so."""
-        self.before, self.dq, self.dv = (self.dq, self.dv), dq, (dq - self.dx) / self.joints.h
+        self.before, self.dq, self.dv = (self.dq, self.dv), dq, self.joints.moves * (dq - self.dx) / self.joints.h
         self.deffort = self._given - self.joints.yielding * dq
 
 
@@ -189,6 +185,7 @@ class JointAdjoint(JointSweep):
         by_ends: of the vertices' displacements where the pass ends."""
         J = self.joints
         by_q, self._to_q_n, self._to_x = self.rows_vjp(rows) if np.ndim(rows) else np.zeros((3, J.count))
+        self.by_v = J.moves * self.by_v
         self._seed = self.by_q + self.by_v / J.h + by_q - J.yielding * self.by_effort
         if len(J.at):
             self._seed = self._seed + np.einsum("iad,id->a", J.J_a, by_ends[J.at])
@@ -235,19 +232,19 @@ class JointAdjoint(JointSweep):
         adjoints of numbers. Returns that of gravity."""
         J, w = self.joints, self.w
         _, by_q_n, by_x = self.rows_vjp(rows)
-        e, by_y, by_gravity, (by_q_on, by_v_on) = w + self.by_effort, J.M @ w / J.h, np.zeros(3), np.zeros((2, J.count))
+        e, by_y, by_gravity, (by_q_on, by_v_on) = w + self.by_effort, J.moves * J.M @ w / J.h, np.zeros(3), np.zeros((2, J.count))
         by_x = by_x + self._to_x + (by_y + J.c * e - self.by_v) / J.h
         for robot, own in self._each():
-            by_q, by_v, by_m, by_g = self._derivatives(robot, own)
+            by_q, by_v, by_m, by_g = J.derivatives(robot, own)
             by_q_on[own] -= w[own] @ by_q
             by_v_on[own] -= w[own] @ by_v
             self.numbers[4, own] -= w[own] @ by_m
-            by_gravity -= w[own] @ by_g
+            by_gravity -= J.laid * w[own] @ by_g
         self.numbers[2] -= np.where(J.robots.prescribed, 0.0, e * (J.q - J.targets))
-        self.numbers[3] -= e * J.rate
+        self.numbers[3] -= J.moves * e * J.rate
         schedule = self.ws.solver.schedule
         schedule.add_pressure(adj.joints, J.j, J.share, J.k * e)
-        adj.joints[schedule.load_row(adj.joints, J.j)][:, 2] += e
+        adj.joints[schedule.load_row(adj.joints, J.j)][:, 2] += J.laid * e
         (a0, a1), (b0, b1) = J.weights
         by_first, by_second = np.stack([by_x, by_y]), np.stack([by_q_on, by_v_on])
         self.by_q, self.by_v = a0 * by_first + b0 * by_second + self.pending

@@ -240,7 +240,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         place, speed = self.prescribed(j, self.arrays.values)
         problem = self.problem(j, stage, x, y)
         if self.joints:
-            self.joints.problem = problem
+            self.joints.take(problem)
         self.rigid.begin(u, stage.c0)
         starts = [] if stage.static else [problem[1], x + stage.gamma * y]
         held = (
