@@ -12,7 +12,8 @@ SOFT = 1e-4  # of the range of a joint, on which its limits grow stiff
 
 
 class Robots(Interaction):
-    """Their joints are unknowns of backward Euler steps (joints/joints.py), and of explicit ones (joints/explicit.py)."""
+    """Their joints are unknowns of implicit steps and equilibria (joints/joints.py), and of explicit steps
+    (joints/explicit.py)."""
 
     name, kinds, works, on_host, in_kernels = "robots", (Robot,), "robots", False, False
     derived = dict(joints="vectors2")
@@ -51,8 +52,11 @@ class Robots(Interaction):
         if self.scene.reduced:
             raise ValueError("robots do not support reduced sets and ties beside them: leave out reduced= and Tie")
         held = [vertices for term in self.terms for _, vertices in term.holds]
-        if held and solver.explicit:
-            raise ValueError("attached= of a robot is for implicit steps alone: take ImplicitEulerSolver or BDF2Solver")
+        if held and solver.explicit and not solver.last_frame_is_state:
+            raise ValueError(
+                f"attached= of a robot is not for {type(solver).__name__}, whose steps end in half a kick: take "
+                "SemiImplicitSolver"
+            )
         if held and (
             self.scene.holds_volumes or any(t.primitives or isinstance(t, SelfContact) for t in self.scene.terms)
         ):

@@ -8,6 +8,9 @@ each w anew: vertices are eliminated. With Phi of the joints alone (terms/robots
 
 is solved for w by Newton's method: links move by J A^-1 J^T times what vertices do to them in the same pass. What one gets
 the other loses, to round-off, whatever is left of this equation. Fixed vertices do not stop links.
+
+Vertices that links hold are kicked like all, to velocities v*, and then go where links have them, y(q), at d = (y(q + h w) -
+y(q)) / h: joints feel J^T m (d - v*), which joins the equation. All of P counts in it, b = 1, so that v' = w and d stays.
 """
 
 import weakref
@@ -59,7 +62,7 @@ class JointStage(Stage):
         self.ws, a = weakref.proxy(ws), ws.arrays
         self.joints = ExplicitJoints(ws)
         self.rows, self.met = np.zeros((a.poses.size, 3)), {}
-        self.blend = 0.5 + 0.5 * ws.solver.contact_damping
+        self.blend = 1.0 if len(self.joints.at) else 0.5 + 0.5 * ws.solver.contact_damping
         links = [k for k, _ in self.joints.links]
         self.own = np.ravel([[2 * k, 2 * k + 1] for k in links]).astype(int)  # their rows of impulses
         self.carried = np.array([carried for _, carried in self.joints.links], float).reshape(-1, self.joints.count)
@@ -77,6 +80,8 @@ class JointStage(Stage):
         J.now, J.u_n = at.history.joints[at.slot], runtime.fetch_row(at.history.u, at.slot)
         J.begin(at.j, Pass(at.now.h), self.rows)
         self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
+        self.m, self.y_n, self.v_star = self.ws.mass[J.at], J.carried(J.q_n), np.zeros((len(J.at), 3))
+        self.J_n = J.ways(J.S_n, self.y_n)  # of vertices that links hold
         self.near, self.given = np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3))
         self.wrenches = self.wrenches_of(self.given)
 
@@ -97,21 +102,37 @@ class JointStage(Stage):
             return
         self.begin(at)
         self.go(J.v_n)
-        self.find()
+        if not len(J.at):
+            self.find()
         history.copy(at.slot, self.pair, 0)
         yield
-        touches = bool(self.own.size) and self.look()
-        if touches:
+        touches = bool(self.own.size) and (self.look() or len(J.at) > 0)
+        if touches or len(J.at):
             copy_slot(history.f, at.slot, self.pair.f, 0)
-            for source, target in ((self.pair.u, history.u), (self.pair.v, history.v)):
+            states = (self.pair.u, history.u), (self.pair.v, history.v)
+            for source, target in states:
                 copy_slot(target, at.end, source, 1)
-            self.find(meets=True)
-            for source, target in ((self.pair.u, history.u), (self.pair.v, history.v)):
+            self.find(meets=touches)
+            for (source, target), row in zip(states, (J.carried(J.q) - ws.arrays.values.rest[J.at], self.chord)):
+                if len(J.at):
+                    x = runtime.fetch(source)
+                    x[1, J.at] = row
+                    runtime.fill(source, x)
                 copy_slot(source, 1, target, at.end)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
         history.joints[at.end] = J.q, J.w - self.rebound(), J.effort(), J.q_n, J.v_n
-        self.met[at.end] = J.w, touches
+        self.met[at.end] = J.w, touches, self.v_star
+
+    @property
+    def chord(self) -> np.ndarray:
+        """Velocities in the pass of vertices that links hold [m/s]."""
+        return (self.joints.carried(self.joints.q) - self.y_n) / self.joints.h
+
+    @property
+    def pull(self) -> np.ndarray:
+        """What links give these vertices [N s]."""
+        return self.m * (self.chord - self.v_star)
 
     def look(self) -> bool:
         """Note what links have done to vertices, and say whether that is anything."""
@@ -147,6 +168,15 @@ class JointStage(Stage):
         turns = self.joints.turns(self.joints.S_n)
         return np.einsum("la,lb,bad,lkd->kba", self.carried, self.carried, turns, self.wrenches)
 
+    def bent_by_held(self) -> np.ndarray:
+        """How what joints feel of vertices that links hold changes as joint b turns where the pass begins, [b, a]."""
+        J, out = self.joints, np.zeros((self.joints.count, self.joints.count))
+        turns, pull = J.turns(J.S_n), self.pull
+        for rows, _, carried in J.grips:
+            force, moment = pull[rows].sum(0), np.cross(self.y_n[rows], pull[rows]).sum(0)
+            out += (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
+        return out
+
     def weighed(self, felt: np.ndarray) -> np.ndarray:
         """What counts of it in the equation of w."""
         return self.blend * felt[0] + felt[1]
@@ -158,10 +188,14 @@ class JointStage(Stage):
         x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
         sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
-        return self.weighed(self.felt(self.wrenches)) - J.h * own, J.h * size + met, J.h * noise
+        F = self.weighed(self.felt(self.wrenches)) - J.h * own + np.einsum("iad,id->a", self.J_n, self.pull)
+        speeds = np.abs(self.chord) + np.abs(self.v_star), 1e-15 * np.abs(self.y_n) / J.h
+        held, rounding = (np.einsum("iad,id->a", np.abs(self.J_n), self.m * x) for x in speeds)
+        return F, J.h * size + met + held, J.h * noise + rounding
 
     def find(self, meets: bool = False) -> None:
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
+        self.v_star = runtime.fetch_row(self.pair.v, 1)[self.joints.at]
         J, (F, size, noise), best, stalled = self.joints, self.left(), np.inf, 0
         for _ in range(ROUNDS):
             share = float(np.max(np.abs(F) / (max(1e-14, 4 * J.eps) * size + noise)))
@@ -178,6 +212,7 @@ class JointStage(Stage):
                 if meets:
                     self.launch("press")
                     self.look()
+                    self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
                 F, size, noise = self.left()
                 if step @ F <= -J.falls * slope or t < 1e-12:
                     break
@@ -194,7 +229,14 @@ class JointStage(Stage):
         """Derivative of the equation by w, or of its part without contact."""
         J = self.joints
         own = J.M + J.h**2 * np.diag(J.yielding)
-        return own + self.weighed(self.answers()) if meets else own
+        own = own + np.einsum("iad,ibd->ab", self.m[..., None] * self.J_n, self.J_end)
+        return own + self.weighed(self.answers()) - self.follows if meets else own
+
+    @property
+    def J_end(self) -> np.ndarray:
+        """How joints move vertices that links hold where the pass ends."""
+        J = self.joints
+        return J.ways(J.kinematics(J.q)[1], J.carried(J.q))
 
     def rebound(self) -> np.ndarray:
         """(1 - b) A^-1 J^T P"""
@@ -202,9 +244,11 @@ class JointStage(Stage):
 
     def answers(self) -> np.ndarray:
         """Changes of what joints feel by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
-        displacements, velocities and impulses of the vertices that are near."""
+        displacements, velocities and impulses of the vertices that are near; follows: by what v* of those that links hold
+        changes."""
         J, change = self.joints, self.change
-        out = np.zeros((2, J.count, J.count))
+        out, self.follows = np.zeros((2, J.count, J.count)), np.zeros((J.count, J.count))
+        near, held = np.nonzero(self.near[:, None] == J.at)
         touched = self.wrenches.any((1, 2))
         self.moves = []
         for b in np.flatnonzero(self.carried[touched].any(0)):
@@ -217,6 +261,7 @@ class JointStage(Stage):
             given = runtime.look(change.impulse)[:, self.near].astype(np.float64)
             out[:, :, b] = self.felt(self.wrenches_of(given))
             self.moves.append((b, du, dv, given))
+            self.follows[:, b] = np.einsum("iad,id->a", self.J_n[held], self.m[held] * dv[near])
         return out
 
     # ---- what derivatives need -----------------------------------------------------------------------------------------
@@ -224,7 +269,7 @@ class JointStage(Stage):
     def reopen(self, at: Passes) -> bool:
         """Stand in a recorded pass; whether links touched in it, of which all is noted then."""
         self.begin(at)
-        J, (w, touches) = self.joints, self.met[at.end]
+        J, (w, touches, self.v_star) = self.joints, self.met[at.end]
         self.go(w)
         J.S = J.kinematics(J.q)[1]
         if not touches:
@@ -270,6 +315,13 @@ class JointStageTangent(Stage):
             runtime.clear([run.impulses.impulse])
         yield
         dF = stage.slope() @ own.dq / h - h * own.force()  # for w as it is
+        u, v, at_held = runtime.fetch(run.u), runtime.fetch(run.v), J.at
+        led_n, led = (J.from_joints(q, own.dlocal) for q in (J.q_n, J.q))
+        dy_n, dm = np.einsum("iad,a->id", stage.J_n, own.dq) + led_n, ws.mass_of(own.tangent)[at_held]
+        dpull = dm * (stage.chord - stage.v_star) + stage.m * ((led - dy_n) / h - v[0, at_held])
+        turned = np.cross(J.holding * J.S_n[:, 3:], dy_n[:, None])
+        dF = dF + np.einsum("iad,id->a", stage.J_n, dpull) + np.einsum("iad,id->a", turned, stage.pull)
+        dF = dF + own.dq @ stage.bent_by_held()
         if touches:
             near, answers, z = stage.near, stage.answers(), stage.rebound()
             given = runtime.fetch(run.impulses.impulse).astype(np.float64)
@@ -277,22 +329,24 @@ class JointStageTangent(Stage):
             dx = (du_n + own.tangent.rest)[near]
             wrenches[..., 3:] += np.cross(dx, stage.given[stage.own]).sum(1).reshape(-1, 2, 3)
             felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
-            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers), dF + stage.weighed(felt))
+            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers) - stage.follows, dF + stage.weighed(felt))
             felt = felt[0] + answers[0] @ dw
             _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
             by_q, by_m = stage.mass_derivatives(z)
             dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
             dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * felt - dA)
-            u, v = runtime.fetch(run.u), runtime.fetch(run.v)
             for b, du_b, dv_b, given_b in stage.moves:
                 u[0, near] += du_b * dw[b]
                 v[0, near] += dv_b * dw[b]
                 given[:, near] += given_b * dw[b]
-            runtime.fill(run.u, u)
-            runtime.fill(run.v, v)
             runtime.fill(run.impulses.impulse, given)
         else:
             dw = dv = -np.linalg.solve(stage.slope(), dF)
+        if touches or len(at_held):
+            dy = np.einsum("iad,a->id", stage.J_end, own.dq + h * dw) + led
+            u[0, at_held], v[0, at_held] = dy - own.tangent.rest[at_held], (dy - dy_n) / h
+            runtime.fill(run.u, u)
+            runtime.fill(run.v, v)
         if stage.own.size:
             run.impulses.note_pass(at.numbers["counted"])
         own.step(own.dq + h * dw)
@@ -313,7 +367,7 @@ class JointStageAdjoint(JointAdjoint):
         if not self.ws.solver.last_frame_is_state:  # its last pass shows the last frame
             self.clear()
         a = self.ws.arrays
-        self.by_rest, self.by_gravity = np.zeros((a.num_vertices, 3)), np.zeros(3)
+        self.by_rest, self.by_gravity, self.by_mass = np.zeros((a.num_vertices, 3)), np.zeros(3), np.zeros(a.num_vertices)
         self.by_steps = SimpleNamespace(joints=np.zeros_like(a.rows["joints"]))
 
     @contextmanager
@@ -328,19 +382,34 @@ class JointStageAdjoint(JointAdjoint):
         touches, h, rows = stage.reopen(at), at.now.h, np.zeros_like(stage.rows)
         seeds = run.impulses.of_frame(at.numbers["counted"]) if stage.own.size else 0.0
         by_w, K = h * (self.by_q - J.yielding * self.by_effort) + self.by_v, stage.slope()
-        if touches:
+        self._to_q_n, by_x = np.zeros(J.count), np.zeros_like(self.by_rest)
+        if touches or len(J.at):
             run.complete()
+            p, q = runtime.fetch_row(run.u, 0), runtime.fetch_row(run.v, 0)
+            by_end, by_begin = p[J.at] + q[J.at] / h, -q[J.at] / h  # of where links have the vertices that they hold
+            self.by_rest[J.at] -= p[J.at]
+            p[J.at], q[J.at] = 0.0, 0.0
+            by_w = by_w + h * np.einsum("iad,id->a", stage.J_end, by_end)
+        if touches:
             near, answers, z = stage.near, stage.answers(), stage.rebound()
-            K = K + stage.weighed(answers)
+            K = K + stage.weighed(answers) - stage.follows
             eased = np.linalg.solve(stage.inertia, self.by_v)
             by_push = (stage.blend - 1) * eased
             by_w = by_w + by_push @ answers[0]
-            p, q = runtime.fetch_row(run.u, 0)[near], runtime.fetch_row(run.v, 0)[near]
             seeded = seeds[:, near] if np.ndim(seeds) else 0.0
             for b, du_b, dv_b, given_b in stage.moves:
-                by_w[b] += (p * du_b).sum() + (q * dv_b).sum() + (seeded * given_b).sum()
+                by_w[b] += (p[near] * du_b).sum() + (q[near] * dv_b).sum() + (seeded * given_b).sum()
         w = np.linalg.solve(K.T, by_w)
-        self.w, self._to_q_n, by_x = h * w, np.zeros(len(w)), np.zeros_like(self.by_rest)
+        self.w = h * w
+        if len(J.at):
+            moved_by, turn = np.einsum("iad,a->id", stage.J_n, w), (J.holding * J.S_n[:, 3:] * w[:, None]).sum(1)
+            q[J.at] = stage.m * moved_by
+            by_end, by_begin = by_end - q[J.at] / h, by_begin + q[J.at] / h - np.cross(stage.pull, turn)
+            self.by_mass[J.at] -= (moved_by * (stage.chord - stage.v_star)).sum(1)
+            self._to_q_n += np.einsum("iad,id->a", stage.J_n, by_begin) - stage.bent_by_held() @ w
+            self.by_local += J.to_joints(J.q, by_end) + J.to_joints(J.q_n, by_begin)
+            runtime.fill(run.u, p[None])
+            runtime.fill(run.v, q[None])
         if touches:
             by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what joints feel
             seeds = self._with(seeds, by)
@@ -348,7 +417,7 @@ class JointStageAdjoint(JointAdjoint):
             turn = np.repeat((own @ J.S_n[:, 3:]).reshape(-1, 1, 3), len(near), 1)
             by_x[near] = np.cross(stage.given[stage.own], turn).sum(0)
             by_q, by_m = stage.mass_derivatives(z)
-            self._to_q_n = np.einsum("kba,ka->b", stage.bent(), by) + eased @ by_q
+            self._to_q_n += np.einsum("kba,ka->b", stage.bent(), by) + eased @ by_q
             self.numbers[4] += eased @ by_m
             self.numbers[3] += h * eased * z
             self.numbers[2] += np.where(J.robots.prescribed, 0.0, h**2 * eased * z)
@@ -381,5 +450,7 @@ class JointStageAdjoint(JointAdjoint):
         if at >= 0:
             out.parameters[at : at + 3] += self.by_gravity
         out.joints += self.by_steps.joints
+        if out.mass is not None:
+            out.mass = out.mass + self.by_mass
         if out.rest is not None:
             out.rest = out.rest + self.by_rest

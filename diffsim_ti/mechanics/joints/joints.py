@@ -1,7 +1,8 @@
 """The joints of a scene's robots in implicit passes: eliminated from Newton's equations, with tangent and adjoint.
 
 For each displacement u of the body the joint positions q(u) minimise the incremental potential (terms/robots/robot.py) by
-Newton's method, from where they are on a way that meets no vertex. So forces on the body are those of Phi(u, q(u)), and its
+Newton's method, from where they are on a way that meets no vertex. The numbers of a pass are those of its solver
+(solvers/implicit/solver.py): p = x + gamma y. At rest M and damping are zero, and weight is taken at q, with its Hessian. So forces on the body are those of Phi(u, q(u)), and its
 Hessian is the Schur complement K_uu - K_uq K_qq^-1 K_qu, of rank as many as there are joints less than K_uu.
 
 Of a link, a vertex at x has the barrier's force f and -df/dx = H, and friction's f' and -df'/du = F. A joint a moves the

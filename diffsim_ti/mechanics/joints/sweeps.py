@@ -265,7 +265,8 @@ class JointAdjoint(JointSweep):
         J = self.joints
         q, *_ = J.start()
         by, x = J.from_joints(q, self.by_local), (J.a.values.rest + J.a.values.displacement)[J.at]
-        out.rest[J.at] += by
+        if out.rest is not None:
+            out.rest[J.at] += by
         out.displacement[J.at] += by
         by_q = self.by_q - np.einsum("iad,id->a", J.ways(J.kinematics(q)[1], x), by)
         J.robots.add_numbers(out.parameters, np.concatenate([[by_q, self.by_v], self.numbers[2:]]))
