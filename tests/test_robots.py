@@ -573,7 +573,10 @@ def test_equilibria_of_joints_are_those_of_their_springs_weights_and_limits():
     lying = found(slide.replace('lower="-3"', 'lower="-0.01"'))
     assert lying["joint_positions"][-1, 0] == pytest.approx(-0.01, abs=2e-6)
     assert lying["joint_efforts"][-1, 0] == pytest.approx(2 * 9.81)
-    for more, message in ((dict(), "nothing holds joint 'j'"), (dict(positions=[np.pi / 2]), "unstable along joint 'j'")):
+    for more, message in (
+        (dict(), "nothing holds joint 'j'"),
+        (dict(positions=[np.pi / 2]), "unstable along joint 'j'"),
+    ):
         text = slide if not more else arm
         with pytest.raises(FloatingPointError, match=f"{message} of a robot: hold the joint by drive_stiffness"):
             found(text, limits=False, **more)
@@ -735,7 +738,9 @@ def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advic
         with pytest.raises(ValueError, match=message):
             ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **options), dt=1e-3))
         ds.Simulator(ds.ImplicitEulerSolver(scene_of(arm, **less), dt=1e-3))
-    with pytest.raises(ValueError, match="attached= of a robot is not for VelocityVerletSolver.* take SemiImplicitSolver"):
+    with pytest.raises(
+        ValueError, match="attached= of a robot is not for VelocityVerletSolver.* take SemiImplicitSolver"
+    ):
         ds.VelocityVerletSolver(scene_of(arm), dt=1e-5)
     with pytest.raises(ValueError, match="LinkMotion: no link 'hand'; there are base"):
         ds.LinkMotion("hand").settled(scene_of(arm))

@@ -229,7 +229,8 @@ class JointStage(Stage):
         """Derivative of the equation by w, or of its part without contact."""
         J = self.joints
         own = J.M + J.h**2 * np.diag(J.yielding)
-        own = own + np.einsum("iad,ibd->ab", self.m[..., None] * self.J_n, self.J_end)
+        if len(J.at):
+            own = own + np.einsum("iad,ibd->ab", self.m[..., None] * self.J_n, self.J_end)
         return own + self.weighed(self.answers()) - self.follows if meets else own
 
     @property
@@ -367,7 +368,11 @@ class JointStageAdjoint(JointAdjoint):
         if not self.ws.solver.last_frame_is_state:  # its last pass shows the last frame
             self.clear()
         a = self.ws.arrays
-        self.by_rest, self.by_gravity, self.by_mass = np.zeros((a.num_vertices, 3)), np.zeros(3), np.zeros(a.num_vertices)
+        self.by_rest, self.by_gravity, self.by_mass = (
+            np.zeros((a.num_vertices, 3)),
+            np.zeros(3),
+            np.zeros(a.num_vertices),
+        )
         self.by_steps = SimpleNamespace(joints=np.zeros_like(a.rows["joints"]))
 
     @contextmanager

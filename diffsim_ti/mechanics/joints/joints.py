@@ -1,9 +1,10 @@
 """The joints of a scene's robots in implicit passes: eliminated from Newton's equations, with tangent and adjoint.
 
 For each displacement u of the body the joint positions q(u) minimise the incremental potential (terms/robots/robot.py) by
-Newton's method, from where they are on a way that meets no vertex. The numbers of a pass are those of its solver
-(solvers/implicit/solver.py): p = x + gamma y. At rest M and damping are zero, and weight is taken at q, with its Hessian. So forces on the body are those of Phi(u, q(u)), and its
-Hessian is the Schur complement K_uu - K_uq K_qq^-1 K_qu, of rank as many as there are joints less than K_uu.
+Newton's method, from where they are on a way that meets no vertex. Numbers of a pass are those of its solver
+(solvers/implicit/solver.py); at rest there is no inertia, and weight is that at q. So forces on the body are those of
+Phi(u, q(u)), and its Hessian is the Schur complement K_uu - K_uq K_qq^-1 K_qu, of rank as many as there are joints less than
+K_uu.
 
 Of a link, a vertex at x has the barrier's force f and -df/dx = H, and friction's f' and -df'/du = F. A joint a moves the
 link's point there by J_a = v_a + w_a x x. Since turning link and vertex together turns f,
@@ -123,7 +124,8 @@ class Joints:
 
     def _each_held(self, q: np.ndarray, of) -> np.ndarray:
         """of(quaternion, position, rows) of the joint that carries each link at q, for rows of vertices that it holds."""
-        self.kinematics(q)
+        if self.grips:
+            self.kinematics(q)
         out, base = np.zeros((len(self.at), 3)), (np.eye(1, 4)[0], np.zeros(3))
         for rows, joint, _ in self.grips:
             out[rows] = of(*(base if joint < 0 else self._frames[joint]), rows)
@@ -174,7 +176,9 @@ class Joints:
         """(x, y) where inertia starts from, as of vertices, and where the joints are and how fast they are as the pass ends,
         to its order, of the states now and before; linear in these."""
         (a0, a1), (b0, b1) = self.weights
-        return tuple(m * one + n * other for m, n in ((a0, a1), (b0, b1)) for one, other in ((q, q_before), (v, v_before)))
+        return tuple(
+            m * one + n * other for m, n in ((a0, a1), (b0, b1)) for one, other in ((q, q_before), (v, v_before))
+        )
 
     def begin(self, j: int, stage: Stage, rows: np.ndarray) -> None:
         """Pass j from `now`; rows: of obstacles, which links write into."""
@@ -281,7 +285,7 @@ class Joints:
         )
 
     def _check_firm(self) -> None:
-        """Raise NotConverged where an equilibrium resists no motion of the joints that pieces of the body on links follow."""
+        """Raise NotConverged where an equilibrium resists no motion of joints, which pieces of the body on links follow."""
         columns, K = self.linear
         scale = np.sqrt(np.abs(np.diag(K)) + self.robots.typical)
         if len(self.at):
@@ -293,9 +297,10 @@ class Joints:
             crossed = np.einsum("bid,ida->ab", ways, columns[-1][1])
             K = K + crossed + crossed.T + np.einsum("aid,bid->ab", ways, [self.of_places(w) for w in ways])
         values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
-        if not values[0] > FIRM:
+        firm = max(FIRM, 2 * self.eps)
+        if not values[0] > firm:
             name = np.concatenate([robot.joints for robot in self.robots.terms])[np.argmax(np.abs(vectors[:, 0]))]
-            how = "nothing holds" if values[0] > -FIRM else "the equilibrium is unstable along"
+            how = "nothing holds" if values[0] > -firm else "the equilibrium is unstable along"
             raise NotConverged(f"static solve: {how} joint {str(name)!r} of a robot: {HELD}", [self.left])
 
     def _own_forces(self) -> tuple[np.ndarray, np.ndarray]:

@@ -232,7 +232,12 @@ class JointAdjoint(JointSweep):
         adjoints of numbers. Returns that of gravity."""
         J, w = self.joints, self.w
         _, by_q_n, by_x = self.rows_vjp(rows)
-        e, by_y, by_gravity, (by_q_on, by_v_on) = w + self.by_effort, J.moves * J.M @ w / J.h, np.zeros(3), np.zeros((2, J.count))
+        e, by_y, by_gravity, (by_q_on, by_v_on) = (
+            w + self.by_effort,
+            J.moves * J.M @ w / J.h,
+            np.zeros(3),
+            np.zeros((2, J.count)),
+        )
         by_x = by_x + self._to_x + (by_y + J.c * e - self.by_v) / J.h
         for robot, own in self._each():
             by_q, by_v, by_m, by_g = J.derivatives(robot, own)
