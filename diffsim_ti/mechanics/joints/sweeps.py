@@ -41,7 +41,7 @@ class JointSweep:
         return at, turns[..., 3:]
 
     def rows_jvp(self, dq: np.ndarray, dq_n: np.ndarray, dx: np.ndarray) -> np.ndarray:
-        """Change of the rows for changes of the joints where the pass ends, where it begins and where inertia starts from."""
+        """Change of the rows for changes of the joints where the pass ends and begins, and where inertia starts from."""
         J, rate = self.joints, self.joints.rate
         out, drate = np.zeros((J.a.poses.size, 3)), (dq - dx) / J.h
         for row, turn, carried, t, t_n in self._moments():
@@ -232,12 +232,8 @@ class JointAdjoint(JointSweep):
         adjoints of numbers. Returns that of gravity."""
         J, w = self.joints, self.w
         _, by_q_n, by_x = self.rows_vjp(rows)
-        e, by_y, by_gravity, (by_q_on, by_v_on) = (
-            w + self.by_effort,
-            J.moves * J.M @ w / J.h,
-            np.zeros(3),
-            np.zeros((2, J.count)),
-        )
+        e, by_y, by_gravity = w + self.by_effort, J.moves * J.M @ w / J.h, np.zeros(3)
+        by_q_on, by_v_on = np.zeros((2, J.count))
         by_x = by_x + self._to_x + (by_y + J.c * e - self.by_v) / J.h
         for robot, own in self._each():
             by_q, by_v, by_m, by_g = J.derivatives(robot, own)

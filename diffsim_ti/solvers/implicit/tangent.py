@@ -71,9 +71,8 @@ class ImplicitTangent(RecordedPasses):
         if self.joints:
             self.joints.begin()
             held[ws.joints.at] = self.joints.led()
-            poses = self.joints.rows_jvp(0.0 * self.joints.dq, self.joints.dq, self.joints.dx) + (
-                0.0 if poses is None else poses
-            )
+            poses = 0.0 if poses is None else poses
+            poses = poses + self.joints.rows_jvp(0.0 * self.joints.dq, self.joints.dq, self.joints.dx)
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
         of_obstacles = dict(poses_dot=poses) if ws.pairs and ws.pairs.obstacles else {}
         if surface_friction:
