@@ -293,7 +293,7 @@ class Joints:
             led = np.zeros((len(x), self.count, 1))
             for rows, _, carried in self.grips:
                 led[np.isin(piece, piece[self.at[rows]])] = carried[:, None]
-            ways = np.swapaxes(led * moved(self.S, x), 0, 1) * self.ws.linear
+            ways = np.array([w * self.ws.linear for w in np.swapaxes(led * moved(self.S, x), 0, 1)])
             crossed = np.einsum("bid,ida->ab", ways, columns[-1][1])
             K = K + crossed + crossed.T + np.einsum("aid,bid->ab", ways, [self.of_places(w) for w in ways])
         values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
