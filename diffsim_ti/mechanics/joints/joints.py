@@ -248,7 +248,7 @@ class Joints:
     def end(self) -> None:
         """The pass is over. Raises NotConverged where the joints are not in balance, or nothing holds them at rest."""
         if not self.moves:
-            self._check_firm()
+            self.check_firm()
         if not self.left <= max(self.ws.solver.tolerance, self.loose):
             remedy = "take smaller steps" if self.moves else HELD
             raise NotConverged(
@@ -284,10 +284,13 @@ class Joints:
             self.q_on[own], self.v_on[own], self.acceleration[own], self.masses[own], self.gravity
         )
 
-    def _check_firm(self) -> None:
-        """Raise NotConverged where an equilibrium resists no motion of joints, which pieces of the body on links follow."""
+    def check_firm(self, R: np.ndarray | None = None) -> None:
+        """Raise NotConverged where an equilibrium resists no motion of joints, which pieces of the body on links follow.
+
+        R: what acts on vertices where one is looked for [N]: what that pulls may come to be held."""
         columns, K = self.linear
         scale = np.sqrt(np.abs(np.diag(K)) + self.robots.typical)
+        pull = np.zeros(self.count)
         if len(self.at):
             x, piece = self.places(self.p.held_at)[0], pieces(self.ws.scene.mesh)
             led = np.zeros((len(x), self.count, 1))
@@ -296,9 +299,12 @@ class Joints:
             ways = np.array([w * self.ws.linear for w in np.swapaxes(led * moved(self.S, x), 0, 1)])
             crossed = np.einsum("bid,ida->ab", ways, columns[-1][1])
             K = K + crossed + crossed.T + np.einsum("aid,bid->ab", ways, [self.of_places(w) for w in ways])
+            if R is not None:
+                pull = np.einsum("aid,id->a", ways, R)
         values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
-        firm = max(FIRM, 2 * self.eps)
-        if not values[0] > firm:
+        firm, away = max(FIRM, 2 * self.eps), abs(vectors[:, 0] @ (pull / scale)) / (np.abs(vectors[:, 0]) @ scale)
+        seeks = R is not None and (values[0] < -firm or away > 1e-3 * firm)
+        if not (values[0] > firm or seeks):
             name = np.concatenate([robot.joints for robot in self.robots.terms])[np.argmax(np.abs(vectors[:, 0]))]
             how = "nothing holds" if values[0] > -firm else "the equilibrium is unstable along"
             raise NotConverged(f"static solve: {how} joint {str(name)!r} of a robot: {HELD}", [self.left])

@@ -312,6 +312,9 @@ class ImplicitWorkspace(PrescribedInPasses):
 
         starts: where inertia leads, and where velocities do; problem: mass, inertial, loads of `Newton.solve`.
         """
+        if self.joints and stage.static:
+            self.potential.place(u)
+            self.joints.check_firm(self.newton.balance(u, *problem)[0])
         starts = [held_as(self.free, held, self.rigid.nearest(u + self.linear * (start - u))) for start in starts]
         near = self.approach(u, held, starts, problem)
         near = self.closing.approached(near, problem) if self.solver.loose else near
@@ -324,6 +327,9 @@ class ImplicitWorkspace(PrescribedInPasses):
         except NotConverged as error:
             if not parts or self.newton.report.cuts and not stage.static:
                 raise
+            if self.joints and stage.static:  # which nothing has come to hold
+                self.potential.place(u)
+                self.joints.check_firm(0 * u)
             return LoadStepping(self)(j, stage, u, held, problem, error)
 
     def check_upright(self, u, there) -> None:
