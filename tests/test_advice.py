@@ -353,7 +353,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("mechanics/robots.py", "far from the origin in float32"): "test_robots.py",
     ("mechanics/robots.py", "leave out reduced= and Tie"): "test_robots.py",
     ("mechanics/robots.py", 'leave out contact="force"'): "test_robots.py",
-    ("mechanics/robots.py", "is for backward Euler steps alone"): "test_robots.py",
+    ("mechanics/robots.py", "whose steps end in half a kick"): "test_robots.py",
     ("mechanics/robots.py", "does not go with SelfContact"): "test_robots.py",
     ("mechanics/robots.py", "are held by two links"): "test_robots.py",
     ("mechanics/joints/joints.py", "needs forces with symmetric derivatives"): "test_robots.py",

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 CANCELS = 1.5  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
 CANCEL = "errors of the {} cancel"  # how its note begins
 FELT = 1e-6  # of the number's change: what is less is left over by solvers
-# estimates were at least 0.7 times the error of problems with known answers (examples/benchmarks/error_bars.py), so that they
-# missed this share of what they are made of
+# estimates were at least 0.7 times the error of problems with known answers (examples/benchmarks/error_bars.py): what they
+# missed is at most this share of them
 MISSED = 1 / 0.7 - 1
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
 PER_VERTEX = ("positions", "velocities", "displacements")  # outputs that count vertices, of which a finer mesh has more

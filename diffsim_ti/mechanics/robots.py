@@ -12,7 +12,8 @@ SOFT = 1e-4  # of the range of a joint, on which its limits grow stiff
 
 
 class Robots(Interaction):
-    """Their joints are unknowns of backward Euler steps (joints/joints.py), and of explicit ones (joints/explicit.py)."""
+    """Their joints are unknowns of implicit steps and equilibria (joints/joints.py), and of explicit steps
+    (joints/explicit.py)."""
 
     name, kinds, works, on_host, in_kernels = "robots", (Robot,), "robots", False, False
     derived = dict(joints="vectors2")
@@ -39,8 +40,8 @@ class Robots(Interaction):
     def check_solver(self, solver) -> None:
         if not solver.moves_robots:
             raise ValueError(
-                f"{type(solver).__name__}: robots move in backward Euler and explicit steps: take ImplicitEulerSolver, "
-                "SemiImplicitSolver or VelocityVerletSolver"
+                f"{type(solver).__name__}: robots move in steps that end where forces are taken: take BDF2Solver or "
+                "ImplicitEulerSolver"
             )
         if solver.explicit and solver.contact == "force" and any(term.companions for term in self.terms):
             raise ValueError('links of robots act in a stage of explicit steps: leave out contact="force"')
@@ -51,8 +52,11 @@ class Robots(Interaction):
         if self.scene.reduced:
             raise ValueError("robots do not support reduced sets and ties beside them: leave out reduced= and Tie")
         held = [vertices for term in self.terms for _, vertices in term.holds]
-        if held and (solver.explicit or solver.order > 1):
-            raise ValueError("attached= of a robot is for backward Euler steps alone: take ImplicitEulerSolver")
+        if held and solver.explicit and not solver.last_frame_is_state:
+            raise ValueError(
+                f"attached= of a robot is not for {type(solver).__name__}, whose steps end in half a kick: take "
+                "SemiImplicitSolver"
+            )
         if held and (
             self.scene.holds_volumes or any(t.primitives or isinstance(t, SelfContact) for t in self.scene.terms)
         ):

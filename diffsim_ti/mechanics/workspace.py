@@ -263,4 +263,4 @@ class Workspace:
     def note_joints(self, frame: int, history: History, slot: int) -> None:
         """A frame has the joints of a slot."""
         if self.joints and frame >= 0:
-            self.joint_frames[frame] = np.stack(history.joints[slot], 1)
+            self.joint_frames[frame] = np.stack(history.joints[slot][:3], 1)

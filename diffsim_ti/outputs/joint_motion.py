@@ -156,9 +156,7 @@ class LinkEnergy(JointPositions):
         M, _ = model.dynamics(q, 0 * v, masses, none)
         _, weight = model.dynamics(q, 0 * v, masses, g)
         by_q, _, by_masses, _ = model.derivatives(q, 0 * v, v, masses, none)
-        c = np.array(
-            [t + rotations.turned(turn, i.lever) for (turn, t), i in zip(model.kinematics(q)[0], model.inertias)]
-        )
+        c = model.centres(q)
         motion = 0.5 * v @ M @ v, (0.5 * v @ by_q, M @ v, 0.5 * v @ by_masses, none)
         place = -masses @ c @ g, (weight, 0 * v, -c @ g, -masses @ c)
         both = [(x, [(of, lambda by=by: by) for of, by in zip(numbers, slopes)]) for x, slopes in (motion, place)]

@@ -280,7 +280,7 @@ class Simulator(metaclass=Public):
     def joint_states(self) -> np.ndarray | None:
         """Positions, velocities and efforts of the joints of all robots, shape (joints, 3); None without robots."""
         joints = self.workspace.state.joints[0]
-        return None if joints is None else np.stack(joints, 1)
+        return None if joints is None else np.stack(joints[:3], 1)
 
     @property
     def _has_before(self) -> bool:
@@ -297,7 +297,7 @@ class Simulator(metaclass=Public):
         if state.z is not None:
             out["law_state"] = self.law_state
         if self.joint_states is not None:
-            out["joint_states"] = self.joint_states
+            out["joint_states"] = np.stack(state.joints[0], 1)
         if self._has_before and not state.fresh[0]:
             before = (runtime.fetch(x)[0] for x in (state.before.u, state.before.v))
             out["displacements_before"], out["velocities_before"] = before

@@ -22,7 +22,7 @@ class BDF2Solver(ImplicitSolver):
     """
 
     order = 2
-    multistep = True
+    multistep = moves_robots = True
     may_gain_energy = True
 
     def stage(self, rate, fresh, j):

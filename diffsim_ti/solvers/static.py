@@ -36,7 +36,7 @@ class StaticSolver(ImplicitSolver):
     -0.050 m
     """
 
-    order = 0
+    order, moves_robots = 0, True
     arguments = ("load_steps", "tolerance", "max_iterations", "dt", "parallel", "preconditioner")
 
     def __init__(

@@ -17,7 +17,7 @@ class History:
         n = arrays.num_vertices
         self.num_slots = num_slots
         self.beside: list = [None] * num_slots  # what solvers keep with each state
-        self.joints: list = [None] * num_slots  # positions, velocities and efforts of the joints of robots
+        self.joints: list = [None] * num_slots  # of robots: `Joints.start`
         self.u = runtime.array(arrays.vector, num_slots, n)
         self.v = runtime.array(arrays.vector, num_slots, n)
         self.f = runtime.array(arrays.vector, num_slots, n) if record else runtime.array(arrays.vector, 1, 1)

@@ -8,6 +8,9 @@ each w anew: vertices are eliminated. With Phi of the joints alone (terms/robots
 
 is solved for w by Newton's method: links move by J A^-1 J^T times what vertices do to them in the same pass. What one gets
 the other loses, to round-off, whatever is left of this equation. Fixed vertices do not stop links.
+
+Vertices that links hold are kicked like all, to velocities v*, and then go where links have them, y(q), at d = (y(q + h w) -
+y(q)) / h: joints feel J^T m (d - v*), which joins the equation. All of P counts in it, b = 1, so that v' = w and d stays.
 """
 
 import weakref
@@ -18,12 +21,13 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.errors import NotConverged
-from diffsim_ti.mechanics.joints.joints import Joints, balanced, moved
+from diffsim_ti.mechanics.joints.joints import Joints, moved
 from diffsim_ti.mechanics.joints.sweeps import JointAdjoint, JointSweep, JointTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.history import History
 from diffsim_ti.state.numbers import Tangent
+from diffsim_ti.state.stage import Stage as Pass
 
 ROUNDS = 100
 
@@ -40,6 +44,16 @@ class ExplicitJoints(Joints):
         self.w, self.q = w, self.q_n + self.h * w
         self.put_rates(rows, w)
 
+    def put_rates(self, rows: np.ndarray, w: np.ndarray) -> None:
+        self._put_rates(rows, w)
+
+    def own_forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(-dPhi/dq, sizes of what it adds up, what digits of places leave)"""
+        return *self._own_forces(), self._rounding()
+
+    def effort(self) -> np.ndarray:
+        return sum(self._efforts())
+
 
 class JointStage(Stage):
     """The stage. `met`: (w, whether links touched) of each recorded pass, by its slot."""
@@ -48,7 +62,7 @@ class JointStage(Stage):
         self.ws, a = weakref.proxy(ws), ws.arrays
         self.joints = ExplicitJoints(ws)
         self.rows, self.met = np.zeros((a.poses.size, 3)), {}
-        self.blend = 0.5 + 0.5 * ws.solver.contact_damping
+        self.blend = 1.0 if len(self.joints.at) else 0.5 + 0.5 * ws.solver.contact_damping
         links = [k for k, _ in self.joints.links]
         self.own = np.ravel([[2 * k, 2 * k + 1] for k in links]).astype(int)  # their rows of impulses
         self.carried = np.array([carried for _, carried in self.joints.links], float).reshape(-1, self.joints.count)
@@ -64,9 +78,12 @@ class JointStage(Stage):
         """Joints stand where the pass begins."""
         J, self.at = self.joints, at
         J.now, J.u_n = at.history.joints[at.slot], runtime.fetch_row(at.history.u, at.slot)
-        J.begin(at.j, SimpleNamespace(gamma=at.now.h), self.rows)
+        J.begin(at.j, Pass(at.now.h), self.rows)
         self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
-        self._note(np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3)))
+        self.m, self.y_n, self.v_star = self.ws.mass[J.at], J.carried(J.q_n), np.zeros((len(J.at), 3))
+        self.J_n = J.ways(J.S_n, self.y_n)  # of vertices that links hold
+        self.near, self.given = np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3))
+        self.wrenches = self.wrenches_of(self.given)
 
     def go(self, w: np.ndarray) -> None:
         """Links move with w in the pass; nothing is noted of it."""
@@ -85,34 +102,45 @@ class JointStage(Stage):
             return
         self.begin(at)
         self.go(J.v_n)
-        self.find()
+        if not len(J.at):
+            self.find()
         history.copy(at.slot, self.pair, 0)
         yield
-        touches = bool(self.own.size) and self.look()
-        if touches:
+        touches = bool(self.own.size) and (self.look() or len(J.at) > 0)
+        if touches or len(J.at):
             copy_slot(history.f, at.slot, self.pair.f, 0)
-            for source, target in ((self.pair.u, history.u), (self.pair.v, history.v)):
+            states = (self.pair.u, history.u), (self.pair.v, history.v)
+            for source, target in states:
                 copy_slot(target, at.end, source, 1)
-            self.find(meets=True)
-            for source, target in ((self.pair.u, history.u), (self.pair.v, history.v)):
+            self.find(meets=touches)
+            for (source, target), row in zip(states, (J.carried(J.q) - ws.arrays.values.rest[J.at], self.chord)):
+                if len(J.at):
+                    x = runtime.fetch(source)
+                    x[1, J.at] = row
+                    runtime.fill(source, x)
                 copy_slot(source, 1, target, at.end)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
-        history.joints[at.end] = J.q, J.w - self.rebound(), sum(J.efforts())
-        self.met[at.end] = J.w, touches
+        history.joints[at.end] = J.q, J.w - self.rebound(), J.effort(), J.q_n, J.v_n
+        self.met[at.end] = J.w, touches, self.v_star
+
+    @property
+    def chord(self) -> np.ndarray:
+        """Velocities in the pass of vertices that links hold [m/s]."""
+        return (self.joints.carried(self.joints.q) - self.y_n) / self.joints.h
+
+    @property
+    def pull(self) -> np.ndarray:
+        """What links give these vertices [N s]."""
+        return self.m * (self.chord - self.v_star)
 
     def look(self) -> bool:
         """Note what links have done to vertices, and say whether that is anything."""
         impulses = runtime.look(self.ws.impulses.impulse)
-        near = np.flatnonzero(impulses[self.own].any((0, 2)))
-        self._note(near, impulses[:, near].astype(np.float64))
-        return bool(near.size)
-
-    def _note(self, near: np.ndarray, given: np.ndarray) -> None:
-        """near: vertices that links touch, at x where the pass begins; given: what all obstacles give them."""
-        J, self.near, self.given = self.joints, near, given
-        self.x = J.a.values.rest[near] + J.u_n[near]
-        self.wrenches = self.wrenches_of(given)
+        self.near = np.flatnonzero(impulses[self.own].any((0, 2)))
+        self.given = impulses[:, self.near].astype(np.float64)
+        self.wrenches = self.wrenches_of(self.given)
+        return bool(self.near.size)
 
     def launch(self, name: str, **numbers) -> None:
         """A kernel on the vertices, from the first state of the pair to the second."""
@@ -128,10 +156,11 @@ class JointStage(Stage):
     def wrenches_of(self, impulses: np.ndarray) -> np.ndarray:
         """Sums of impulses of each link, and of their moments about the origin, shape (links, 2, 6)."""
         own = impulses[self.own]
-        return np.concatenate([own.sum(1), np.cross(self.x, own).sum(1)], 1).reshape(-1, 2, 6)
+        x = self.joints.places(self.joints.u_n)[1][self.near]
+        return np.concatenate([own.sum(1), np.cross(x, own).sum(1)], 1).reshape(-1, 2, 6)
 
-    def on_joints(self, wrenches: np.ndarray) -> np.ndarray:
-        """What they do to joints, by push and by friction, shape (2, joints): J^T."""
+    def felt(self, wrenches: np.ndarray) -> np.ndarray:
+        """What joints feel of them, by push and by friction, shape (2, joints): J^T."""
         return np.einsum("la,ad,lkd->ka", self.carried, self.joints.S_n, wrenches)
 
     def bent(self) -> np.ndarray:
@@ -139,60 +168,88 @@ class JointStage(Stage):
         turns = self.joints.turns(self.joints.S_n)
         return np.einsum("la,lb,bad,lkd->kba", self.carried, self.carried, turns, self.wrenches)
 
-    def weighed(self, acting: np.ndarray) -> np.ndarray:
+    def bent_by_held(self) -> np.ndarray:
+        """How what joints feel of vertices that links hold changes as joint b turns where the pass begins, [b, a]."""
+        J, out = self.joints, np.zeros((self.joints.count, self.joints.count))
+        turns, pull = J.turns(J.S_n), self.pull
+        for rows, _, carried in J.grips:
+            force, moment = pull[rows].sum(0), np.cross(self.y_n[rows], pull[rows]).sum(0)
+            out += (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
+        return out
+
+    def weighed(self, felt: np.ndarray) -> np.ndarray:
         """What counts of it in the equation of w."""
-        return self.blend * acting[0] + acting[1]
+        return self.blend * felt[0] + felt[1]
 
     def left(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(what is left of that equation, by its sign a force, sizes of what it adds up, what digits of places leave)"""
+        """(what is left of that equation, sizes of what it adds up, what digits of places leave)"""
         J = self.joints
-        own, size = J.own_forces()
-        given = np.abs(self.given[self.own])
-        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(self.x), given)).sum(1)], 1).reshape(-1, 2, 6)
+        own, size, noise = J.own_forces()
+        x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
+        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
-        return J.h * own - self.weighed(self.on_joints(self.wrenches)), J.h * size + met, J.h * J.rounding()
+        F = self.weighed(self.felt(self.wrenches)) - J.h * own + np.einsum("iad,id->a", self.J_n, self.pull)
+        speeds = np.abs(self.chord) + np.abs(self.v_star), 1e-15 * np.abs(self.y_n) / J.h
+        held, rounding = (np.einsum("iad,id->a", np.abs(self.J_n), self.m * x) for x in speeds)
+        return F, J.h * size + met + held, J.h * noise + rounding
 
     def find(self, meets: bool = False) -> None:
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
-        J = self.joints
-
-        def stand(w):
-            self.go(w)
-            if meets:
-                self.launch("press")
-                self.look()
-            return self.left()
-
-        def direction(R):
-            step, w = np.linalg.solve(self.slope(meets), R), J.w
-            if not step @ R > 0:  # which friction alone can do
-                step = np.linalg.solve(self.slope(), R)
-            return step, 1.0, lambda t: stand(w + t * step)
-
-        R, size, noise = balanced(self.left(), direction, max(1e-14, 4 * J.eps), J.loose, ROUNDS)
-        share = float(np.max(np.abs(R) / (size + noise / J.loose)))
+        self.v_star = runtime.fetch_row(self.pair.v, 1)[self.joints.at]
+        J, (F, size, noise), best, stalled = self.joints, self.left(), np.inf, 0
+        for _ in range(ROUNDS):
+            share = float(np.max(np.abs(F) / (max(1e-14, 4 * J.eps) * size + noise)))
+            stalled = 0 if share < 0.5 * best else stalled + 1
+            if share <= 1 or (stalled > 3 and np.all(np.abs(F) <= J.loose * size + noise)) or stalled > 20:
+                break
+            best = min(best, share)
+            step = -np.linalg.solve(self.slope(meets), F)
+            if not step @ F < 0:  # which friction alone can do
+                step = -np.linalg.solve(self.slope(), F)
+            w, slope, t = J.w, step @ F, 1.0
+            while True:
+                self.go(w + t * step)
+                if meets:
+                    self.launch("press")
+                    self.look()
+                    self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
+                F, size, noise = self.left()
+                if step @ F <= -J.falls * slope or t < 1e-12:
+                    break
+                t *= 0.5
+        share = float(np.max(np.abs(F) / (size + noise / J.loose)))
         if not share <= J.loose:
             remedy = "take smaller steps, or begin with links outside of the body"
             error = NotConverged(f"joints of robots are out of balance by {share:.2g}: {remedy}", [share])
             raise self.ws.dated(error, self.at.j, self.at.num_passes)
-        J.w = J.w + np.linalg.solve(self.slope(), R)  # so that momentum is kept to round-off
+        J.w = J.w - np.linalg.solve(self.slope(), F)  # so that momentum is kept to round-off
         J.q = J.q_n + J.h * J.w
 
     def slope(self, meets: bool = False) -> np.ndarray:
         """Derivative of the equation by w, or of its part without contact."""
         J = self.joints
         own = J.M + J.h**2 * np.diag(J.yielding)
-        return own + self.weighed(self.answers()) if meets else own
+        if len(J.at):
+            own = own + np.einsum("iad,ibd->ab", self.m[..., None] * self.J_n, self.J_end)
+        return own + self.weighed(self.answers()) - self.follows if meets else own
+
+    @property
+    def J_end(self) -> np.ndarray:
+        """How joints move vertices that links hold where the pass ends."""
+        J = self.joints
+        return J.ways(J.kinematics(J.q)[1], J.carried(J.q))
 
     def rebound(self) -> np.ndarray:
         """(1 - b) A^-1 J^T P"""
-        return (1 - self.blend) * np.linalg.solve(self.inertia, self.on_joints(self.wrenches)[0])
+        return (1 - self.blend) * np.linalg.solve(self.inertia, self.felt(self.wrenches)[0])
 
     def answers(self) -> np.ndarray:
-        """Changes of what acts on joints, by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
-        displacements, velocities and impulses of the vertices that are near."""
+        """Changes of what joints feel by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
+        displacements, velocities and impulses of the vertices that are near; follows: by what v* of those that links hold
+        changes."""
         J, change = self.joints, self.change
-        out = np.zeros((2, J.count, J.count))
+        out, self.follows = np.zeros((2, J.count, J.count)), np.zeros((J.count, J.count))
+        near, held = np.nonzero(self.near[:, None] == J.at)
         touched = self.wrenches.any((1, 2))
         self.moves = []
         for b in np.flatnonzero(self.carried[touched].any(0)):
@@ -203,8 +260,9 @@ class JointStage(Stage):
             self.launch("press_jvp", rate_dot=0.0)
             du, dv = (runtime.fetch_row(x, 0)[self.near] for x in (change.u, change.v))
             given = runtime.look(change.impulse)[:, self.near].astype(np.float64)
-            out[:, :, b] = self.on_joints(self.wrenches_of(given))
+            out[:, :, b] = self.felt(self.wrenches_of(given))
             self.moves.append((b, du, dv, given))
+            self.follows[:, b] = np.einsum("iad,id->a", self.J_n[held], self.m[held] * dv[near])
         return out
 
     # ---- what derivatives need -----------------------------------------------------------------------------------------
@@ -212,7 +270,7 @@ class JointStage(Stage):
     def reopen(self, at: Passes) -> bool:
         """Stand in a recorded pass; whether links touched in it, of which all is noted then."""
         self.begin(at)
-        J, (w, touches) = self.joints, self.met[at.end]
+        J, (w, touches, self.v_star) = self.joints, self.met[at.end]
         self.go(w)
         J.S = J.kinematics(J.q)[1]
         if not touches:
@@ -251,35 +309,45 @@ class JointStageTangent(Stage):
             yield
             return
         touches, h = stage.reopen(at), at.now.h
+        own.begin()
         du_n = runtime.fetch_row(run.u, 0)
         if stage.own.size:
-            runtime.fill(run.offsets, own.rows_jvp(own.dq, own.dq))
+            runtime.fill(run.offsets, own.rows_jvp(own.dq, own.dq, own.dq))
             runtime.clear([run.impulses.impulse])
         yield
         dF = stage.slope() @ own.dq / h - h * own.force()  # for w as it is
+        u, v, at_held = runtime.fetch(run.u), runtime.fetch(run.v), J.at
+        led_n, led = (J.from_joints(q, own.dlocal) for q in (J.q_n, J.q))
+        dy_n, dm = np.einsum("iad,a->id", stage.J_n, own.dq) + led_n, ws.mass_of(own.tangent)[at_held]
+        dpull = dm * (stage.chord - stage.v_star) + stage.m * ((led - dy_n) / h - v[0, at_held])
+        turned = np.cross(J.holding * J.S_n[:, 3:], dy_n[:, None])
+        dF = dF + np.einsum("iad,id->a", stage.J_n, dpull) + np.einsum("iad,id->a", turned, stage.pull)
+        dF = dF + own.dq @ stage.bent_by_held()
         if touches:
             near, answers, z = stage.near, stage.answers(), stage.rebound()
             given = runtime.fetch(run.impulses.impulse).astype(np.float64)
             wrenches = stage.wrenches_of(given[:, near])
             dx = (du_n + own.tangent.rest)[near]
             wrenches[..., 3:] += np.cross(dx, stage.given[stage.own]).sum(1).reshape(-1, 2, 3)
-            acting = stage.on_joints(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
-            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers), dF + stage.weighed(acting))
-            acting = acting[0] + answers[0] @ dw
+            felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
+            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers) - stage.follows, dF + stage.weighed(felt))
+            felt = felt[0] + answers[0] @ dw
             _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
             by_q, by_m = stage.mass_derivatives(z)
             dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
-            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * acting - dA)
-            u, v = runtime.fetch(run.u), runtime.fetch(run.v)
+            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * felt - dA)
             for b, du_b, dv_b, given_b in stage.moves:
                 u[0, near] += du_b * dw[b]
                 v[0, near] += dv_b * dw[b]
                 given[:, near] += given_b * dw[b]
-            runtime.fill(run.u, u)
-            runtime.fill(run.v, v)
             runtime.fill(run.impulses.impulse, given)
         else:
             dw = dv = -np.linalg.solve(stage.slope(), dF)
+        if touches or len(at_held):
+            dy = np.einsum("iad,a->id", stage.J_end, own.dq + h * dw) + led
+            u[0, at_held], v[0, at_held] = dy - own.tangent.rest[at_held], (dy - dy_n) / h
+            runtime.fill(run.u, u)
+            runtime.fill(run.v, v)
         if stage.own.size:
             run.impulses.note_pass(at.numbers["counted"])
         own.step(own.dq + h * dw)
@@ -300,7 +368,11 @@ class JointStageAdjoint(JointAdjoint):
         if not self.ws.solver.last_frame_is_state:  # its last pass shows the last frame
             self.clear()
         a = self.ws.arrays
-        self.by_rest, self.by_gravity = np.zeros((a.num_vertices, 3)), np.zeros(3)
+        self.by_rest, self.by_gravity, self.by_mass = (
+            np.zeros((a.num_vertices, 3)),
+            np.zeros(3),
+            np.zeros(a.num_vertices),
+        )
         self.by_steps = SimpleNamespace(joints=np.zeros_like(a.rows["joints"]))
 
     @contextmanager
@@ -315,27 +387,42 @@ class JointStageAdjoint(JointAdjoint):
         touches, h, rows = stage.reopen(at), at.now.h, np.zeros_like(stage.rows)
         seeds = run.impulses.of_frame(at.numbers["counted"]) if stage.own.size else 0.0
         by_w, K = h * (self.by_q - J.yielding * self.by_effort) + self.by_v, stage.slope()
-        if touches:
+        self._to_q_n, by_x = np.zeros(J.count), np.zeros_like(self.by_rest)
+        if touches or len(J.at):
             run.complete()
+            p, q = runtime.fetch_row(run.u, 0), runtime.fetch_row(run.v, 0)
+            by_end, by_begin = p[J.at] + q[J.at] / h, -q[J.at] / h  # of where links have the vertices that they hold
+            self.by_rest[J.at] -= p[J.at]
+            p[J.at], q[J.at] = 0.0, 0.0
+            by_w = by_w + h * np.einsum("iad,id->a", stage.J_end, by_end)
+        if touches:
             near, answers, z = stage.near, stage.answers(), stage.rebound()
-            K = K + stage.weighed(answers)
+            K = K + stage.weighed(answers) - stage.follows
             eased = np.linalg.solve(stage.inertia, self.by_v)
             by_push = (stage.blend - 1) * eased
             by_w = by_w + by_push @ answers[0]
-            p, q = runtime.fetch_row(run.u, 0)[near], runtime.fetch_row(run.v, 0)[near]
             seeded = seeds[:, near] if np.ndim(seeds) else 0.0
             for b, du_b, dv_b, given_b in stage.moves:
-                by_w[b] += (p * du_b).sum() + (q * dv_b).sum() + (seeded * given_b).sum()
+                by_w[b] += (p[near] * du_b).sum() + (q[near] * dv_b).sum() + (seeded * given_b).sum()
         w = np.linalg.solve(K.T, by_w)
-        self.w, self._to_q_n, by_x = h * w, np.zeros(len(w)), np.zeros_like(self.by_rest)
+        self.w = h * w
+        if len(J.at):
+            moved_by, turn = np.einsum("iad,a->id", stage.J_n, w), (J.holding * J.S_n[:, 3:] * w[:, None]).sum(1)
+            q[J.at] = stage.m * moved_by
+            by_end, by_begin = by_end - q[J.at] / h, by_begin + q[J.at] / h - np.cross(stage.pull, turn)
+            self.by_mass[J.at] -= (moved_by * (stage.chord - stage.v_star)).sum(1)
+            self._to_q_n += np.einsum("iad,id->a", stage.J_n, by_begin) - stage.bent_by_held() @ w
+            self.by_local += J.to_joints(J.q, by_end) + J.to_joints(J.q_n, by_begin)
+            runtime.fill(run.u, p[None])
+            runtime.fill(run.v, q[None])
         if touches:
-            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what acts on joints
+            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what joints feel
             seeds = self._with(seeds, by)
             own = stage.carried[:, None] * by  # (links, 2, joints)
             turn = np.repeat((own @ J.S_n[:, 3:]).reshape(-1, 1, 3), len(near), 1)
             by_x[near] = np.cross(stage.given[stage.own], turn).sum(0)
             by_q, by_m = stage.mass_derivatives(z)
-            self._to_q_n = np.einsum("kba,ka->b", stage.bent(), by) + eased @ by_q
+            self._to_q_n += np.einsum("kba,ka->b", stage.bent(), by) + eased @ by_q
             self.numbers[4] += eased @ by_m
             self.numbers[3] += h * eased * z
             self.numbers[2] += np.where(J.robots.prescribed, 0.0, h**2 * eased * z)
@@ -352,10 +439,10 @@ class JointStageAdjoint(JointAdjoint):
             self.add_frame(frame)
 
     def _with(self, seeds, by: np.ndarray) -> np.ndarray:
-        """Adjoints of all impulses, with those by what acts on joints."""
+        """Adjoints of all impulses, with those by what joints feel."""
         stage, J = self.stage, self.joints
         out = np.zeros((2 * len(stage.ws.arrays.obstacles), *self.by_rest.shape)) + seeds
-        arms = moved(J.S_n, stage.x)  # (near, joints, 3)
+        arms = moved(J.S_n, J.places(J.u_n)[1][stage.near])  # (near, joints, 3)
         for link, k in enumerate(stage.own[::2] // 2):
             for side in range(2):
                 out[2 * k + side, stage.near] += np.einsum("a,iad->id", stage.carried[link] * by[side], arms)
@@ -364,8 +451,11 @@ class JointStageAdjoint(JointAdjoint):
     def collect(self, out) -> None:
         """Add what was summed up."""
         super().collect(out)
-        gravity_adj = self.ws.arrays.gravity_of(out)
-        gravity_adj += self.by_gravity
+        at = self.ws.arrays.features().gravity
+        if at >= 0:
+            out.parameters[at : at + 3] += self.by_gravity
         out.joints += self.by_steps.joints
+        if out.mass is not None:
+            out.mass = out.mass + self.by_mass
         if out.rest is not None:
             out.rest = out.rest + self.by_rest

@@ -1,8 +1,10 @@
 """The joints of a scene's robots in implicit passes: eliminated from Newton's equations, with tangent and adjoint.
 
 For each displacement u of the body the joint positions q(u) minimise the incremental potential (terms/robots/robot.py) by
-Newton's method, from where they are on a way that meets no vertex. So forces on the body are those of Phi(u, q(u)), and its
-Hessian is the Schur complement K_uu - K_uq K_qq^-1 K_qu, of rank as many as there are joints less than K_uu.
+Newton's method, from where they are on a way that meets no vertex. Numbers of a pass are those of its solver
+(solvers/implicit/solver.py); at rest there is no inertia, and weight is that at q. So forces on the body are those of
+Phi(u, q(u)), and its Hessian is the Schur complement K_uu - K_uq K_qq^-1 K_qu, of rank as many as there are joints less than
+K_uu.
 
 Of a link, a vertex at x has the barrier's force f and -df/dx = H, and friction's f' and -df'/du = F. A joint a moves the
 link's point there by J_a = v_a + w_a x x. Since turning link and vertex together turns f,
@@ -13,7 +15,7 @@ link's point there by J_a = v_a + w_a x x. Since turning link and vertex togethe
 J' being taken at the place where the step begins, from which friction takes its arm.
 
 Vertices that a link holds move with it, u_a = y(q) - X, and are no unknowns of their own. With R_a what acts on them, less
-their inertia, and J = dy/dq, J^T R_a acts on the joints, and to K come, u being the other vertices,
+their inertia, and J = dy/dq, the joints feel J^T R_a, and to K come, u being the other vertices,
 
     K_uq += K_ua J,    K_qq += J^T K_aq + K_qa J + J^T K_aa J - R_a . dJ/dq.
 """
@@ -30,59 +32,21 @@ from diffsim_ti.common import rotations
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mechanics.obstacles.contact_record import Shares
 from diffsim_ti.mechanics.robots import Robots
+from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.state.numbers import Tangent
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
+from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms.robots.model import bracket
 
 STIFF = 1e6  # of a prescribed joint's drive, and of a limit, over inertia / h^2
-FALLS = 0.8  # how steeply Phi may rise along a step where it ends, against how it fell
+AT_REST = 0.01  # [s], h of these in equilibria
+FIRM = 1e-9  # stiffness of what is held in an equilibrium, over the largest that a joint meets, or inertia / s^2
+HELD = "hold the joint by drive_stiffness, prescribe it, or take a solver with inertia"
 
 
 def moved(S: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Velocities at points of twists S, shape (..., joints, 3), of points of shape (..., 3)."""
     return S[:, :3] + np.tensordot(x, rotations.skew(S[:, 3:]), (-1, 2))
-
-
-def moved_jvp(S: np.ndarray, dx: np.ndarray) -> np.ndarray:
-    """Their change as the points move by dx, shape (k, 3)."""
-    return np.cross(S[:, 3:], dx[:, None])
-
-
-def on_joints(J: np.ndarray, f: np.ndarray) -> np.ndarray:
-    """J^T f: what forces on points, shape (k, 3), do on joints that move these by J, shape (k, joints, 3)."""
-    return np.einsum("iad,id->a", J, f)
-
-
-def by_turns(turns: np.ndarray, carried: np.ndarray, x: np.ndarray, f: np.ndarray) -> np.ndarray:
-    """How J_a^T f of a link changes as joint b turns it, [b, a], for forces f at points x that stay where they are.
-
-    turns: of `Joints.turns`; carried: which joints move the link."""
-    force, moment = f.sum(0), np.cross(x, f).sum(0)
-    return (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
-
-
-def balanced(at: tuple, direction, eps: float, loose: float, most: int) -> tuple:
-    """(R, sizes of what it adds up, what digits leave) where Newton's method, from `at`, finds that R is zero to `eps` of
-    these, or, once it gains no more, to `loose`.
-
-    direction(R): (step, share of it that is tried first, t -> (R, ...) at that share). A share is good where R along the
-    step has not turned round to more than FALLS of what it was.
-    """
-    (R, size, noise), best, stalled = at, np.inf, 0
-    for _ in range(most):
-        left = float(np.max(np.abs(R) / (eps * size + noise)))
-        stalled = 0 if left < 0.5 * best else stalled + 1
-        if not left > 1 or (stalled > 3 and np.all(np.abs(R) <= loose * size + noise)) or stalled > 20:
-            break
-        best = min(best, left)
-        step, t, go = direction(R)
-        slope = float(R @ step)
-        while True:
-            R, size, noise = go(t)
-            if float(R @ step) >= -FALLS * slope or t < 1e-12:
-                break
-            t *= 0.5
-    return R, size, noise
 
 
 class Pushed(NamedTuple):
@@ -100,6 +64,7 @@ class Joints:
     """Of a workspace, made when its arrays are loaded. q: joint positions [rad or m] that belong to the body's place."""
 
     most = 200  # rounds
+    falls = 0.8  # how steeply Phi may rise along a step where it ends, against how it fell
 
     def __init__(self, workspace):
         self.ws, self.a, self.p = weakref.proxy(workspace), workspace.arrays, workspace.potential
@@ -117,7 +82,7 @@ class Joints:
         self.shares = Shares(workspace) if self.links and self.p else None
         self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
         self.loose = max(1e-6, 1e3 * self.eps)  # of their forces, what rounding of the vertices' places may leave
-        self._known, self._zero, self._held, self._placed, self._back, self._anchor = [None] * 6
+        self._known, self._zero, self._held, self._placed, self._back, self._anchor, self.problem = [None] * 7
         self.q, self.left, self.now = None, 0.0, self.start()
 
     def _take_held(self) -> None:
@@ -135,14 +100,14 @@ class Joints:
                 self.holding = np.concatenate([self.holding, moving])
 
     def start(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(positions, velocities, efforts) where a run begins."""
+        """(positions, velocities, efforts, positions and velocities before) where a run begins."""
         values = self.a.values
         q, v, *_ = self.robots.numbers(values.parameters)
         for robot, own in zip(self.robots.terms, self.slices):
             robot.check_limits(q[own])
         x = (values.rest + values.displacement)[self.at]
         self.local = self._each_held(q, lambda turn, t, rows: rotations.turned(rotations.conjugate(turn), x[rows] - t))
-        return q.copy(), v.copy(), np.zeros(self.count)
+        return q.copy(), v.copy(), np.zeros(self.count), q.copy(), v.copy()
 
     # ---- kinematics --------------------------------------------------------------------------------------------------
 
@@ -159,7 +124,8 @@ class Joints:
 
     def _each_held(self, q: np.ndarray, of) -> np.ndarray:
         """of(quaternion, position, rows) of the joint that carries each link at q, for rows of vertices that it holds."""
-        self.kinematics(q)
+        if self.grips:
+            self.kinematics(q)
         out, base = np.zeros((len(self.at), 3)), (np.eye(1, 4)[0], np.zeros(3))
         for rows, joint, _ in self.grips:
             out[rows] = of(*(base if joint < 0 else self._frames[joint]), rows)
@@ -196,9 +162,9 @@ class Joints:
         """The same with velocities."""
         self.put(rows, q)
         self.poses_n, self.S_n = self.kinematics(q)
-        self.put_rates(rows, v)
+        self._put_rates(rows, v)
 
-    def put_rates(self, rows: np.ndarray, rate: np.ndarray) -> None:
+    def _put_rates(self, rows: np.ndarray, rate: np.ndarray) -> None:
         for (k, carried), (_, t) in zip(self.links, self.poses_n):
             J = moved(self.S_n, t)
             rows[3 * k + RATE] = (rate * carried) @ J
@@ -206,27 +172,55 @@ class Joints:
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 
-    def begin(self, j: int, stage, rows: np.ndarray) -> None:
+    def led_on(self, q, v, q_before, v_before) -> tuple[np.ndarray, ...]:
+        """(x, y) where inertia starts from, as of vertices, and where the joints are and how fast they are as the pass ends,
+        to its order, of the states now and before; linear in these."""
+        (a0, a1), (b0, b1) = self.weights
+        return tuple(
+            m * one + n * other for m, n in ((a0, a1), (b0, b1)) for one, other in ((q, q_before), (v, v_before))
+        )
+
+    def begin(self, j: int, stage: Stage, rows: np.ndarray) -> None:
         """Pass j from `now`; rows: of obstacles, which links write into."""
-        (self.q_n, self.v_n, *_), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
+        (self.q_n, self.v_n, _, *before), self.h, self.rows, a = self.now, stage.gamma, rows, self.a
+        self.moves = 0.0 if stage.static else 1.0  # without which there is neither inertia nor damping
+        r = np.sqrt(-stage.a1 / stage.a0)  # w / (1 + w) of a step that is w times as long as the one before
+        self.weights = (stage.a0, stage.a1), (self.moves / (1 - r), -self.moves * r / (1 - r))
+        self.x, self.y, self.q_on, self.v_on = self.led_on(self.q_n, self.v_n, *before)
         self.poses_n, self.S_n = self.kinematics(self.q_n)
+        self.reach = np.where(self.S_n[:, 3:].any(1), 0.5, np.ptp(a.values.rest, 0).max())  # of a round at rest
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
-        self.gravity = a.gravity_of(a.values).copy()
-        self.M, self.bias = np.zeros((self.count, self.count)), np.zeros(self.count)
-        for robot, own in zip(self.robots.terms, self.slices):
-            numbers = self.q_n[own], self.v_n[own], self.masses[own], self.gravity
-            self.M[own, own], self.bias[own] = robot.model.dynamics(*numbers)
-        schedule, self.j = self.ws.solver.schedule, j
-        self.share = self.ws.share_at_stage(j, stage)
-        given = a.rows["joints"]
-        self.targets = schedule.pressure(given, j, self.share)
-        self.torques = given[schedule.load_row(given, j)][:, 2]
-        self.k = np.where(self.robots.prescribed, STIFF * self.robots.typical / self.h**2, self.k)
-        self.c = self.c + self.robots.damping
-        self.q, self._held, self._placed, self._anchor, self.reach = self.q_n.copy(), None, None, None, 0.0
+        self.load(j, stage)
+        self.stiff = STIFF * self.robots.typical / (self.h if self.moves else AT_REST) ** 2
+        self.k = np.where(self.robots.prescribed, self.stiff, self.k)
+        self.c = self.moves * (self.c + self.robots.damping)
+        self.q, self._held, self._placed, self._anchor, self.felt = self.q_n.copy(), None, None, None, 0.0
         self._back = None
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
-        self.put_rates(rows, np.zeros(self.count))
+        self._put_rates(rows, np.zeros(self.count))
+
+    def load(self, j: int, stage: Stage) -> None:
+        """Take targets, torques and weight of pass j; statics lay on a share of these."""
+        schedule, given, at, self.j = self.ws.solver.schedule, self.a.rows["joints"], self.a.features().gravity, j
+        self.share, self.laid = self.ws.share_at_stage(j, stage), 1.0 if self.moves else self.ws.load_share(j, stage)
+        self.targets = schedule.pressure(given, j, self.share)
+        self.torques = self.laid * given[schedule.load_row(given, j)][:, 2]
+        self.gravity = self.laid * self.a.values.parameters[at : at + 3] if at >= 0 else np.zeros(3)
+        self._weigh()
+        self.forget()
+
+    def _weigh(self) -> None:
+        """Inertia M, and bias b of Coriolis forces and weight, where they are taken."""
+        self.M, self.bias = np.zeros((self.count, self.count)), np.zeros(self.count)
+        for robot, own in zip(self.robots.terms, self.slices):
+            numbers = self.q_on[own], self.v_on[own], self.masses[own], self.gravity
+            self.M[own, own], self.bias[own] = robot.model.dynamics(*numbers)
+
+    def take(self, problem: tuple) -> None:
+        """What is solved: mass, inertial and loads of `Newton.solve`."""
+        if problem is not self.problem:
+            self.problem = problem
+            self.forget()
 
     def hold(self, q: np.ndarray) -> None:
         """Stand at q wherever the body is, as a recorded pass does."""
@@ -252,11 +246,13 @@ class Joints:
             )
 
     def end(self) -> None:
-        """The pass is over. Raises NotConverged where the joints are not in balance."""
+        """The pass is over. Raises NotConverged where the joints are not in balance, or nothing holds them at rest."""
+        if not self.moves:
+            self.check_firm()
         if not self.left <= max(self.ws.solver.tolerance, self.loose):
+            remedy = "take smaller steps" if self.moves else HELD
             raise NotConverged(
-                f"the joints of robots are out of balance by {self.left:.2g} of their forces: take smaller steps",
-                [self.left],
+                f"the joints of robots are out of balance by {self.left:.2g} of their forces: {remedy}", [self.left]
             )
         meets = self.links or len(self.at) and len(self.rows)
         met = self.ws.collisions.detection.nearest(self.p.held_at, self.rows[::3]) if meets else None
@@ -266,32 +262,68 @@ class Joints:
         turned = np.abs(self.q - self.q_n) * np.linalg.norm(self.S_n[:, 3:], axis=1)
         if any(turned @ carried >= np.pi for _, carried in self.links):
             raise NotConverged("a link of a robot turns by more than half a turn: take smaller steps", [self.left])
-        self.now = self.q.copy(), (self.q - self.q_n) / self.h, sum(self.efforts())
+        self.now = self.q.copy(), self.moves * self.rate, sum(self._efforts()), *self.now[:2]
 
     def forget(self) -> None:
         """Rows of obstacles were written by others."""
         self._placed = None
 
     @property
+    def rate(self) -> np.ndarray:
+        """Velocities of the joints as the pass ends."""
+        return (self.q - self.x) / self.h
+
+    @property
     def acceleration(self) -> np.ndarray:
         """Of the joints in the pass."""
-        return (self.q - self.q_n - self.h * self.v_n) / self.h**2
+        return self.moves * (self.rate - self.y) / self.h
 
-    def own_forces(self) -> tuple[np.ndarray, np.ndarray]:
+    def derivatives(self, robot, own: slice) -> tuple[np.ndarray, ...]:
+        """Of inertia and bias of a robot (RobotModel.derivatives), where they are taken."""
+        return robot.model.derivatives(
+            self.q_on[own], self.v_on[own], self.acceleration[own], self.masses[own], self.gravity
+        )
+
+    def check_firm(self, R: np.ndarray | None = None) -> None:
+        """Raise NotConverged where an equilibrium resists no motion of joints, which pieces of the body on links follow.
+
+        R: what acts on vertices where one is looked for [N]: what that pulls may come to be held."""
+        columns, K = self.linear
+        scale = np.sqrt(np.abs(np.diag(K)) + self.robots.typical)
+        pull = np.zeros(self.count)
+        if len(self.at):
+            x, piece = self.places(self.p.held_at)[0], pieces(self.ws.scene.mesh)
+            led = np.zeros((len(x), self.count, 1))
+            for rows, _, carried in self.grips:
+                led[np.isin(piece, piece[self.at[rows]])] = carried[:, None]
+            ways = np.array([w * self.ws.linear for w in np.swapaxes(led * moved(self.S, x), 0, 1)])
+            crossed = np.einsum("bid,ida->ab", ways, columns[-1][1])
+            K = K + crossed + crossed.T + np.einsum("aid,bid->ab", ways, [self.of_places(w) for w in ways])
+            if R is not None:
+                pull = np.einsum("aid,id->a", ways, R)
+        values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
+        firm, away = max(FIRM, 2 * self.eps), abs(vectors[:, 0] @ (pull / scale)) / (np.abs(vectors[:, 0]) @ scale)
+        seeks = R is not None and (values[0] < -firm or away > 1e-3 * firm)
+        if not (values[0] > firm or seeks):
+            name = np.concatenate([robot.joints for robot in self.robots.terms])[np.argmax(np.abs(vectors[:, 0]))]
+            how = "nothing holds" if values[0] > -firm else "the equilibrium is unstable along"
+            raise NotConverged(f"static solve: {how} joint {str(name)!r} of a robot: {HELD}", [self.left])
+
+    def _own_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(-dPhi/dq but for contact, sizes of what it adds up)"""
-        parts = -self.bias, *self.efforts()
+        parts = -self.bias, *self._efforts()
         size = np.abs(self.M) @ np.abs(self.acceleration) + sum(np.abs(part) for part in parts)
         return sum(parts) - self.M @ self.acceleration, size
 
-    def efforts(self) -> tuple[np.ndarray, ...]:
+    def _efforts(self) -> tuple[np.ndarray, ...]:
         """Of torques, drives, damping and limits [N m or N]."""
-        drive, damping = -self.k * (self.q - self.targets), -self.c * (self.q - self.q_n) / self.h
+        drive, damping = -self.k * (self.q - self.targets), -self.c * self.rate
         return self.torques, drive, damping, -self._limits()[1]
 
     def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Energies of the limits of joints, and their first two derivatives: k d^3 / (6 w) of what is beyond by d < w, and
         beyond w with the constant stiffness k; prescribed joints have none."""
-        k, w = np.where(self.robots.prescribed, 0.0, STIFF * self.robots.typical / self.h**2), self.robots.soft
+        k, w = np.where(self.robots.prescribed, 0.0, self.stiff), self.robots.soft
         past = np.maximum(self.q - self.robots.upper, 0) - np.maximum(self.robots.lower - self.q, 0)
         s = np.abs(past) / w
         c = np.minimum(s, 1.0)
@@ -303,30 +335,35 @@ class Joints:
         """How efforts fall as joints move: stiffness of drives, damping and limits."""
         return self.k + self.c / self.h + self._limits()[2]
 
-    def rounding(self) -> np.ndarray:
+    def _rounding(self) -> np.ndarray:
         """Of each joint's own forces, by the digits of their positions."""
         reach = np.abs(self.q) + np.abs(self.q_n) + self.h * np.abs(self.v_n)
         own = 1e-15 * (np.abs(self.M) @ reach / self.h**2 + self.yielding * reach) + 1e-300
-        return own + self.eps * self.reach
+        return own + self.eps * self.felt
 
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
         if self.q is None:
             return np.zeros(1)
         a, d = self.acceleration, self.q - self.q_n
-        inertia = 0.5 * self.h**2 * a @ self.M @ a
-        drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * d**2 / self.h
-        return np.array([inertia, self.bias @ d, drives.sum(), -self.torques @ d, self._limits()[0].sum()])
+        inertia, weight = 0.5 * self.h**2 * a @ self.M @ a, self.bias @ d if self.moves else 0.0
+        for robot, own in zip(self.robots.terms, [] if self.moves else self.slices):
+            weight -= self.masses[own] @ robot.model.centres(self.q[own]) @ self.gravity
+        drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * self.h * self.rate**2
+        return np.array([inertia, weight, drives.sum(), -self.torques @ d, self._limits()[0].sum()])
 
-    def _stand(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Go to q; (-dPhi/dq, sizes of what it adds up, what digits of places leave)."""
+    def _stand(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Go to q; (-dPhi/dq, sizes of what it adds up)."""
         self.q, self._linear = q, None
+        if not self.moves:  # the weight is that at rest
+            self.q_on = q
+            self._weigh()
         u = self._carry(u)
         self.put(self.rows, q)
-        self.put_rates(self.rows, (q - self.q_n) / self.h)
+        self._put_rates(self.rows, self.rate)
         if len(self.rows):
             runtime.fill(self.p.poses, self.rows)
-        R, size = self.own_forces()
+        R, size = self._own_forces()
         x, x_n = self.places(u)
         _, self.S = self.kinematics(q)
         self.pushed = []
@@ -337,14 +374,14 @@ class Joints:
             J, J_n = (carried[:, None] * moved(S, y[at]) for S, y in ((self.S, x), (self.S_n, x_n)))
             self.pushed.append(Pushed(at, f[at], drag[at], J, J_n))
             for arm, force in ((J, f[at]), (J_n, drag[at])):
-                R = R - on_joints(arm, force)
-                size = size + on_joints(np.abs(arm), np.abs(force))
+                R = R - np.einsum("iad,id->a", arm, force)
+                size = size + np.einsum("iad,id->a", np.abs(arm), np.abs(force))
         if len(self.at):
             self.pull, sizes = (x[self.at] for x in self.ws.newton.balance(u, *self.problem))
             self.J_a = self.ways(self.S, x[self.at])
-            R = R + on_joints(self.J_a, self.pull)
+            R = R + np.einsum("iad,id->a", self.J_a, self.pull)
             size = size + np.linalg.norm(self.J_a, axis=2).T @ sizes
-        return R, size, self.rounding()
+        return R, size
 
     def _carry(self, u: np.ndarray) -> np.ndarray:
         """u with the vertices that links hold where they are at q; the potential goes there."""
@@ -378,18 +415,31 @@ class Joints:
             self._placed = own if np.array_equal(own, back) else None
             self._stand(self.q, u)
             return
-        at = self._stand(self._predicted(u), u)
+        R, size = self._stand(self._predicted(u), u)
+        best, stalled = np.inf, 0
         scale = np.sqrt(np.diag(self.M) / self.h**2 + self.yielding)  # of joints, some stiff, some light
-
-        def direction(R):
+        for _ in range(self.most):
+            noise = self._rounding()
+            left = float(np.max(np.abs(R) / (max(1e-13, 4 * self.eps) * size + noise)))
+            stalled = 0 if left < 0.5 * best else stalled + 1
+            fair = np.all(np.abs(R) <= self.loose * size + noise)
+            if not left > 1 or (stalled > 3 and fair) or stalled > 20:
+                break
+            best = min(best, left)
             _, K = self.linear
             values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
-            values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max())
-            step, q = vectors @ ((vectors.T @ (R / scale)) / values) / scale, self.q
-            return step, self._free_share(u, q, step), lambda t: self._stand(q + t * step, u)
-
-        R, size, noise = balanced(at, direction, max(1e-13, 4 * self.eps), self.loose, self.most)
-        self.left = float(np.max(np.abs(R) / (size + 1e6 * noise)))
+            values = np.maximum(np.abs(values), 1e-12 * max(np.abs(values).max(), 1.0))
+            step = vectors @ ((vectors.T @ (R / scale)) / values) / scale
+            if not self.moves:
+                step = step * min(1.0, 1 / np.max(np.abs(step) / self.reach))
+            slope, q = float(R @ step), self.q
+            t = self._free_share(u, q, step)
+            while True:
+                R, size = self._stand(q + t * step, u)
+                if float(R @ step) >= -self.falls * slope or t < 1e-12:
+                    break
+                t *= 0.5
+        self.left = float(np.max(np.abs(R) / (size + 1e6 * self._rounding())))
 
     def _free_share(self, u, q: np.ndarray, step: np.ndarray) -> float:
         """How far links may go along a step of the joints."""
@@ -410,7 +460,9 @@ class Joints:
         return self._linear
 
     def _linearise(self) -> tuple[list, np.ndarray]:
-        K, columns = self.M / self.h**2 + np.diag(self.yielding), []
+        K, columns = self.moves * self.M / self.h**2 + np.diag(self.yielding), []
+        for robot, own in zip(self.robots.terms, [] if self.moves else self.slices):
+            K[own, own] += self.derivatives(robot, own)[0] + 1e-14 * np.diag(robot.typical)
         if any(len(part.at) for part in self.pushed):
             blocks = self._blocks()
             turns, x = self.turns(self.S), self.places(self.p.held_at)[0]
@@ -420,7 +472,9 @@ class Joints:
                 turned = np.tensordot(f, rotations.skew(w), (1, 2))  # (k, joints, 3), of f as the link turns
                 HJ, FJ = np.einsum("jid,iaj->iad", H, J), np.einsum("jid,iaj->iad", F, J_n)
                 columns.append((at, -np.swapaxes(turned + HJ + FJ, 1, 2)))
-                K = K + by_turns(turns, carried, x[at], f).T
+                force, moment = f.sum(0), np.cross(x[at], f).sum(0)
+                bent = turns[..., :3] @ force + turns[..., 3:] @ moment
+                K = K + (bent * carried * carried[:, None]).T
                 K = K + np.einsum("iad,ibd->ab", J, turned + HJ) + np.einsum("iad,ibd->ab", J_n, FJ)
         if len(self.at):
             columns, K = self._with_held(columns, K)
@@ -436,10 +490,11 @@ class Joints:
             w = np.zeros((n, 3))
             w[self.at] = J[:, a]
             own[..., a] = self.of_places(w)
-        self.reach = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
+        self.felt = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
         turns, y = self.turns(self.S), self.places(self.p.held_at)[0][self.at]
         for rows, _, carried in self.grips:
-            K = K - by_turns(turns, carried, y[rows], self.pull[rows]).T
+            force, moment = -self.pull[rows].sum(0), -np.cross(y[rows], self.pull[rows]).sum(0)
+            K = K + ((turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]).T
         pulled = np.cross(self.holding * self.S[:, 3:], self.pull[:, None])
         crossed = np.einsum("iad,idb->ab", J, of_links[self.at])
         K = K + np.einsum("iad,ibd->ab", pulled, J) + crossed + crossed.T + np.einsum("iad,idb->ab", J, own[self.at])

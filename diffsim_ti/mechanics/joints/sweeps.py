@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti.mechanics.joints.joints import by_turns, moved, moved_jvp, on_joints
+from diffsim_ti.mechanics.joints.joints import moved
 from diffsim_ti.mechanics.obstacles.contact_record import SharesAdjoint
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
 
@@ -40,10 +40,10 @@ class JointSweep:
         at = turns[..., :3] + np.cross(turns[..., 3:], t) + np.cross(J.S_n[None, :, 3:], here[:, None])
         return at, turns[..., 3:]
 
-    def rows_jvp(self, dq: np.ndarray, dq_n: np.ndarray) -> np.ndarray:
-        """Change of the rows for changes of the joints where the pass ends, and where it begins."""
-        J, rate = self.joints, (self.joints.q - self.joints.q_n) / self.joints.h
-        out, drate = np.zeros((J.a.poses.size, 3)), (dq - dq_n) / J.h
+    def rows_jvp(self, dq: np.ndarray, dq_n: np.ndarray, dx: np.ndarray) -> np.ndarray:
+        """Change of the rows for changes of the joints where the pass ends and begins, and where inertia starts from."""
+        J, rate = self.joints, self.joints.rate
+        out, drate = np.zeros((J.a.poses.size, 3)), (dq - dx) / J.h
         for row, turn, carried, t, t_n in self._moments():
             for m, S, at, by in ((AT_STAGE, J.S, t, dq), (AT_BEGIN, J.S_n, t_n, dq_n), (RATE, J.S_n, t_n, drate)):
                 out[row + m] += (by * carried) @ moved(S, at)
@@ -54,35 +54,32 @@ class JointSweep:
             out[turn + RATE] += np.einsum("bad,b,a->d", by_spin, *own)
         return out
 
-    def rows_vjp(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of the joints where the pass ends, and where it begins."""
-        J, rate = self.joints, (self.joints.q - self.joints.q_n) / self.joints.h
-        by_q, by_q_n = np.zeros((2, J.count))
+    def rows_vjp(self, rows: np.ndarray) -> np.ndarray:
+        """Adjoints of the joints where the pass ends, where it begins and where inertia starts from, shape (3, joints)."""
+        J, rate, out = self.joints, self.joints.rate, np.zeros((3, self.joints.count))
         for row, turn, carried, t, t_n in self._moments():
             pulled = [
                 carried * (moved(S, at) @ rows[row + m] + S[:, 3:] @ rows[turn + m])
                 for m, S, at in ((AT_STAGE, J.S, t), (AT_BEGIN, J.S_n, t_n), (RATE, J.S_n, t_n))
             ]
-            by_q += pulled[0] + pulled[2] / J.h
             by_point, by_spin = self._rate_by_place(t_n)
             bent = by_point @ rows[row + RATE] + by_spin @ rows[turn + RATE]
-            by_q_n += pulled[1] - pulled[2] / J.h + carried * (bent @ (rate * carried))
-        return by_q, by_q_n
+            pulled[1] = pulled[1] + carried * (bent @ (rate * carried))
+            out += pulled[0] + pulled[2] / J.h, pulled[1], -pulled[2] / J.h
+        return out
 
     def _each(self):
         """(robot, its joints)"""
         return zip(self.joints.robots.terms, self.joints.slices)
-
-    def _derivatives(self, robot, own: slice) -> tuple[np.ndarray, ...]:
-        J = self.joints
-        return robot.model.derivatives(J.q_n[own], J.v_n[own], J.acceleration[own], J.masses[own], J.gravity)
 
     def _of_friction(self) -> list:
         """(vertices, joints that move the link, f, f', sum over vertices of f' . change of J' by q_b, [b, a])"""
         J, out = self.joints, []
         turns, x_n = J.turns(J.S_n), J.places(J.p.held_at)[1]
         for (_, carried), part in zip(J.links, J.pushed):
-            out.append((part.at, carried, part.f, part.drag, by_turns(turns, carried, x_n[part.at], part.drag)))
+            force, moment = part.drag.sum(0), np.cross(x_n[part.at], part.drag).sum(0)
+            bent = (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
+            out.append((part.at, carried, part.f, part.drag, bent))
         return out
 
 
@@ -93,12 +90,16 @@ class JointTangent(JointSweep):
         super().__init__(workspace)
         self.tangent, J, self.frames = tangent, self.joints, []
         self.dq, self.dv, *_ = J.robots.numbers(tangent.parameters)
-        self.deffort, (q, *_) = np.zeros(J.count), J.start()
+        self.deffort, (q, *_), self.before = np.zeros(J.count), J.start(), (self.dq, self.dv)
         at, x = J.at, (J.a.values.rest + J.a.values.displacement)[J.at]
         moved_on = (tangent.rest + tangent.displacement)[at] - np.einsum(
             "iad,a->id", J.ways(J.kinematics(q)[1], x), self.dq
         )
         self.dlocal = J.to_joints(q, moved_on)
+
+    def begin(self) -> None:
+        """The pass is open. dx, dy, dq_on, dv_on: changes of what `led_on` says."""
+        self.dx, self.dy, self.dq_on, self.dv_on = self.joints.led_on(self.dq, self.dv, *self.before)
 
     def note(self) -> None:
         """A frame has the change of the present state."""
@@ -117,38 +118,42 @@ class JointTangent(JointSweep):
         J, moved_numbers, out = self.joints, self.tangent, np.zeros(self.joints.count)
         _, _, dk, dc, dm = J.robots.numbers(moved_numbers.parameters)
         dk = np.where(J.robots.prescribed, 0.0, dk)
-        dg = J.a.gravity_of(moved_numbers)
+        at = J.a.features().gravity
+        dg = moved_numbers.parameters[at : at + 3] if at >= 0 else np.zeros(3)
         for robot, own in self._each():
-            by_q, by_v, by_m, by_g = self._derivatives(robot, own)
-            out[own] -= by_q @ self.dq[own] + by_v @ self.dv[own] + by_m @ dm[own] + by_g @ dg
+            by_q, by_v, by_m, by_g = J.derivatives(robot, own)
+            out[own] -= by_q @ self.dq_on[own] + by_v @ self.dv_on[own] + by_m @ dm[own] + J.laid * by_g @ dg
         schedule, rows = self.ws.solver.schedule, moved_numbers.joints
         dtargets = schedule.pressure(rows, J.j, J.share)
-        self._given = J.k * dtargets - dk * (J.q - J.targets) - dc * (J.q - J.q_n) / J.h + J.c * self.dq / J.h
-        self._given += rows[schedule.load_row(rows, J.j)][:, 2]
-        out += J.M @ (self.dq / J.h**2 + self.dv / J.h) + self._given
+        self._given = J.k * dtargets - dk * (J.q - J.targets) + J.c * self.dx / J.h
+        self._given += J.laid * rows[schedule.load_row(rows, J.j)][:, 2] - J.moves * dc * J.rate
+        out += J.moves * J.M @ (self.dx / J.h + self.dy) / J.h + self._given
         if held is None:
             return out
         x, x_n = J.places(J.p.held_at)
         dx, dx_n = held + moved_numbers.rest, du + moved_numbers.rest
         if len(J.at):
-            out += on_joints(J.J_a, dR[J.at])
-            out += on_joints(J.holding * moved_jvp(J.S, dx[J.at]), J.pull)
+            out += np.einsum("iad,id->a", J.J_a, dR[J.at])
+            out += np.einsum("iad,id->a", J.holding * np.cross(J.S[:, 3:], dx[J.at][:, None]), J.pull)
         for (k, *_), (vertices, carried, f, drag, bent) in zip(J.links, self._of_friction()):
             both = ((J.S, x, shares[k, 0], f, dx), (J.S_n, x_n, shares[k, 1], drag, dx_n))
             for S, y, change, force, dy in both:
-                out -= carried * on_joints(moved(S, y[vertices]), change[vertices])
-                out -= carried * on_joints(moved_jvp(S, dy[vertices]), force)
+                out -= carried * np.einsum("iad,id->a", moved(S, y[vertices]), change[vertices])
+                out -= carried * np.einsum("iad,id->a", np.cross(S[:, 3:], dy[vertices][:, None]), force)
             out -= self.dq @ bent
         return out
 
     def step(self, dq: np.ndarray) -> None:
         """The pass has changed the joints so."""
-        self.dq, self.dv = dq, (dq - self.dq) / self.joints.h
+        self.before, self.dq, self.dv = (self.dq, self.dv), dq, self.joints.moves * (dq - self.dx) / self.joints.h
         self.deffort = self._given - self.joints.yielding * dq
 
 
 class JointAdjoint(JointSweep):
-    """Adjoints of the joints in a reverse sweep."""
+    """Adjoints of the joints in a reverse sweep. pending: of positions and velocities before, from the pass that comes
+    next."""
+
+    _to_x = 0.0
 
     def __init__(self, workspace, features, numbers):
         super().__init__(workspace)
@@ -159,11 +164,16 @@ class JointAdjoint(JointSweep):
         frames = len(self.ws.joint_frames)
         self.frames = np.zeros((frames, self.joints.count, 3)) if seeds is None else seeds
         self.by_q, self.by_v, self.by_effort = self.frames[-1].T.copy()
+        self.pending = np.zeros((2, self.joints.count))
         self.numbers, self.by_local = np.zeros((5, self.joints.count)), np.zeros((len(self.joints.at), 3))
 
     def clear(self) -> None:
         """The joints where the sweep stands are no start of theirs."""
-        self.by_q, self.by_v, self.by_effort = np.zeros((3, self.joints.count))
+        self.by_q, self.by_v, self.by_effort, *self.pending = np.zeros((5, self.joints.count))
+
+    def scale(self, factor: float) -> None:
+        """Multiply the running adjoint."""
+        self.by_q, self.by_v, self.pending = factor * self.by_q, factor * self.by_v, [factor * x for x in self.pending]
 
     def add_frame(self, frame: int) -> None:
         """Add the adjoints of a frame."""
@@ -174,10 +184,11 @@ class JointAdjoint(JointSweep):
         """What the body's equation is to be solved for; rows: adjoint of the obstacles' rows by what is seen of contacts;
         by_ends: of the vertices' displacements where the pass ends."""
         J = self.joints
-        by_q, self._to_q_n = self.rows_vjp(rows) if np.ndim(rows) else np.zeros((2, J.count))
+        by_q, self._to_q_n, self._to_x = self.rows_vjp(rows) if np.ndim(rows) else np.zeros((3, J.count))
+        self.by_v = J.moves * self.by_v
         self._seed = self.by_q + self.by_v / J.h + by_q - J.yielding * self.by_effort
         if len(J.at):
-            self._seed = self._seed + on_joints(J.J_a, by_ends[J.at])
+            self._seed = self._seed + np.einsum("iad,id->a", J.J_a, by_ends[J.at])
         return seed - J.of_joints(J.follow(self._seed), seed.shape)
 
     def with_held(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -220,21 +231,26 @@ class JointAdjoint(JointSweep):
         """Go to where the pass begins. rows: adjoint of the obstacles' rows by the equations of body and joints; adj: takes
         adjoints of numbers. Returns that of gravity."""
         J, w = self.joints, self.w
-        by_q_n = self._to_q_n + self.rows_vjp(rows)[1] - self.by_v / J.h
-        by_q_n = by_q_n + J.M @ w / J.h**2 + J.c * (w + self.by_effort) / J.h
-        by_v_n, by_gravity, e = J.M @ w / J.h, np.zeros(3), w + self.by_effort
+        _, by_q_n, by_x = self.rows_vjp(rows)
+        e, by_y, by_gravity = w + self.by_effort, J.moves * J.M @ w / J.h, np.zeros(3)
+        by_q_on, by_v_on = np.zeros((2, J.count))
+        by_x = by_x + self._to_x + (by_y + J.c * e - self.by_v) / J.h
         for robot, own in self._each():
-            by_q, by_v, by_m, by_g = self._derivatives(robot, own)
-            by_q_n[own] -= w[own] @ by_q
-            by_v_n[own] -= w[own] @ by_v
+            by_q, by_v, by_m, by_g = J.derivatives(robot, own)
+            by_q_on[own] -= w[own] @ by_q
+            by_v_on[own] -= w[own] @ by_v
             self.numbers[4, own] -= w[own] @ by_m
-            by_gravity -= w[own] @ by_g
+            by_gravity -= J.laid * w[own] @ by_g
         self.numbers[2] -= np.where(J.robots.prescribed, 0.0, e * (J.q - J.targets))
-        self.numbers[3] -= e * (J.q - J.q_n) / J.h
+        self.numbers[3] -= J.moves * e * J.rate
         schedule = self.ws.solver.schedule
         schedule.add_pressure(adj.joints, J.j, J.share, J.k * e)
-        adj.joints[schedule.load_row(adj.joints, J.j)][:, 2] += e
-        self.by_q, self.by_v, self.by_effort = by_q_n, by_v_n, np.zeros(J.count)
+        adj.joints[schedule.load_row(adj.joints, J.j)][:, 2] += J.laid * e
+        (a0, a1), (b0, b1) = J.weights
+        by_first, by_second = np.stack([by_x, by_y]), np.stack([by_q_on, by_v_on])
+        self.by_q, self.by_v = a0 * by_first + b0 * by_second + self.pending
+        self.by_q, self.pending = self.by_q + self._to_q_n + by_q_n, a1 * by_first + b1 * by_second
+        self.by_effort = np.zeros(J.count)
         return by_gravity
 
     def hand_on(self, by_places: np.ndarray) -> np.ndarray:
@@ -250,7 +266,8 @@ class JointAdjoint(JointSweep):
         J = self.joints
         q, *_ = J.start()
         by, x = J.from_joints(q, self.by_local), (J.a.values.rest + J.a.values.displacement)[J.at]
-        out.rest[J.at] += by
+        if out.rest is not None:
+            out.rest[J.at] += by
         out.displacement[J.at] += by
-        by_q = self.by_q - on_joints(J.ways(J.kinematics(q)[1], x), by)
+        by_q = self.by_q - np.einsum("iad,id->a", J.ways(J.kinematics(q)[1], x), by)
         J.robots.add_numbers(out.parameters, np.concatenate([[by_q, self.by_v], self.numbers[2:]]))

@@ -12,6 +12,7 @@ import numpy as np
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mesh.geometry import inner_faces
 from diffsim_ti.mesh.sets import components, pieces
+from diffsim_ti.terms import Robot
 from diffsim_ti.terms.supports import motions_left
 
 MOST = 200  # parts that hang on each other, whose motions are found together
@@ -59,6 +60,8 @@ class Rows:
         np.maximum.at(self.size, self.parts, arms)
         self._entries, self.num_rows, self.shared = [], 0, []
         self._add_held(scene.supports.vertices, scene.supports.held)
+        for _, vertices in (x for robot in scene.terms_of(Robot) for x in robot.holds):
+            self._add_held(vertices, np.tile(np.eye(3), (len(vertices), 1, 1)))
         self._add_shared(np.setdiff1d(np.arange(len(self.vertices)), begin))
         derived = scene.inputs.derive(scene.inputs.at_times([0.0])) if scene.interactions else None
         for force in host_forces(scene).take(derived):

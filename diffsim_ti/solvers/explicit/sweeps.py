@@ -152,7 +152,7 @@ class ExplicitAdjoint:
             x = self._arrays[name]
             runtime.fill(x, runtime.fetch(x) * factor)
         if self.joints:
-            self.joints.by_q, self.joints.by_v = factor * self.joints.by_q, factor * self.joints.by_v
+            self.joints.scale(factor)
 
     def collect(self, state: bool = True) -> Derived:
         """Adjoints of what kernels read, in float64, at the start of the run; state=False leaves out those of the state."""

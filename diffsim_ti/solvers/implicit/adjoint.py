@@ -274,7 +274,7 @@ class ImplicitAdjoint(RecordedPasses):
         """Multiply the running adjoint."""
         self.p, self.q, self.pending = factor * self.p, factor * self.q, [factor * x for x in self.pending]
         if self.joints:
-            self.joints.by_q, self.joints.by_v = factor * self.joints.by_q, factor * self.joints.by_v
+            self.joints.scale(factor)
         if self.z is not None:
             runtime.fill(self.z, runtime.fetch(self.z) * factor)
 

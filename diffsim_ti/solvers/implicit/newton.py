@@ -306,4 +306,6 @@ class Newton:
     def pose(self, problem: tuple) -> None:
         """What is solved: mass, inertial and loads of `solve`."""
         self.mass, self.inertial, self.loads = problem
+        if self.potential.joints:
+            self.potential.joints.take(problem)
         self.preconditioner, self.stiffness = self.preconditioners(self.mass)

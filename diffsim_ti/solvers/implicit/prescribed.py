@@ -51,6 +51,8 @@ class PrescribedInPasses(Workspace):
     def apply_loads(self, j: int, stage: Stage, share: float = 1.0) -> None:
         """Set host forces and growth of pass j; of statics a share of what it lays on."""
         self.applied_share = share if stage.static else 1.0
+        if self.joints and stage.static:
+            self.joints.load(j, stage)
         if self.hosts:
             self.hosts.take(self._host_values(), self.instant(j, stage))
         self.grow(j, stage)

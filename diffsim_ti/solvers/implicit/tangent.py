@@ -69,8 +69,10 @@ class ImplicitTangent(RecordedPasses):
             held = ws.rigid.held_jvp(held, self.du, tangent.rest)
         poses = None if tangent.path is None else ws.collisions.jvp(tangent.path, j, s)
         if self.joints:
+            self.joints.begin()
             held[ws.joints.at] = self.joints.led()
-            poses = self.joints.rows_jvp(0.0 * self.joints.dq, self.joints.dq) + (0.0 if poses is None else poses)
+            poses = 0.0 if poses is None else poses
+            poses = poses + self.joints.rows_jvp(0.0 * self.joints.dq, self.joints.dq, self.joints.dx)
         surface_friction, from_friction = ws.potential.surface_friction, 0.0
         if surface_friction:
             from_friction = surface_friction.jvp(ws.potential.held_at, held, dx, self.du, self.numbers, poses)
@@ -111,7 +113,7 @@ class ImplicitTangent(RecordedPasses):
         d_star = held + d_star
         if self.joints:
             d_star[ws.joints.at] += np.einsum("iad,a->id", ws.joints.J_a, dq)
-            poses = poses + self.joints.rows_jvp(dq, np.zeros_like(dq))
+            poses = poses + self.joints.rows_jvp(dq, 0.0 * dq, 0.0 * dq)
             if len(poses):
                 runtime.fill(self.poses, poses)
         if self.contacts:

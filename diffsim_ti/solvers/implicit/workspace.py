@@ -70,7 +70,8 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     def __init__(self, solver, derived, bend=0.0):
         self.potential, self._length, self.hosts = None, solver.substep, host_forces(solver.scene)
-        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.term(Growth) else None
+        watched = solver.may_gain_energy and not (solver.scene.term(Growth) or solver.scene.interaction(Robots))
+        self.energy_watch = EnergyWatch(self) if watched else None
         super().__init__(solver, derived, bend)
 
     def history(self, num_slots, record=False):
@@ -225,7 +226,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         place, speed = self.prescribed(j, self.arrays.values)
         problem = self.problem(j, stage, x, y)
         if self.joints:
-            self.joints.problem = problem
+            self.joints.take(problem)
         self.rigid.begin(u, stage.c0)
         starts = [] if stage.static else [problem[1], x + stage.gamma * y]
         held = (
@@ -297,6 +298,9 @@ class ImplicitWorkspace(PrescribedInPasses):
 
         starts: where inertia leads, and where velocities do; problem: mass, inertial, loads of `Newton.solve`.
         """
+        if self.joints and stage.static:
+            self.potential.place(u)
+            self.joints.check_firm(self.newton.balance(u, *problem)[0])
         starts = [held_as(self.free, held, self.rigid.nearest(u + self.linear * (start - u))) for start in starts]
         near = self.approach(u, held, starts, problem)
         near = self.closing.approached(near, problem) if self.solver.loose else near
@@ -309,6 +313,9 @@ class ImplicitWorkspace(PrescribedInPasses):
         except NotConverged as error:
             if not parts or self.newton.report.cuts and not stage.static:
                 raise
+            if self.joints and stage.static:  # which nothing has come to hold
+                self.potential.place(u)
+                self.joints.check_firm(0 * u)
             return LoadStepping(self)(j, stage, u, held, problem, error)
 
     def check_upright(self, u, there) -> None:

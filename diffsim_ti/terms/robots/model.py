@@ -96,6 +96,11 @@ class RobotModel:
         S = self.pin.computeJointJacobians(self.model, self.data, self._place(q)).reshape(6, -1).T.copy()
         return [self._pose(x) for x in list(self.data.oMi)[1:]], S
 
+    def centres(self, q: np.ndarray) -> np.ndarray:
+        """Centres of mass of what each joint carries rigidly, shape (joints, 3) [m]."""
+        places = zip(self.kinematics(q)[0], self.inertias)
+        return np.array([t + rotations.turned(turn, inertia.lever) for (turn, t), inertia in places])
+
     def _load(self, masses: np.ndarray, gravity: np.ndarray) -> None:
         for j, (mass, inertia) in enumerate(zip(masses, self.inertias), 1):
             share = mass / inertia.mass

@@ -47,7 +47,9 @@ class Robot(GivenOverTime, Term):
     with friction by the velocities of body and links in the same step. So no wrench of normal contact lags. The inertia
     M(q_n), the bias b = C(q_n, v_n) v_n + g(q_n) of Coriolis forces and weight, and arms and normal forces of friction, as
     of every obstacle, are those where the step begins: they change by O(h) within it, which keeps the first order of
-    backward Euler. Action is reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
+    backward Euler. BDF2 takes M and b where the two states before lead linearly, which keeps its second order. In an
+    equilibrium joints have no inertia and no damping, and their weight is that where they are; what nothing holds is named.
+    Action is reaction to round-off. Weight is that of the scene's `Gravity`; `Drag` acts on the body alone.
     In explicit steps joints take substeps of backward Euler, whose length stiff drives do not limit, and links are obstacles
     of the contact stage: what vertices do to them turns joints in the same substep, by J M^-1 J^T. Fixed vertices do not
     stop links there.
@@ -55,9 +57,11 @@ class Robot(GivenOverTime, Term):
     where they are. `compute_energy` and the guard of the energy are those of the body; `LinkEnergy` is that of links.
     Vertices that are `attached` move exactly as their links do, from where they and the joints are as a run starts: they are
     no unknowns of their own, and what acts on them acts on the joints, inertia included. `Reaction` of their set is the
-    force of the link on them, or its moment. Give the body `initial_velocities` that go with those of the joints.
+    force of the link on them, or its moment. Give the body `initial_velocities` that go with those of the joints. In
+    explicit steps they meet obstacles with their own mass before they go where links have them, without rebound.
     Limits of joints hold by the one-sided potential E_limit = k d^3 / (6 w) of what is beyond them by d < w, 1e-4 of the
-    range, and of constant stiffness k = 10^6 M / h^2 beyond: joints stop there without rebound. Limits of effort and
+    range, and of constant stiffness k = 10^6 M / h^2 beyond (in equilibria with h = 0.01 s): joints stop there without
+    rebound. Limits of effort and
     velocity in the file have no effect; nor have limits of prescribed joints, but where they start.
 
     All inputs have a gradient, by names that begin with the robot's: "positions", "velocities", shape (joints,), where a
@@ -117,7 +121,7 @@ class Robot(GivenOverTime, Term):
         links: whose collision geometry acts on the body; None: all. contact: of all links, as of an `Obstacle`; they act on
         vertices by their distance. Meshes are taken from beside the file.
         attached: {link: vertices that it holds}, by a vertex set's name, indices, a mask or a list of names, free ones of
-        the scene that are outside of the links' own geometry; in `ImplicitEulerSolver` alone, and not beside `SelfContact`,
+        the scene that are outside of the links' own geometry; not in `VelocityVerletSolver`, nor beside `SelfContact`,
         `FilledChamber` or obstacles that act by pairs. limits: whether those of joints in the file hold.
 
         Raises ValueError for joints of other kinds, mimic joints, closed loops, dry friction, joints that carry no mass or
