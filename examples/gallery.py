@@ -38,6 +38,7 @@ EXAMPLES = {
     "control/gripper": ("output", "gripper.gif"),
     "control/soft_hand": ("output", "soft_hand.gif"),
     "control/arm": ("output", "arm.png"),
+    "control/grasp_and_lift": ("--ppo 0", "grasp_and_lift.gif"),
     "control/swimmer": ("", "swimmer.gif"),
     "control/pneumatic_finger": ("output", "pneumatic_finger.png"),
     "control/train_controller": ("", "train_controller.gif"),

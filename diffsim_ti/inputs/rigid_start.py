@@ -66,9 +66,9 @@ class Displacement(Recording, Link):
         out = linear(x - X, self.of, self.of)
         for body in self.bodies:
             at, y, D = body.vertices, body.apart(x), body.apart(X)
-            near, none = Nearest(value_of(y), value_of(D)), np.zeros((len(at), 3))
-            by_y = y, lambda dy, near=near: near.jvp(dy, none), lambda seed, near=near: near.vjp(seed)[0]
-            by_D = D, lambda dD, near=near: near.jvp(none, dD), lambda seed, near=near: near.vjp(seed)[1]
+            near = Nearest(value_of(y), value_of(D))
+            by_y = y, lambda dy, near=near: near.jvp(dy, 0 * dy), lambda seed, near=near: near.vjp(seed)[0]
+            by_D = D, lambda dD, near=near: near.jvp(0 * dD, dD), lambda seed, near=near: near.vjp(seed)[1]
             moved = x[at].mean(0) - X[at].mean(0) + D @ (made(near.R, by_y, by_D).T - np.eye(3))
             out = replaced(out, at, moved)
         return (out,)

@@ -84,12 +84,12 @@ class Lift:
             drive_stiffness=[4000.0, 0, 0],
             drive_damping=[80.0, 5.0, 5.0],
             friction=MU,
-            friction_speed=5e-4,
+            friction_speed=2.5e-4,
             width=1e-3,
             stiffness_per_area=5e6,
         )
         terms = [ds.Gravity(), ds.Ground(width=2e-3, stiffness_per_area=1e6), self.robot]
-        self.scene = ds.Scene(block, ds.StableNeoHookean(1e4, 0.35), DENSITY, terms, precision="f64")
+        self.scene = ds.Scene(block, ds.StableNeoHookean(3e4, 0.35), DENSITY, terms, precision="f64")
         outputs = [ds.JointPositions("gripper"), ds.JointVelocities("gripper")]
         outputs += [ds.ContactForce(f"gripper_{side}", "normal", name=side) for side in ("left", "right")]
         solver = ds.ImplicitEulerSolver(self.scene, dt=DT, tolerance=1e-6)
