@@ -173,6 +173,11 @@ class LinesOnHost(HostForce):
         dd = segments_dot[self.paths.starts] + self.parted @ du
         return self._sums((self._state(u)[0] * dd).sum(1))
 
+    def lengths_vjp(self, u, L_adj) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of u and segments for that of the lengths."""
+        d_adj = L_adj[self.paths.path_of, None] * self._state(u)[0]
+        return self.together @ d_adj, self._of_points(d_adj)
+
     def tensions_jvp(self, u, du, segments_dot, tension_dot, slack_dot, stiffness_dot) -> np.ndarray:
         """Change of T for changes of everything."""
         _, _, _, e, k, _ = self._state(u)
