@@ -163,7 +163,7 @@ def judged(job: dict, pieces, by_moduli, gradients, share: float = 1.0) -> tuple
     return compared(g, sixth, fourth)
 
 
-def answers(python: str, script: Path, jobs: list[dict], timeout: float = 500.0) -> tuple[list, str]:
+def answers(python: str, script: Path, jobs: list[dict], timeout: float = 240.0) -> tuple[list, str]:
     """(the answers of a tool to jobs, all in one process, why there are no more)"""
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{k}.job.npz" for k in range(len(jobs))]
