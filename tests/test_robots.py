@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.accuracy.finer import on_finer
 from diffsim_ti.common import rotations
 from diffsim_ti.study import recommend
 
@@ -372,7 +373,7 @@ def test_every_gradient_goes_through_body_and_joints(pressing, kind):
     assert (sides[0] - sides[1]) / (2 * size) == pytest.approx(whole, rel=1e-5)
 
 
-def test_what_links_do_to_vertices_they_feel_in_the_same_step(pressing):
+def test_what_links_do_to_vertices_acts_on_joints_in_the_same_step(pressing):
     """The joints' equation with forces that the body has, from Pinocchio alone: left over is the rounding of the solve."""
     import pinocchio as pin
 
@@ -495,7 +496,8 @@ def differs(rollout, frames, seeds, gradients, change):
 
 @pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
 def test_every_gradient_goes_through_vertices_that_links_hold(kind):
-    """A block on an arm whose shoulder meets its limit; a link touches it where it is held, a ball elsewhere."""
+    """A block on an arm whose shoulder meets its limit; a link touches it where it is held; in implicit steps a ball does
+    elsewhere."""
     tip = ds.Robot.from_urdf(ARM).poses(Q)["robot_tip"][:3]
     mesh = moved(tip - [0.0, 0.03, 0.03])
     text = urdf(
@@ -506,19 +508,20 @@ def test_every_gradient_goes_through_vertices_that_links_hold(kind):
     above = [*(tip + [0.004, 0.0526, 0.003]), 0, 0, 0]
     slide = ds.Robot.from_urdf(text, "slide", above, targets=lambda t: [-0.2 * t], prescribed=["j"], **CONTACT)
     ball = ds.Sphere(tip + [0.063, -0.0521, -0.004], 0.02, name="ball", by_pairs=False, **CONTACT)
-    scene = held_by_arm(mesh, [slide, ball, ds.Gravity()])
-    outputs = [
-        f(robot) for f in (ds.JointPositions, ds.JointVelocities, ds.JointEfforts, ds.LinkEnergy) for robot in ("arm",)
-    ]
-    outputs += [ds.LinkMotion("tip", "arm"), ds.JointEfforts("slide", "pushed"), ds.ElasticEnergy()]
-    outputs += [ds.Reaction("xmin"), ds.Reaction("xmin", "moment", about=tip)]
-    outputs += [ds.ContactForce("ball"), ds.ContactForce("slide_b", name="on_slide", per_vertex=True)]
+    scene = held_by_arm(mesh, [slide, ds.Gravity()] if kind.explicit else [slide, ball, ds.Gravity()])
+    outputs = [f("arm") for f in (ds.JointPositions, ds.JointVelocities, ds.JointEfforts, ds.LinkEnergy)]
+    outputs += [ds.LinkMotion("tip", "arm"), ds.JointEfforts("slide", "pushed")]
+    outputs += [ds.ContactForce("slide_b", name="on_slide", per_vertex=True)]
+    if not kind.explicit:  # of frames, whoever steps there
+        outputs += [ds.Reaction("xmin"), ds.Reaction("xmin", "moment", about=tip), ds.ElasticEnergy()]
+        outputs += [ds.ContactForce("ball")]
     steps, rng = 2, np.random.default_rng(1)
     solver = kind(scene, dt=5e-3, **({} if kind.explicit else dict(tolerance=1e-12)))
     rollout = ds.Rollout(solver, steps, save_every=1, gradients="all", outputs=outputs)
     frames = rollout.forward()
     held = mesh.vertex_indices("xmin")
-    assert np.abs(frames["on_slide"][-1, held]).max() > 0.05 and np.abs(frames["contact_force"][-1]).max() > 0.05
+    assert all(np.abs(frames[x.name][-1]).max() > 0.05 for x in outputs if isinstance(x, ds.ContactForce))
+    assert np.abs(frames["on_slide"][-1, held]).max() > 0.05
     assert 0.3005 < frames["joint_positions"][-1, 0] < 0.3006
     x, (t, turn) = frames.positions[-1, held], np.split(frames["link_motion"][-1, :7], [3])
     x0, (t0, turn0) = mesh.vertices[held], np.split(frames["link_motion"][0, :7], [3])
@@ -584,7 +587,7 @@ def test_equilibria_of_joints_are_those_of_their_springs_weights_and_limits():
         found(text, limits=False, **more, prescribed=["j"])
 
 
-def test_a_link_presses_in_equilibrium_with_the_force_of_its_joint_and_turns_what_it_holds():
+def test_a_link_presses_in_equilibrium_with_the_force_of_its_joint_and_turns_by_less_than_half_a_turn():
     text = urdf(
         link("a"),
         link("b", 1.0, 0.0, shape='<sphere radius="0.02"/>'),
@@ -595,6 +598,16 @@ def test_a_link_presses_in_equilibrium_with_the_force_of_its_joint_and_turns_wha
     frames = ds.Rollout(ds.StaticSolver(scene_of(robot, fixed="xmax")), 1, outputs=outputs).forward()
     assert frames["contact_force"][-1, 0] == pytest.approx(2.0, rel=1e-7)
     assert frames["reaction"][-1, 0] == pytest.approx(-2.0, rel=1e-7)
+    text = urdf(link("a"), link("b", 1.0, shape='<sphere radius="0.02"/>'), joint("j", "revolute", "a", "b", "0 5 0"))
+    given = dict(width=2e-3, stiffness_per_area=3e7, torques=[4.0], targets=[0.0], drive_stiffness=1.0, limits=False)
+
+    def turned(start):
+        scene = scene_of(ds.Robot.from_urdf(text, positions=[start], **given), fixed="xmax")
+        return ds.Rollout(ds.StaticSolver(scene), 1, outputs=[ds.JointPositions()]).forward()["joint_positions"][-1, 0]
+
+    with pytest.raises(FloatingPointError, match="half a turn: give positions of joints nearer to the equilibrium"):
+        turned(0.0)
+    assert turned(3.0) == pytest.approx(4.0)
 
 
 BOB = ds.TetrahedralMesh.create_box((3, 3, 3), 0.06, origin=(0.2, -0.03, -0.03))
@@ -711,6 +724,13 @@ def test_vertices_that_links_hold_are_set_where_links_have_them():
     simulator.set_state(positions=there)
     simulator.step()
     assert np.abs(simulator.positions[held] - x[held]).max() < 2e-3
+
+
+def test_links_hold_new_vertices_of_a_finer_mesh():
+    held = ds.Robot.from_urdf(ARM, attached=dict(tip=MESH.vertex_indices("xmin")), links=())
+    fine = on_finer(scene_of(held), ds.TetrahedralMesh.refined)
+    ((_, vertices),) = fine.terms_of(ds.Robot)[0].holds
+    np.testing.assert_array_equal(np.sort(vertices), np.flatnonzero(fine.mesh.vertices[:, 0] == 0))
 
 
 def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works():

@@ -41,7 +41,9 @@ from diffsim_ti.terms.robots.model import bracket
 
 STIFF = 1e6  # of a prescribed joint's drive, and of a limit, over inertia / h^2
 AT_REST = 0.01  # [s], h of these in equilibria
-FIRM = 1e-9  # stiffness of what is held in an equilibrium, over the largest that a joint meets, or inertia / s^2
+STABLE = (
+    1e-9  # least stiffness of what is held in an equilibrium, over the largest that a joint meets, or inertia / s^2
+)
 HELD = "hold the joint by drive_stiffness, prescribe it, or take a solver with inertia"
 FALLS = 0.8  # how steeply Phi may rise along a step where it ends, against how it fell
 
@@ -192,9 +194,9 @@ class Joints:
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 
-    def led_on(self, q, v, q_before, v_before) -> tuple[np.ndarray, ...]:
-        """(x, y) where inertia starts from, as of vertices, and where the joints are and how fast they are as the pass ends,
-        to its order, of the states now and before; linear in these."""
+    def extrapolated(self, q, v, q_before, v_before) -> tuple[np.ndarray, ...]:
+        """(x, y) where inertia starts from, as of vertices, and positions and velocities where the pass ends, extrapolated
+        from the states now and before; linear in these."""
         (a0, a1), (b0, b1) = self.weights
         return tuple(
             m * one + n * other for m, n in ((a0, a1), (b0, b1)) for one, other in ((q, q_before), (v, v_before))
@@ -206,7 +208,7 @@ class Joints:
         self.moves = 0.0 if stage.static else 1.0  # without which there is neither inertia nor damping
         r = np.sqrt(-stage.a1 / stage.a0)  # w / (1 + w) of a step that is w times as long as the one before
         self.weights = (stage.a0, stage.a1), (self.moves / (1 - r), -self.moves * r / (1 - r))
-        self.x, self.y, self.q_on, self.v_on = self.led_on(self.q_n, self.v_n, *before)
+        self.x, self.y, self.q_on, self.v_on = self.extrapolated(self.q_n, self.v_n, *before)
         self.poses_n, self.S_n = self.kinematics(self.q_n)
         self.reach = np.where(self.S_n[:, 3:].any(1), 0.5, np.ptp(a.values.rest, 0).max())  # of a round at rest
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
@@ -268,9 +270,10 @@ class Joints:
     def end(self) -> None:
         """The pass is over. Raises NotConverged where the joints are not in balance, or nothing holds them at rest."""
         if not self.moves:
-            self.check_firm()
+            self.check_stable()
+        smaller = "take smaller steps" if self.moves else "give positions of joints nearer to the equilibrium"
         if not self.left <= max(self.ws.solver.tolerance, self.loose):
-            remedy = "take smaller steps" if self.moves else HELD
+            remedy = smaller if self.moves else HELD
             raise NotConverged(
                 f"the joints of robots are out of balance by {self.left:.2g} of their forces: {remedy}", [self.left]
             )
@@ -278,10 +281,10 @@ class Joints:
         met = self.ws.collisions.detection.nearest(self.p.held_at, self.rows[::3]) if meets else None
         if met and (met.obstacle in dict(self.links) or np.isin(met.vertices, self.at).any()):
             obstacle = self.a.contacts[met.obstacle].name
-            raise NotConverged(f"{obstacle} has got {-met.value:.2g} m into {met}: take smaller steps", [self.left])
+            raise NotConverged(f"{obstacle} has got {-met.value:.2g} m into {met}: {smaller}", [self.left])
         turned = np.abs(self.q - self.q_n) * np.linalg.norm(self.S_n[:, 3:], axis=1)
         if any(turned @ carried >= np.pi for _, carried in self.links):
-            raise NotConverged("a link of a robot turns by more than half a turn: take smaller steps", [self.left])
+            raise NotConverged(f"a link of a robot turns by more than half a turn: {smaller}", [self.left])
         self.now = self.q.copy(), self.moves * self.rate, sum(self.efforts()), *self.now[:2]
 
     def forget(self) -> None:
@@ -304,7 +307,7 @@ class Joints:
             self.q_on[own], self.v_on[own], self.acceleration[own], self.masses[own], self.gravity
         )
 
-    def check_firm(self, R: np.ndarray | None = None) -> None:
+    def check_stable(self, R: np.ndarray | None = None) -> None:
         """Raise NotConverged where an equilibrium resists no motion of joints, which pieces of the body on links follow.
 
         R: what acts on vertices where one is looked for [N]: what that pulls may come to be held."""
@@ -322,11 +325,11 @@ class Joints:
             if R is not None:
                 pull = np.einsum("aid,id->a", ways, R)
         values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
-        firm, away = max(FIRM, 2 * self.eps), abs(vectors[:, 0] @ (pull / scale)) / (np.abs(vectors[:, 0]) @ scale)
-        seeks = R is not None and (values[0] < -firm or away > 1e-3 * firm)
-        if not (values[0] > firm or seeks):
+        least, away = max(STABLE, 2 * self.eps), abs(vectors[:, 0] @ (pull / scale)) / (np.abs(vectors[:, 0]) @ scale)
+        sought = R is not None and (values[0] < -least or away > 1e-3 * least)
+        if not (values[0] > least or sought):
             name = np.concatenate([robot.joints for robot in self.robots.terms])[np.argmax(np.abs(vectors[:, 0]))]
-            how = "nothing holds" if values[0] > -firm else "the equilibrium is unstable along"
+            how = "nothing holds" if values[0] > -least else "the equilibrium is unstable along"
             raise NotConverged(f"static solve: {how} joint {str(name)!r} of a robot: {HELD}", [self.left])
 
     def own_forces(self) -> tuple[np.ndarray, np.ndarray]:

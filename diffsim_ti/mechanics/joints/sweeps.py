@@ -96,8 +96,8 @@ class JointTangent(JointSweep):
         self.dlocal = J.to_joints(q, moved_on)
 
     def begin(self) -> None:
-        """The pass is open. dx, dy, dq_on, dv_on: changes of what `led_on` says."""
-        self.dx, self.dy, self.dq_on, self.dv_on = self.joints.led_on(self.dq, self.dv, *self.before)
+        """The pass is open. dx, dy, dq_on, dv_on: changes of what `extrapolated` says."""
+        self.dx, self.dy, self.dq_on, self.dv_on = self.joints.extrapolated(self.dq, self.dv, *self.before)
 
     def note(self) -> None:
         """A frame has the change of the present state."""
