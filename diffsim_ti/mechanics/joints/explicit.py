@@ -189,15 +189,18 @@ class JointStage(Stage):
     def find(self, meets: bool = False) -> None:
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
         J = self.joints
-        self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
+
+        def left():
+            if len(J.at):
+                self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
+            return self.left()
 
         def stand(w):
             self.go(w)
             if meets:
                 self.launch("press")
                 self.look()
-                self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
-            return self.left()
+            return left()
 
         def direction(R):
             step, w = np.linalg.solve(self.slope(meets), R), J.w
@@ -205,7 +208,7 @@ class JointStage(Stage):
                 step = np.linalg.solve(self.slope(), R)
             return step, 1.0, lambda t: stand(w + t * step)
 
-        R, size, noise = balanced(self.left(), direction, max(1e-14, 4 * J.eps), J.loose, ROUNDS)
+        R, size, noise = balanced(left(), direction, max(1e-14, 4 * J.eps), J.loose, ROUNDS)
         share = float(np.max(np.abs(R) / (size + noise / J.loose)))
         if not share <= J.loose:
             remedy = "take smaller steps, or begin with links outside of the body"

@@ -210,7 +210,6 @@ class Joints:
         self.weights = (stage.a0, stage.a1), (self.moves / (1 - r), -self.moves * r / (1 - r))
         self.x, self.y, self.q_on, self.v_on = self.extrapolated(self.q_n, self.v_n, *before)
         self.poses_n, self.S_n = self.kinematics(self.q_n)
-        self.reach = np.where(self.S_n[:, 3:].any(1), 0.5, np.ptp(a.values.rest, 0).max())  # of a round at rest
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
         self.load(j, stage)
         self.stiff = STIFF * self.robots.typical / (self.h if self.moves else AT_REST) ** 2
@@ -446,8 +445,9 @@ class Joints:
             values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
             values = np.maximum(np.abs(values), 1e-12 * max(np.abs(values).max(), 1.0))
             step, q = vectors @ ((vectors.T @ (R / scale)) / values) / scale, self.q
-            if not self.moves:
-                step = step * min(1.0, 1 / np.max(np.abs(step) / self.reach))
+            if not self.moves:  # no farther than half a radian, or the size of the body
+                most = np.where(self.S_n[:, 3:].any(1), 0.5, np.ptp(self.a.values.rest, 0).max())
+                step = step * min(1.0, 1 / np.max(np.abs(step) / most))
             return step, self._free_share(u, q, step), lambda t: self._stand(q + t * step, u)
 
         R, size, noise = balanced(at, direction, max(1e-13, 4 * self.eps), self.loose, self.most)
