@@ -237,8 +237,8 @@ class JointStage(Stage):
 
     def answers(self) -> np.ndarray:
         """Changes of what acts on joints, by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
-        displacements, velocities and impulses of the vertices that are near; follows: by what v* of those that links hold
-        changes."""
+        displacements, velocities and impulses of the vertices that are near; `follows`: those of J^T m v* of vertices that
+        links hold."""
         J, change = self.joints, self.change
         out, self.follows = np.zeros((2, J.count, J.count)), np.zeros((J.count, J.count))
         near, held = np.nonzero(self.near[:, None] == J.at)
