@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.accuracy.finer import on_finer
 from diffsim_ti.common import rotations
 from diffsim_ti.study import recommend
 
@@ -372,7 +373,7 @@ def test_every_gradient_goes_through_body_and_joints(pressing, kind):
     assert (sides[0] - sides[1]) / (2 * size) == pytest.approx(whole, rel=1e-5)
 
 
-def test_what_links_do_to_vertices_they_feel_in_the_same_step(pressing):
+def test_what_links_do_to_vertices_acts_on_joints_in_the_same_step(pressing):
     """The joints' equation with forces that the body has, from Pinocchio alone: left over is the rounding of the solve."""
     import pinocchio as pin
 
@@ -584,7 +585,7 @@ def test_equilibria_of_joints_are_those_of_their_springs_weights_and_limits():
         found(text, limits=False, **more, prescribed=["j"])
 
 
-def test_a_link_presses_in_equilibrium_with_the_force_of_its_joint_and_turns_what_it_holds():
+def test_a_link_presses_in_equilibrium_with_the_force_of_its_joint_and_turns_by_less_than_half_a_turn():
     text = urdf(
         link("a"),
         link("b", 1.0, 0.0, shape='<sphere radius="0.02"/>'),
@@ -595,6 +596,16 @@ def test_a_link_presses_in_equilibrium_with_the_force_of_its_joint_and_turns_wha
     frames = ds.Rollout(ds.StaticSolver(scene_of(robot, fixed="xmax")), 1, outputs=outputs).forward()
     assert frames["contact_force"][-1, 0] == pytest.approx(2.0, rel=1e-7)
     assert frames["reaction"][-1, 0] == pytest.approx(-2.0, rel=1e-7)
+    text = urdf(link("a"), link("b", 1.0, shape='<sphere radius="0.02"/>'), joint("j", "revolute", "a", "b", "0 5 0"))
+    given = dict(width=2e-3, stiffness_per_area=3e7, torques=[4.0], targets=[0.0], drive_stiffness=1.0, limits=False)
+
+    def turned(start):
+        scene = scene_of(ds.Robot.from_urdf(text, positions=[start], **given), fixed="xmax")
+        return ds.Rollout(ds.StaticSolver(scene), 1, outputs=[ds.JointPositions()]).forward()["joint_positions"][-1, 0]
+
+    with pytest.raises(FloatingPointError, match="half a turn: give positions of joints nearer to the equilibrium"):
+        turned(0.0)
+    assert turned(3.0) == pytest.approx(4.0)
 
 
 BOB = ds.TetrahedralMesh.create_box((3, 3, 3), 0.06, origin=(0.2, -0.03, -0.03))
@@ -711,6 +722,13 @@ def test_vertices_that_links_hold_are_set_where_links_have_them():
     simulator.set_state(positions=there)
     simulator.step()
     assert np.abs(simulator.positions[held] - x[held]).max() < 2e-3
+
+
+def test_links_hold_new_vertices_of_a_finer_mesh():
+    held = ds.Robot.from_urdf(ARM, attached=dict(tip=MESH.vertex_indices("xmin")), links=())
+    fine = on_finer(scene_of(held), ds.TetrahedralMesh.refined)
+    ((_, vertices),) = fine.terms_of(ds.Robot)[0].holds
+    np.testing.assert_array_equal(np.sort(vertices), np.flatnonzero(fine.mesh.vertices[:, 0] == 0))
 
 
 def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works():

@@ -10,7 +10,7 @@ import numpy as np
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs import SmoothMaximum, Strain, Stress
 from diffsim_ti.scene import Scene
-from diffsim_ti.terms import ExternalForce, MultiPointConstraint, Obstacle, Tie
+from diffsim_ti.terms import ExternalForce, MultiPointConstraint, Obstacle, Robot, Tie
 from diffsim_ti.terms.pose import Pose
 
 if TYPE_CHECKING:
@@ -53,6 +53,12 @@ def on_finer(scene: Scene, finer: Callable[[TetrahedralMesh], TetrahedralMesh]) 
         if not is_named(chosen := getattr(term, "tetrahedra", None)):
             own.tetrahedra = f"tetrahedra of term {k}"
             base, term = base.with_tetrahedron_set(own.tetrahedra, chosen), own
+        if isinstance(term, Robot):
+            term, own.attached = own, dict(own.attached)
+            for link, chosen in own.attached.items():
+                if not is_named(chosen):
+                    own.attached[link] = f"held by {link} of term {k}"
+                    base = base.with_vertex_set(own.attached[link], chosen)
         terms.append(term)
     if not is_named(given["fixed"]):
         base, given["fixed"] = base.with_vertex_set(HELD, given["fixed"]), HELD

@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti.common import rotations
 from diffsim_ti.differentiation.arrays import made, value_of, with_slopes
-from diffsim_ti.mechanics.joints.joints import moved
+from diffsim_ti.mechanics.joints.twists import moved
 from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.outputs.output import Frames, Output, derived
 from diffsim_ti.scene import Scene

@@ -10,7 +10,7 @@ is solved for w by Newton's method: links move by J A^-1 J^T times what vertices
 the other loses, to round-off, whatever is left of this equation. Fixed vertices do not stop links.
 
 Vertices that links hold are kicked like all, to velocities v*, and then go where links have them, y(q), at d = (y(q + h w) -
-y(q)) / h: joints feel J^T m (d - v*), which joins the equation. All of P counts in it, b = 1, so that v' = w and d stays.
+y(q)) / h: J^T m (d - v*) acts on joints, which joins the equation. All of P counts in it, b = 1, so that v' = w and d stays.
 """
 
 import weakref
@@ -21,8 +21,9 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.errors import NotConverged
-from diffsim_ti.mechanics.joints.joints import Joints, moved
+from diffsim_ti.mechanics.joints.joints import Joints, balanced
 from diffsim_ti.mechanics.joints.sweeps import JointAdjoint, JointSweep, JointTangent
+from diffsim_ti.mechanics.joints.twists import by_turns, moved, moved_jvp, on_joints
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.history import History
@@ -43,16 +44,6 @@ class ExplicitJoints(Joints):
         """Stand there, with the velocities of links in rows of obstacles."""
         self.w, self.q = w, self.q_n + self.h * w
         self.put_rates(rows, w)
-
-    def put_rates(self, rows: np.ndarray, w: np.ndarray) -> None:
-        self._put_rates(rows, w)
-
-    def own_forces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(-dPhi/dq, sizes of what it adds up, what digits of places leave)"""
-        return *self._own_forces(), self._rounding()
-
-    def effort(self) -> np.ndarray:
-        return sum(self._efforts())
 
 
 class JointStage(Stage):
@@ -82,8 +73,7 @@ class JointStage(Stage):
         self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
         self.m, self.y_n, self.v_star = self.ws.mass[J.at], J.carried(J.q_n), np.zeros((len(J.at), 3))
         self.J_n = J.ways(J.S_n, self.y_n)  # of vertices that links hold
-        self.near, self.given = np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3))
-        self.wrenches = self.wrenches_of(self.given)
+        self._note(np.zeros(0, int), np.zeros((2 * len(self.ws.arrays.obstacles), 0, 3)))
 
     def go(self, w: np.ndarray) -> None:
         """Links move with w in the pass; nothing is noted of it."""
@@ -121,7 +111,7 @@ class JointStage(Stage):
                 copy_slot(source, 1, target, at.end)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
-        history.joints[at.end] = J.q, J.w - self.rebound(), J.effort(), J.q_n, J.v_n
+        history.joints[at.end] = J.q, J.w - self.rebound(), sum(J.efforts()), J.q_n, J.v_n
         self.met[at.end] = J.w, touches, self.v_star
 
     @property
@@ -137,10 +127,15 @@ class JointStage(Stage):
     def look(self) -> bool:
         """Note what links have done to vertices, and say whether that is anything."""
         impulses = runtime.look(self.ws.impulses.impulse)
-        self.near = np.flatnonzero(impulses[self.own].any((0, 2)))
-        self.given = impulses[:, self.near].astype(np.float64)
-        self.wrenches = self.wrenches_of(self.given)
-        return bool(self.near.size)
+        near = np.flatnonzero(impulses[self.own].any((0, 2)))
+        self._note(near, impulses[:, near].astype(np.float64))
+        return bool(near.size)
+
+    def _note(self, near: np.ndarray, given: np.ndarray) -> None:
+        """near: vertices that links touch, at x where the pass begins; given: what all obstacles give them."""
+        J, self.near, self.given = self.joints, near, given
+        self.x = J.a.values.rest[near] + J.u_n[near]
+        self.wrenches = self.wrenches_of(given)
 
     def launch(self, name: str, **numbers) -> None:
         """A kernel on the vertices, from the first state of the pair to the second."""
@@ -156,11 +151,10 @@ class JointStage(Stage):
     def wrenches_of(self, impulses: np.ndarray) -> np.ndarray:
         """Sums of impulses of each link, and of their moments about the origin, shape (links, 2, 6)."""
         own = impulses[self.own]
-        x = self.joints.places(self.joints.u_n)[1][self.near]
-        return np.concatenate([own.sum(1), np.cross(x, own).sum(1)], 1).reshape(-1, 2, 6)
+        return np.concatenate([own.sum(1), np.cross(self.x, own).sum(1)], 1).reshape(-1, 2, 6)
 
-    def felt(self, wrenches: np.ndarray) -> np.ndarray:
-        """What joints feel of them, by push and by friction, shape (2, joints): J^T."""
+    def on_joints(self, wrenches: np.ndarray) -> np.ndarray:
+        """What they do to joints, by push and by friction, shape (2, joints): J^T."""
         return np.einsum("la,ad,lkd->ka", self.carried, self.joints.S_n, wrenches)
 
     def bent(self) -> np.ndarray:
@@ -169,60 +163,58 @@ class JointStage(Stage):
         return np.einsum("la,lb,bad,lkd->kba", self.carried, self.carried, turns, self.wrenches)
 
     def bent_by_held(self) -> np.ndarray:
-        """How what joints feel of vertices that links hold changes as joint b turns where the pass begins, [b, a]."""
-        J, out = self.joints, np.zeros((self.joints.count, self.joints.count))
-        turns, pull = J.turns(J.S_n), self.pull
-        for rows, _, carried in J.grips:
-            force, moment = pull[rows].sum(0), np.cross(self.y_n[rows], pull[rows]).sum(0)
-            out += (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
-        return out
+        """How what vertices that links hold do to joints changes as joint b turns where the pass begins, [b, a]."""
+        J, pull = self.joints, self.pull
+        turns = J.turns(J.S_n)
+        parts = (by_turns(turns, carried, self.y_n[rows], pull[rows]) for rows, _, carried in J.grips)
+        return sum(parts, np.zeros((J.count, J.count)))
 
-    def weighed(self, felt: np.ndarray) -> np.ndarray:
+    def weighed(self, acting: np.ndarray) -> np.ndarray:
         """What counts of it in the equation of w."""
-        return self.blend * felt[0] + felt[1]
+        return self.blend * acting[0] + acting[1]
 
     def left(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(what is left of that equation, sizes of what it adds up, what digits of places leave)"""
+        """(what is left of that equation, by its sign a force, sizes of what it adds up, what digits of places leave)"""
         J = self.joints
-        own, size, noise = J.own_forces()
-        x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
-        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
+        own, size = J.own_forces()
+        given = np.abs(self.given[self.own])
+        sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(self.x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
-        F = self.weighed(self.felt(self.wrenches)) - J.h * own + np.einsum("iad,id->a", self.J_n, self.pull)
+        pull, J_n = self.pull, self.J_n
+        R = J.h * own - self.weighed(self.on_joints(self.wrenches)) - on_joints(J_n, pull)
         speeds = np.abs(self.chord) + np.abs(self.v_star), 1e-15 * np.abs(self.y_n) / J.h
-        held, rounding = (np.einsum("iad,id->a", np.abs(self.J_n), self.m * x) for x in speeds)
-        return F, J.h * size + met + held, J.h * noise + rounding
+        held, rounding = (on_joints(np.abs(J_n), self.m * x) for x in speeds)
+        return R, J.h * size + met + held, J.h * J.rounding() + rounding
 
     def find(self, meets: bool = False) -> None:
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
-        self.v_star = runtime.fetch_row(self.pair.v, 1)[self.joints.at]
-        J, (F, size, noise), best, stalled = self.joints, self.left(), np.inf, 0
-        for _ in range(ROUNDS):
-            share = float(np.max(np.abs(F) / (max(1e-14, 4 * J.eps) * size + noise)))
-            stalled = 0 if share < 0.5 * best else stalled + 1
-            if share <= 1 or (stalled > 3 and np.all(np.abs(F) <= J.loose * size + noise)) or stalled > 20:
-                break
-            best = min(best, share)
-            step = -np.linalg.solve(self.slope(meets), F)
-            if not step @ F < 0:  # which friction alone can do
-                step = -np.linalg.solve(self.slope(), F)
-            w, slope, t = J.w, step @ F, 1.0
-            while True:
-                self.go(w + t * step)
-                if meets:
-                    self.launch("press")
-                    self.look()
-                    self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
-                F, size, noise = self.left()
-                if step @ F <= -J.falls * slope or t < 1e-12:
-                    break
-                t *= 0.5
-        share = float(np.max(np.abs(F) / (size + noise / J.loose)))
+        J = self.joints
+
+        def left():
+            if len(J.at):
+                self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
+            return self.left()
+
+        def stand(w):
+            self.go(w)
+            if meets:
+                self.launch("press")
+                self.look()
+            return left()
+
+        def direction(R):
+            step, w = np.linalg.solve(self.slope(meets), R), J.w
+            if not step @ R > 0:  # which friction alone can do
+                step = np.linalg.solve(self.slope(), R)
+            return step, 1.0, lambda t: stand(w + t * step)
+
+        R, size, noise = balanced(left(), direction, max(1e-14, 4 * J.eps), J.loose, ROUNDS)
+        share = float(np.max(np.abs(R) / (size + noise / J.loose)))
         if not share <= J.loose:
             remedy = "take smaller steps, or begin with links outside of the body"
             error = NotConverged(f"joints of robots are out of balance by {share:.2g}: {remedy}", [share])
             raise self.ws.dated(error, self.at.j, self.at.num_passes)
-        J.w = J.w - np.linalg.solve(self.slope(), F)  # so that momentum is kept to round-off
+        J.w = J.w + np.linalg.solve(self.slope(), R)  # so that momentum is kept to round-off
         J.q = J.q_n + J.h * J.w
 
     def slope(self, meets: bool = False) -> np.ndarray:
@@ -241,12 +233,12 @@ class JointStage(Stage):
 
     def rebound(self) -> np.ndarray:
         """(1 - b) A^-1 J^T P"""
-        return (1 - self.blend) * np.linalg.solve(self.inertia, self.felt(self.wrenches)[0])
+        return (1 - self.blend) * np.linalg.solve(self.inertia, self.on_joints(self.wrenches)[0])
 
     def answers(self) -> np.ndarray:
-        """Changes of what joints feel by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
-        displacements, velocities and impulses of the vertices that are near; follows: by what v* of those that links hold
-        changes."""
+        """Changes of what acts on joints, by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
+        displacements, velocities and impulses of the vertices that are near; `follows`: those of J^T m v* of vertices that
+        links hold."""
         J, change = self.joints, self.change
         out, self.follows = np.zeros((2, J.count, J.count)), np.zeros((J.count, J.count))
         near, held = np.nonzero(self.near[:, None] == J.at)
@@ -260,9 +252,9 @@ class JointStage(Stage):
             self.launch("press_jvp", rate_dot=0.0)
             du, dv = (runtime.fetch_row(x, 0)[self.near] for x in (change.u, change.v))
             given = runtime.look(change.impulse)[:, self.near].astype(np.float64)
-            out[:, :, b] = self.felt(self.wrenches_of(given))
+            out[:, :, b] = self.on_joints(self.wrenches_of(given))
             self.moves.append((b, du, dv, given))
-            self.follows[:, b] = np.einsum("iad,id->a", self.J_n[held], self.m[held] * dv[near])
+            self.follows[:, b] = on_joints(self.J_n[held], self.m[held] * dv[near])
         return out
 
     # ---- what derivatives need -----------------------------------------------------------------------------------------
@@ -320,22 +312,21 @@ class JointStageTangent(Stage):
         led_n, led = (J.from_joints(q, own.dlocal) for q in (J.q_n, J.q))
         dy_n, dm = np.einsum("iad,a->id", stage.J_n, own.dq) + led_n, ws.mass_of(own.tangent)[at_held]
         dpull = dm * (stage.chord - stage.v_star) + stage.m * ((led - dy_n) / h - v[0, at_held])
-        turned = np.cross(J.holding * J.S_n[:, 3:], dy_n[:, None])
-        dF = dF + np.einsum("iad,id->a", stage.J_n, dpull) + np.einsum("iad,id->a", turned, stage.pull)
-        dF = dF + own.dq @ stage.bent_by_held()
+        turned = J.holding * moved_jvp(J.S_n, dy_n)
+        dF = dF + on_joints(stage.J_n, dpull) + on_joints(turned, stage.pull) + own.dq @ stage.bent_by_held()
         if touches:
             near, answers, z = stage.near, stage.answers(), stage.rebound()
             given = runtime.fetch(run.impulses.impulse).astype(np.float64)
             wrenches = stage.wrenches_of(given[:, near])
             dx = (du_n + own.tangent.rest)[near]
             wrenches[..., 3:] += np.cross(dx, stage.given[stage.own]).sum(1).reshape(-1, 2, 3)
-            felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
-            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers) - stage.follows, dF + stage.weighed(felt))
-            felt = felt[0] + answers[0] @ dw
+            acting = stage.on_joints(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
+            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers) - stage.follows, dF + stage.weighed(acting))
+            acting = acting[0] + answers[0] @ dw
             _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
             by_q, by_m = stage.mass_derivatives(z)
             dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
-            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * felt - dA)
+            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * acting - dA)
             for b, du_b, dv_b, given_b in stage.moves:
                 u[0, near] += du_b * dw[b]
                 v[0, near] += dv_b * dw[b]
@@ -367,12 +358,8 @@ class JointStageAdjoint(JointAdjoint):
         super().seed_frames(seeds)
         if not self.ws.solver.last_frame_is_state:  # its last pass shows the last frame
             self.clear()
-        a = self.ws.arrays
-        self.by_rest, self.by_gravity, self.by_mass = (
-            np.zeros((a.num_vertices, 3)),
-            np.zeros(3),
-            np.zeros(a.num_vertices),
-        )
+        a, n = self.ws.arrays, self.ws.arrays.num_vertices
+        self.by_rest, self.by_mass, self.by_gravity = np.zeros((n, 3)), np.zeros(n), np.zeros(3)
         self.by_steps = SimpleNamespace(joints=np.zeros_like(a.rows["joints"]))
 
     @contextmanager
@@ -394,7 +381,7 @@ class JointStageAdjoint(JointAdjoint):
             by_end, by_begin = p[J.at] + q[J.at] / h, -q[J.at] / h  # of where links have the vertices that they hold
             self.by_rest[J.at] -= p[J.at]
             p[J.at], q[J.at] = 0.0, 0.0
-            by_w = by_w + h * np.einsum("iad,id->a", stage.J_end, by_end)
+            by_w = by_w + h * on_joints(stage.J_end, by_end)
         if touches:
             near, answers, z = stage.near, stage.answers(), stage.rebound()
             K = K + stage.weighed(answers) - stage.follows
@@ -411,12 +398,12 @@ class JointStageAdjoint(JointAdjoint):
             q[J.at] = stage.m * moved_by
             by_end, by_begin = by_end - q[J.at] / h, by_begin + q[J.at] / h - np.cross(stage.pull, turn)
             self.by_mass[J.at] -= (moved_by * (stage.chord - stage.v_star)).sum(1)
-            self._to_q_n += np.einsum("iad,id->a", stage.J_n, by_begin) - stage.bent_by_held() @ w
+            self._to_q_n += on_joints(stage.J_n, by_begin) - stage.bent_by_held() @ w
             self.by_local += J.to_joints(J.q, by_end) + J.to_joints(J.q_n, by_begin)
             runtime.fill(run.u, p[None])
             runtime.fill(run.v, q[None])
         if touches:
-            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what joints feel
+            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what acts on joints
             seeds = self._with(seeds, by)
             own = stage.carried[:, None] * by  # (links, 2, joints)
             turn = np.repeat((own @ J.S_n[:, 3:]).reshape(-1, 1, 3), len(near), 1)
@@ -439,10 +426,10 @@ class JointStageAdjoint(JointAdjoint):
             self.add_frame(frame)
 
     def _with(self, seeds, by: np.ndarray) -> np.ndarray:
-        """Adjoints of all impulses, with those by what joints feel."""
+        """Adjoints of all impulses, with those by what acts on joints."""
         stage, J = self.stage, self.joints
         out = np.zeros((2 * len(stage.ws.arrays.obstacles), *self.by_rest.shape)) + seeds
-        arms = moved(J.S_n, J.places(J.u_n)[1][stage.near])  # (near, joints, 3)
+        arms = moved(J.S_n, stage.x)  # (near, joints, 3)
         for link, k in enumerate(stage.own[::2] // 2):
             for side in range(2):
                 out[2 * k + side, stage.near] += np.einsum("a,iad->id", stage.carried[link] * by[side], arms)
@@ -451,9 +438,8 @@ class JointStageAdjoint(JointAdjoint):
     def collect(self, out) -> None:
         """Add what was summed up."""
         super().collect(out)
-        at = self.ws.arrays.features().gravity
-        if at >= 0:
-            out.parameters[at : at + 3] += self.by_gravity
+        gravity_adj = self.ws.arrays.gravity_of(out)
+        gravity_adj += self.by_gravity
         out.joints += self.by_steps.joints
         if out.mass is not None:
             out.mass = out.mass + self.by_mass

@@ -15,7 +15,7 @@ link's point there by J_a = v_a + w_a x x. Since turning link and vertex togethe
 J' being taken at the place where the step begins, from which friction takes its arm.
 
 Vertices that a link holds move with it, u_a = y(q) - X, and are no unknowns of their own. With R_a what acts on them, less
-their inertia, and J = dy/dq, the joints feel J^T R_a, and to K come, u being the other vertices,
+their inertia, and J = dy/dq, J^T R_a acts on the joints, and to K come, u being the other vertices,
 
     K_uq += K_ua J,    K_qq += J^T K_aq + K_qa J + J^T K_aa J - R_a . dJ/dq.
 """
@@ -30,6 +30,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.common import rotations
 from diffsim_ti.common.errors import NotConverged
+from diffsim_ti.mechanics.joints.twists import by_turns, moved, on_joints
 from diffsim_ti.mechanics.obstacles.contact_record import Shares
 from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.mesh.sets import pieces
@@ -40,13 +41,35 @@ from diffsim_ti.terms.robots.model import bracket
 
 STIFF = 1e6  # of a prescribed joint's drive, and of a limit, over inertia / h^2
 AT_REST = 0.01  # [s], h of these in equilibria
-FIRM = 1e-9  # stiffness of what is held in an equilibrium, over the largest that a joint meets, or inertia / s^2
+STABLE = (
+    1e-9  # least stiffness of what is held in an equilibrium, over the largest that a joint meets, or inertia / s^2
+)
 HELD = "hold the joint by drive_stiffness, prescribe it, or take a solver with inertia"
+FALLS = 0.8  # how steeply Phi may rise along a step where it ends, against how it fell
 
 
-def moved(S: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Velocities at points of twists S, shape (..., joints, 3), of points of shape (..., 3)."""
-    return S[:, :3] + np.tensordot(x, rotations.skew(S[:, 3:]), (-1, 2))
+def balanced(at: tuple, direction, eps: float, loose: float, most: int) -> tuple:
+    """(R, sizes of what it adds up, what digits leave) where Newton's method, from `at`, finds that R is zero to `eps` of
+    these, or, once it gains no more, to `loose`.
+
+    direction(R): (step, share of it that is tried first, t -> (R, ...) at that share). A share is good where R along the
+    step has not turned round to more than FALLS of what it was.
+    """
+    (R, size, noise), best, stalled = at, np.inf, 0
+    for _ in range(most):
+        left = float(np.max(np.abs(R) / (eps * size + noise)))
+        stalled = 0 if left < 0.5 * best else stalled + 1
+        if not left > 1 or (stalled > 3 and np.all(np.abs(R) <= loose * size + noise)) or stalled > 20:
+            break
+        best = min(best, left)
+        step, t, go = direction(R)
+        slope = float(R @ step)
+        while True:
+            R, size, noise = go(t)
+            if float(R @ step) >= -FALLS * slope or t < 1e-12:
+                break
+            t *= 0.5
+    return R, size, noise
 
 
 class Pushed(NamedTuple):
@@ -64,7 +87,6 @@ class Joints:
     """Of a workspace, made when its arrays are loaded. q: joint positions [rad or m] that belong to the body's place."""
 
     most = 200  # rounds
-    falls = 0.8  # how steeply Phi may rise along a step where it ends, against how it fell
 
     def __init__(self, workspace):
         self.ws, self.a, self.p = weakref.proxy(workspace), workspace.arrays, workspace.potential
@@ -162,9 +184,9 @@ class Joints:
         """The same with velocities."""
         self.put(rows, q)
         self.poses_n, self.S_n = self.kinematics(q)
-        self._put_rates(rows, v)
+        self.put_rates(rows, v)
 
-    def _put_rates(self, rows: np.ndarray, rate: np.ndarray) -> None:
+    def put_rates(self, rows: np.ndarray, rate: np.ndarray) -> None:
         for (k, carried), (_, t) in zip(self.links, self.poses_n):
             J = moved(self.S_n, t)
             rows[3 * k + RATE] = (rate * carried) @ J
@@ -172,9 +194,9 @@ class Joints:
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 
-    def led_on(self, q, v, q_before, v_before) -> tuple[np.ndarray, ...]:
-        """(x, y) where inertia starts from, as of vertices, and where the joints are and how fast they are as the pass ends,
-        to its order, of the states now and before; linear in these."""
+    def extrapolated(self, q, v, q_before, v_before) -> tuple[np.ndarray, ...]:
+        """(x, y) where inertia starts from, as of vertices, and positions and velocities where the pass ends, extrapolated
+        from the states now and before; linear in these."""
         (a0, a1), (b0, b1) = self.weights
         return tuple(
             m * one + n * other for m, n in ((a0, a1), (b0, b1)) for one, other in ((q, q_before), (v, v_before))
@@ -186,26 +208,25 @@ class Joints:
         self.moves = 0.0 if stage.static else 1.0  # without which there is neither inertia nor damping
         r = np.sqrt(-stage.a1 / stage.a0)  # w / (1 + w) of a step that is w times as long as the one before
         self.weights = (stage.a0, stage.a1), (self.moves / (1 - r), -self.moves * r / (1 - r))
-        self.x, self.y, self.q_on, self.v_on = self.led_on(self.q_n, self.v_n, *before)
+        self.x, self.y, self.q_on, self.v_on = self.extrapolated(self.q_n, self.v_n, *before)
         self.poses_n, self.S_n = self.kinematics(self.q_n)
-        self.reach = np.where(self.S_n[:, 3:].any(1), 0.5, np.ptp(a.values.rest, 0).max())  # of a round at rest
         _, _, self.k, self.c, self.masses = self.robots.numbers(a.values.parameters)
         self.load(j, stage)
         self.stiff = STIFF * self.robots.typical / (self.h if self.moves else AT_REST) ** 2
         self.k = np.where(self.robots.prescribed, self.stiff, self.k)
         self.c = self.moves * (self.c + self.robots.damping)
-        self.q, self._held, self._placed, self._anchor, self.felt = self.q_n.copy(), None, None, None, 0.0
+        self.q, self._held, self._placed, self._anchor, self.held_sizes = self.q_n.copy(), None, None, None, 0.0
         self._back = None
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
-        self._put_rates(rows, np.zeros(self.count))
+        self.put_rates(rows, np.zeros(self.count))
 
     def load(self, j: int, stage: Stage) -> None:
         """Take targets, torques and weight of pass j; statics lay on a share of these."""
-        schedule, given, at, self.j = self.ws.solver.schedule, self.a.rows["joints"], self.a.features().gravity, j
+        schedule, given, self.j = self.ws.solver.schedule, self.a.rows["joints"], j
         self.share, self.laid = self.ws.share_at_stage(j, stage), 1.0 if self.moves else self.ws.load_share(j, stage)
         self.targets = schedule.pressure(given, j, self.share)
         self.torques = self.laid * given[schedule.load_row(given, j)][:, 2]
-        self.gravity = self.laid * self.a.values.parameters[at : at + 3] if at >= 0 else np.zeros(3)
+        self.gravity = self.laid * self.a.gravity_of(self.a.values)
         self._weigh()
         self.forget()
 
@@ -248,9 +269,10 @@ class Joints:
     def end(self) -> None:
         """The pass is over. Raises NotConverged where the joints are not in balance, or nothing holds them at rest."""
         if not self.moves:
-            self.check_firm()
+            self.check_stable()
+        smaller = "take smaller steps" if self.moves else "give positions of joints nearer to the equilibrium"
         if not self.left <= max(self.ws.solver.tolerance, self.loose):
-            remedy = "take smaller steps" if self.moves else HELD
+            remedy = smaller if self.moves else HELD
             raise NotConverged(
                 f"the joints of robots are out of balance by {self.left:.2g} of their forces: {remedy}", [self.left]
             )
@@ -258,11 +280,11 @@ class Joints:
         met = self.ws.collisions.detection.nearest(self.p.held_at, self.rows[::3]) if meets else None
         if met and (met.obstacle in dict(self.links) or np.isin(met.vertices, self.at).any()):
             obstacle = self.a.contacts[met.obstacle].name
-            raise NotConverged(f"{obstacle} has got {-met.value:.2g} m into {met}: take smaller steps", [self.left])
+            raise NotConverged(f"{obstacle} has got {-met.value:.2g} m into {met}: {smaller}", [self.left])
         turned = np.abs(self.q - self.q_n) * np.linalg.norm(self.S_n[:, 3:], axis=1)
         if any(turned @ carried >= np.pi for _, carried in self.links):
-            raise NotConverged("a link of a robot turns by more than half a turn: take smaller steps", [self.left])
-        self.now = self.q.copy(), self.moves * self.rate, sum(self._efforts()), *self.now[:2]
+            raise NotConverged(f"a link of a robot turns by more than half a turn: {smaller}", [self.left])
+        self.now = self.q.copy(), self.moves * self.rate, sum(self.efforts()), *self.now[:2]
 
     def forget(self) -> None:
         """Rows of obstacles were written by others."""
@@ -284,7 +306,7 @@ class Joints:
             self.q_on[own], self.v_on[own], self.acceleration[own], self.masses[own], self.gravity
         )
 
-    def check_firm(self, R: np.ndarray | None = None) -> None:
+    def check_stable(self, R: np.ndarray | None = None) -> None:
         """Raise NotConverged where an equilibrium resists no motion of joints, which pieces of the body on links follow.
 
         R: what acts on vertices where one is looked for [N]: what that pulls may come to be held."""
@@ -302,20 +324,20 @@ class Joints:
             if R is not None:
                 pull = np.einsum("aid,id->a", ways, R)
         values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
-        firm, away = max(FIRM, 2 * self.eps), abs(vectors[:, 0] @ (pull / scale)) / (np.abs(vectors[:, 0]) @ scale)
-        seeks = R is not None and (values[0] < -firm or away > 1e-3 * firm)
-        if not (values[0] > firm or seeks):
+        least, away = max(STABLE, 2 * self.eps), abs(vectors[:, 0] @ (pull / scale)) / (np.abs(vectors[:, 0]) @ scale)
+        sought = R is not None and (values[0] < -least or away > 1e-3 * least)
+        if not (values[0] > least or sought):
             name = np.concatenate([robot.joints for robot in self.robots.terms])[np.argmax(np.abs(vectors[:, 0]))]
-            how = "nothing holds" if values[0] > -firm else "the equilibrium is unstable along"
+            how = "nothing holds" if values[0] > -least else "the equilibrium is unstable along"
             raise NotConverged(f"static solve: {how} joint {str(name)!r} of a robot: {HELD}", [self.left])
 
-    def _own_forces(self) -> tuple[np.ndarray, np.ndarray]:
+    def own_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(-dPhi/dq but for contact, sizes of what it adds up)"""
-        parts = -self.bias, *self._efforts()
+        parts = -self.bias, *self.efforts()
         size = np.abs(self.M) @ np.abs(self.acceleration) + sum(np.abs(part) for part in parts)
         return sum(parts) - self.M @ self.acceleration, size
 
-    def _efforts(self) -> tuple[np.ndarray, ...]:
+    def efforts(self) -> tuple[np.ndarray, ...]:
         """Of torques, drives, damping and limits [N m or N]."""
         drive, damping = -self.k * (self.q - self.targets), -self.c * self.rate
         return self.torques, drive, damping, -self._limits()[1]
@@ -335,11 +357,11 @@ class Joints:
         """How efforts fall as joints move: stiffness of drives, damping and limits."""
         return self.k + self.c / self.h + self._limits()[2]
 
-    def _rounding(self) -> np.ndarray:
+    def rounding(self) -> np.ndarray:
         """Of each joint's own forces, by the digits of their positions."""
         reach = np.abs(self.q) + np.abs(self.q_n) + self.h * np.abs(self.v_n)
         own = 1e-15 * (np.abs(self.M) @ reach / self.h**2 + self.yielding * reach) + 1e-300
-        return own + self.eps * self.felt
+        return own + self.eps * self.held_sizes
 
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
@@ -352,18 +374,18 @@ class Joints:
         drives = 0.5 * self.k * (self.q - self.targets) ** 2 + 0.5 * self.c * self.h * self.rate**2
         return np.array([inertia, weight, drives.sum(), -self.torques @ d, self._limits()[0].sum()])
 
-    def _stand(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Go to q; (-dPhi/dq, sizes of what it adds up)."""
+    def _stand(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Go to q; (-dPhi/dq, sizes of what it adds up, what digits of places leave)."""
         self.q, self._linear = q, None
         if not self.moves:  # the weight is that at rest
             self.q_on = q
             self._weigh()
         u = self._carry(u)
         self.put(self.rows, q)
-        self._put_rates(self.rows, self.rate)
+        self.put_rates(self.rows, self.rate)
         if len(self.rows):
             runtime.fill(self.p.poses, self.rows)
-        R, size = self._own_forces()
+        R, size = self.own_forces()
         x, x_n = self.places(u)
         _, self.S = self.kinematics(q)
         self.pushed = []
@@ -374,14 +396,14 @@ class Joints:
             J, J_n = (carried[:, None] * moved(S, y[at]) for S, y in ((self.S, x), (self.S_n, x_n)))
             self.pushed.append(Pushed(at, f[at], drag[at], J, J_n))
             for arm, force in ((J, f[at]), (J_n, drag[at])):
-                R = R - np.einsum("iad,id->a", arm, force)
-                size = size + np.einsum("iad,id->a", np.abs(arm), np.abs(force))
+                R = R - on_joints(arm, force)
+                size = size + on_joints(np.abs(arm), np.abs(force))
         if len(self.at):
             self.pull, sizes = (x[self.at] for x in self.ws.newton.balance(u, *self.problem))
             self.J_a = self.ways(self.S, x[self.at])
-            R = R + np.einsum("iad,id->a", self.J_a, self.pull)
+            R = R + on_joints(self.J_a, self.pull)
             size = size + np.linalg.norm(self.J_a, axis=2).T @ sizes
-        return R, size
+        return R, size, self.rounding()
 
     def _carry(self, u: np.ndarray) -> np.ndarray:
         """u with the vertices that links hold where they are at q; the potential goes there."""
@@ -415,31 +437,21 @@ class Joints:
             self._placed = own if np.array_equal(own, back) else None
             self._stand(self.q, u)
             return
-        R, size = self._stand(self._predicted(u), u)
-        best, stalled = np.inf, 0
+        at = self._stand(self._predicted(u), u)
         scale = np.sqrt(np.diag(self.M) / self.h**2 + self.yielding)  # of joints, some stiff, some light
-        for _ in range(self.most):
-            noise = self._rounding()
-            left = float(np.max(np.abs(R) / (max(1e-13, 4 * self.eps) * size + noise)))
-            stalled = 0 if left < 0.5 * best else stalled + 1
-            fair = np.all(np.abs(R) <= self.loose * size + noise)
-            if not left > 1 or (stalled > 3 and fair) or stalled > 20:
-                break
-            best = min(best, left)
+
+        def direction(R):
             _, K = self.linear
             values, vectors = np.linalg.eigh(K / np.outer(scale, scale))
             values = np.maximum(np.abs(values), 1e-12 * max(np.abs(values).max(), 1.0))
-            step = vectors @ ((vectors.T @ (R / scale)) / values) / scale
-            if not self.moves:
-                step = step * min(1.0, 1 / np.max(np.abs(step) / self.reach))
-            slope, q = float(R @ step), self.q
-            t = self._free_share(u, q, step)
-            while True:
-                R, size = self._stand(q + t * step, u)
-                if float(R @ step) >= -self.falls * slope or t < 1e-12:
-                    break
-                t *= 0.5
-        self.left = float(np.max(np.abs(R) / (size + 1e6 * self._rounding())))
+            step, q = vectors @ ((vectors.T @ (R / scale)) / values) / scale, self.q
+            if not self.moves:  # no farther than half a radian, or the size of the body
+                most = np.where(self.S_n[:, 3:].any(1), 0.5, np.ptp(self.a.values.rest, 0).max())
+                step = step * min(1.0, 1 / np.max(np.abs(step) / most))
+            return step, self._free_share(u, q, step), lambda t: self._stand(q + t * step, u)
+
+        R, size, noise = balanced(at, direction, max(1e-13, 4 * self.eps), self.loose, self.most)
+        self.left = float(np.max(np.abs(R) / (size + 1e6 * noise)))
 
     def _free_share(self, u, q: np.ndarray, step: np.ndarray) -> float:
         """How far links may go along a step of the joints."""
@@ -472,9 +484,7 @@ class Joints:
                 turned = np.tensordot(f, rotations.skew(w), (1, 2))  # (k, joints, 3), of f as the link turns
                 HJ, FJ = np.einsum("jid,iaj->iad", H, J), np.einsum("jid,iaj->iad", F, J_n)
                 columns.append((at, -np.swapaxes(turned + HJ + FJ, 1, 2)))
-                force, moment = f.sum(0), np.cross(x[at], f).sum(0)
-                bent = turns[..., :3] @ force + turns[..., 3:] @ moment
-                K = K + (bent * carried * carried[:, None]).T
+                K = K + by_turns(turns, carried, x[at], f).T
                 K = K + np.einsum("iad,ibd->ab", J, turned + HJ) + np.einsum("iad,ibd->ab", J_n, FJ)
         if len(self.at):
             columns, K = self._with_held(columns, K)
@@ -490,11 +500,10 @@ class Joints:
             w = np.zeros((n, 3))
             w[self.at] = J[:, a]
             own[..., a] = self.of_places(w)
-        self.felt = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
+        self.held_sizes = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
         turns, y = self.turns(self.S), self.places(self.p.held_at)[0][self.at]
         for rows, _, carried in self.grips:
-            force, moment = -self.pull[rows].sum(0), -np.cross(y[rows], self.pull[rows]).sum(0)
-            K = K + ((turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]).T
+            K = K - by_turns(turns, carried, y[rows], self.pull[rows]).T
         pulled = np.cross(self.holding * self.S[:, 3:], self.pull[:, None])
         crossed = np.einsum("iad,idb->ab", J, of_links[self.at])
         K = K + np.einsum("iad,ibd->ab", pulled, J) + crossed + crossed.T + np.einsum("iad,idb->ab", J, own[self.at])

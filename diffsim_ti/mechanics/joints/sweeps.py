@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti.mechanics.joints.joints import moved
+from diffsim_ti.mechanics.joints.twists import by_turns, moved, moved_jvp, on_joints
 from diffsim_ti.mechanics.obstacles.contact_record import SharesAdjoint
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
 
@@ -77,9 +77,7 @@ class JointSweep:
         J, out = self.joints, []
         turns, x_n = J.turns(J.S_n), J.places(J.p.held_at)[1]
         for (_, carried), part in zip(J.links, J.pushed):
-            force, moment = part.drag.sum(0), np.cross(x_n[part.at], part.drag).sum(0)
-            bent = (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
-            out.append((part.at, carried, part.f, part.drag, bent))
+            out.append((part.at, carried, part.f, part.drag, by_turns(turns, carried, x_n[part.at], part.drag)))
         return out
 
 
@@ -98,8 +96,8 @@ class JointTangent(JointSweep):
         self.dlocal = J.to_joints(q, moved_on)
 
     def begin(self) -> None:
-        """The pass is open. dx, dy, dq_on, dv_on: changes of what `led_on` says."""
-        self.dx, self.dy, self.dq_on, self.dv_on = self.joints.led_on(self.dq, self.dv, *self.before)
+        """The pass is open. dx, dy, dq_on, dv_on: changes of what `extrapolated` says."""
+        self.dx, self.dy, self.dq_on, self.dv_on = self.joints.extrapolated(self.dq, self.dv, *self.before)
 
     def note(self) -> None:
         """A frame has the change of the present state."""
@@ -118,8 +116,7 @@ class JointTangent(JointSweep):
         J, moved_numbers, out = self.joints, self.tangent, np.zeros(self.joints.count)
         _, _, dk, dc, dm = J.robots.numbers(moved_numbers.parameters)
         dk = np.where(J.robots.prescribed, 0.0, dk)
-        at = J.a.features().gravity
-        dg = moved_numbers.parameters[at : at + 3] if at >= 0 else np.zeros(3)
+        dg = J.a.gravity_of(moved_numbers)
         for robot, own in self._each():
             by_q, by_v, by_m, by_g = J.derivatives(robot, own)
             out[own] -= by_q @ self.dq_on[own] + by_v @ self.dv_on[own] + by_m @ dm[own] + J.laid * by_g @ dg
@@ -133,13 +130,13 @@ class JointTangent(JointSweep):
         x, x_n = J.places(J.p.held_at)
         dx, dx_n = held + moved_numbers.rest, du + moved_numbers.rest
         if len(J.at):
-            out += np.einsum("iad,id->a", J.J_a, dR[J.at])
-            out += np.einsum("iad,id->a", J.holding * np.cross(J.S[:, 3:], dx[J.at][:, None]), J.pull)
+            out += on_joints(J.J_a, dR[J.at])
+            out += on_joints(J.holding * moved_jvp(J.S, dx[J.at]), J.pull)
         for (k, *_), (vertices, carried, f, drag, bent) in zip(J.links, self._of_friction()):
             both = ((J.S, x, shares[k, 0], f, dx), (J.S_n, x_n, shares[k, 1], drag, dx_n))
             for S, y, change, force, dy in both:
-                out -= carried * np.einsum("iad,id->a", moved(S, y[vertices]), change[vertices])
-                out -= carried * np.einsum("iad,id->a", np.cross(S[:, 3:], dy[vertices][:, None]), force)
+                out -= carried * on_joints(moved(S, y[vertices]), change[vertices])
+                out -= carried * on_joints(moved_jvp(S, dy[vertices]), force)
             out -= self.dq @ bent
         return out
 
@@ -188,7 +185,7 @@ class JointAdjoint(JointSweep):
         self.by_v = J.moves * self.by_v
         self._seed = self.by_q + self.by_v / J.h + by_q - J.yielding * self.by_effort
         if len(J.at):
-            self._seed = self._seed + np.einsum("iad,id->a", J.J_a, by_ends[J.at])
+            self._seed = self._seed + on_joints(J.J_a, by_ends[J.at])
         return seed - J.of_joints(J.follow(self._seed), seed.shape)
 
     def with_held(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -269,5 +266,5 @@ class JointAdjoint(JointSweep):
         if out.rest is not None:
             out.rest[J.at] += by
         out.displacement[J.at] += by
-        by_q = self.by_q - np.einsum("iad,id->a", J.ways(J.kinematics(q)[1], x), by)
+        by_q = self.by_q - on_joints(J.ways(J.kinematics(q)[1], x), by)
         J.robots.add_numbers(out.parameters, np.concatenate([[by_q, self.by_v], self.numbers[2:]]))

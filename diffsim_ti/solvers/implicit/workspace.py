@@ -300,7 +300,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         """
         if self.joints and stage.static:
             self.potential.place(u)
-            self.joints.check_firm(self.newton.balance(u, *problem)[0])
+            self.joints.check_stable(self.newton.balance(u, *problem)[0])
         starts = [held_as(self.free, held, self.rigid.nearest(u + self.linear * (start - u))) for start in starts]
         near = self.approach(u, held, starts, problem)
         near = self.closing.approached(near, problem) if self.solver.loose else near
@@ -315,7 +315,7 @@ class ImplicitWorkspace(PrescribedInPasses):
                 raise
             if self.joints and stage.static:  # which nothing has come to hold
                 self.potential.place(u)
-                self.joints.check_firm(0 * u)
+                self.joints.check_stable(0 * u)
             return LoadStepping(self)(j, stage, u, held, problem, error)
 
     def check_upright(self, u, there) -> None:

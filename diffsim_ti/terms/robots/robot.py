@@ -61,8 +61,8 @@ class Robot(GivenOverTime, Term):
     explicit steps they meet obstacles with their own mass before they go where links have them, without rebound.
     Limits of joints hold by the one-sided potential E_limit = k d^3 / (6 w) of what is beyond them by d < w, 1e-4 of the
     range, and of constant stiffness k = 10^6 M / h^2 beyond (in equilibria with h = 0.01 s): joints stop there without
-    rebound. Limits of effort and
-    velocity in the file have no effect; nor have limits of prescribed joints, but where they start.
+    rebound. Limits of effort and velocity in the file have no effect; nor have limits of prescribed joints, but where they
+    start.
 
     All inputs have a gradient, by names that begin with the robot's: "positions", "velocities", shape (joints,), where a
     run starts [rad or m, per s]; "torques", (joints,) or (steps, joints) [N m or N]; "targets", of shape (joints,),
