@@ -121,7 +121,7 @@ RECORDED = [
     ),
     (lambda a: (a - 1.5) ** 0 + a[(0, 0, 1, 1),] + a[:, [2, 2, 0]] + np.einsum("i j -> j", a) + np.square(a), (4, 3)),
     (
-        lambda a: np.tanh(np.stack([a[0], a[1]], -1)).T + np.minimum(a[2], 1.0) + np.transpose(a)[:, :1].squeeze(),
+        lambda a: np.tanh(np.stack([a[0], a[1]], -1)).T + np.minimum(a[2], 1.0) + np.squeeze(np.transpose(a)[:, :1]),
         (4, 3),
     ),
     (lambda a, b: arrays.ratio(a, np.linalg.norm(b, axis=1, keepdims=True)), (4, 3), (4, 3)),
