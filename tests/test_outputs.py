@@ -119,6 +119,11 @@ RECORDED = [
         lambda a: np.roll(a, 1, 0) + np.repeat(a[:1], 4, 0) + np.tile(a[0], (4, 1)) + np.broadcast_to(a[2], (4, 3)),
         (4, 3),
     ),
+    (lambda a: (a - 1.5) ** 0 + a[(0, 0, 1, 1),] + a[:, [2, 2, 0]] + np.einsum("i j -> j", a) + np.square(a), (4, 3)),
+    (
+        lambda a: np.tanh(np.stack([a[0], a[1]], -1)).T + np.minimum(a[2], 1.0) + np.squeeze(np.transpose(a)[:, :1]),
+        (4, 3),
+    ),
     (lambda a, b: arrays.ratio(a, np.linalg.norm(b, axis=1, keepdims=True)), (4, 3), (4, 3)),
     (lambda a, b: arrays.replaced(b, np.array([3, 1]), a) + arrays.summed_at(np.array([0, 2]), a, 4), (2, 3), (4, 3)),
 ]
@@ -139,9 +144,27 @@ def test_sweeps_over_what_arrays_record(function, shapes):
     assert (seed * change).sum() == pytest.approx(pulled, rel=1e-12)
 
 
-@pytest.mark.parametrize("function", [np.floor, np.sort, np.array])
+def changed(x):
+    x += 1.0
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        np.floor,
+        np.sort,
+        np.array,
+        np.add.accumulate,
+        changed,
+        lambda x: np.add.at(np.zeros(3), [0, 0, 1], x),
+        lambda x: np.linalg.norm(x, 1),
+        lambda x: np.einsum("ii->", x[:, None] * x),
+        lambda x: x.astype(int),
+        lambda x: x.max(),
+    ],
+)
 def test_functions_without_a_derivative_say_so(function):
-    with pytest.raises(TypeError, match="derivative"):
+    with pytest.raises((TypeError, AttributeError), match="derivative"):
         function(arrays.Recorded(np.ones(3)))
 
 

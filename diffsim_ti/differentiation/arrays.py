@@ -16,7 +16,7 @@ _numbers = count()
 
 class Node:
     """A value with what it was made of: parents are (node, change of the value for that of the node, adjoint of the node for
-    that of the value). None stands for zero. An adjoint may also be a function that adds it to what `zeros` gives."""
+    that of the value). None stands for zero. Either may also be a function that adds it to what `zeros` gives."""
 
     def __init__(self, value, parents: Iterable = (), zeros: Callable | None = None):
         self.value, self.parents, self.number = value, tuple(parents), next(_numbers)
@@ -31,20 +31,28 @@ class Recorded(Node, NDArrayOperatorsMixin):
     size = property(lambda self: np.size(self.value))
     T = property(lambda self: linear(self, np.transpose, np.transpose))
 
-    def __array__(self, *_, **__):
+    def _refuse(self, *_, **__):
         raise TypeError(
-            "an array whose derivatives are asked for cannot be made a plain one: leave np.array out, or write jvp and vjp"
+            "an array whose derivatives are asked for is not made a plain one, nor changed in place: take np.stack, "
+            "np.concatenate or np.where, and y = y + x for y += x, or write jvp and vjp beside value"
         )
 
+    __array__ = __float__ = __bool__ = __setitem__ = _refuse
+
+    def __getattr__(self, name: str):
+        raise AttributeError(f"arrays have no derivative by .{name} here: write jvp and vjp beside value")
+
     def __array_ufunc__(self, ufunc, method, *x, **how):
+        if "out" in how or method == "at":
+            self._refuse()
         if ufunc is np.matmul:
             return _matmul(*x)
         plain = [value_of(a) for a in x]
         y = getattr(ufunc, method)(*plain, **how)
         if ufunc in PARTIALS and method == "__call__" and not how:
-            slopes = [partial(y, *plain) if isinstance(a, Recorded) else 0 for a, partial in zip(x, PARTIALS[ufunc])]
-            return made(y, *((a, s.__mul__, s.__mul__) for a, s in zip(x, map(np.asarray, slopes))))
-        if y.dtype.kind == "f" and ufunc is not np.sign:
+            by = [lambda d, own=own: own(d, y, *plain) for own in PARTIALS[ufunc]]
+            return made(y, *zip(x, by, by))
+        if np.asarray(y).dtype.kind == "f" and ufunc is not np.sign:
             raise TypeError(f"np.{ufunc.__name__} has no derivative here: write jvp and vjp beside value")
         return y
 
@@ -65,18 +73,12 @@ class Recorded(Node, NDArrayOperatorsMixin):
 
     def __getitem__(self, index):
         parts = index if isinstance(index, tuple) else (index,)
-        listed = any(isinstance(part, list | np.ndarray) for part in parts)
+        if any(isinstance(part, list | tuple | np.ndarray) for part in parts):  # which may name a place twice
+            return _moved(lambda x: x[index], self)
+        return linear(self, lambda x: x[index], lambda seed: lambda into: _add_at(into, index, seed))
 
-        def add(into, seed):
-            if listed:
-                np.add.at(into, index, seed)
-            else:
-                into[index] += seed
-
-        return linear(self, lambda x: x[index], lambda seed: lambda into: add(into, seed))
-
-    def astype(self, _):
-        return self
+    def astype(self, kind, **_):
+        return self if np.dtype(kind).kind == "f" else self._refuse()
 
     copy = __copy__ = lambda self: self
 
@@ -147,9 +149,10 @@ def summed_at(places: np.ndarray, x, count: int):
     """Sums of what stands in the same places, shape (count, ...): x has the axes of `places`, and others behind."""
 
     def add(x):
-        out = np.zeros((count, *x.shape[places.ndim :]))
-        np.add.at(out, places, x)
-        return out
+        shape = x.shape[places.ndim :]
+        each = int(np.prod(shape))
+        at = places.reshape(-1, 1) * each + np.arange(each)
+        return np.bincount(at.ravel(), x.ravel(), count * each).reshape(count, *shape)
 
     return linear(x, add, lambda seed: seed[places])
 
@@ -171,48 +174,50 @@ def ratio(a, b):
 
 def forward(y, changes: Iterable[tuple[Node, object]]):
     """Change of y for changes of nodes."""
-    known = {id(node): change for node, change in changes}
+    known, own = {id(node): change for node, change in changes}, set()
     for node in _before(y):
         if id(node) not in known:
-            terms = [push(known[id(p)]) for p, push, _ in node.parents if known.get(id(p)) is not None]
-            terms = [term for term in terms if term is not None]
-            total = sum(terms[1:], terms[0]) if terms else None
-            known[id(node)] = np.broadcast_to(total, node.shape) if terms and isinstance(node, Recorded) else total
+            for parent, push, _ in node.parents:
+                if known.get(id(parent)) is not None:
+                    _add(known, own, node, push(known[id(parent)]))
     change = known.get(id(y))
     return np.zeros(np.shape(value_of(y))) if change is None else np.array(change)
 
 
 def reverse(y, seed, leaves: Iterable[Node]) -> list:
     """Adjoints of the leaves for that of y; None where y does not depend on one."""
-    known = {id(y): np.asarray(seed, np.float64)}
+    known, own = {id(y): np.asarray(seed, np.float64)}, set()
     for node in reversed(_before(y)):
         if id(node) in known:
             for parent, _, pull in node.parents:
-                _add(known, parent, pull(known[id(node)]))
-    return [known.get(id(leaf)) for leaf in leaves]
+                _add(known, own, parent, pull(known[id(node)]))
+    found = [(id(leaf) in own, known.get(id(leaf))) for leaf in leaves]
+    return [x if x is None or fresh else np.array(x) for fresh, x in found]
 
 
-def _add(known: dict, node: Node, more) -> None:
-    if more is None:
-        return
-    if not callable(more):
-        more = _unspread(np.asarray(more), node.shape)
-        if id(node) not in known:
-            known[id(node)] = np.array(more)
-            return
-    into = known.setdefault(id(node), None)
-    if into is None:
-        into = known[id(node)] = node.zeros()
+def _add(known: dict, own: set, node: Node, more) -> None:
+    """Add to what is known of a node; own: those whose arrays nothing else has."""
+    key = id(node)
     if callable(more):
-        more(into)
-    else:
-        into += more
+        if key not in own:
+            known[key] = np.array(known[key]) if key in known else node.zeros()
+            own.add(key)
+        more(known[key])
+    elif more is not None:
+        more = _fitted(np.asarray(more), node.shape) if isinstance(node, Recorded) else more
+        known[key] = known[key] + more if key in known else more
 
 
-def _unspread(x: np.ndarray, shape: tuple) -> np.ndarray:
-    """The adjoint of what was broadcast from a shape."""
-    x = x.sum(tuple(range(x.ndim - len(shape))))
-    axes = tuple(k for k, n in enumerate(shape) if n == 1 and x.shape[k] > 1)
+def _add_at(into: np.ndarray, index, x) -> None:
+    into[index] += x
+
+
+def _fitted(x: np.ndarray, shape: tuple) -> np.ndarray:
+    """Spread to a shape, or the adjoint of what was spread from it."""
+    if x.shape == shape:
+        return x
+    x = x.sum(tuple(range(x.ndim - len(shape)))) if x.ndim > len(shape) else x
+    axes = tuple(k for k in range(-x.ndim, 0) if shape[k] == 1 < x.shape[k])
     return np.broadcast_to(x.sum(axes, keepdims=True) if axes else x, shape)
 
 
@@ -230,25 +235,26 @@ def _before(y) -> list[Node]:
 # ---- what NumPy does with arrays that record ----------------------------------------------------------------------------
 
 
-def _moved(function: Callable, given, *more, **how):
-    """What a function that moves or repeats numbers makes of an array, or of several."""
-    several = isinstance(given, list | tuple)
-    parts = list(given) if several else [given]
-    ends = np.cumsum([0, *(np.size(value_of(part)) for part in parts)])
+def _moved(function: Callable, x, *more, **how):
+    """What a function that moves or repeats numbers makes of an array."""
+    size, shape = np.size(x), np.shape(x)
 
-    def run(arrays):
-        return function(arrays if several else arrays[0], *more, **how)
+    def pull(seed):
+        at = function(np.arange(size).reshape(shape), *more, **how)
+        return np.bincount(at.ravel(), seed.ravel(), size).reshape(shape)
 
-    at = run([np.arange(a, b).reshape(np.shape(value_of(part))) for a, b, part in zip(ends, ends[1:], parts)])
-    none = [np.zeros(np.shape(value_of(part))) for part in parts]
+    return linear(x, lambda x: function(x, *more, **how), pull)
 
-    def parent(k):
-        def pull(seed):
-            return np.bincount(at.ravel(), seed.ravel(), ends[-1])[ends[k] : ends[k + 1]].reshape(none[k].shape)
 
-        return parts[k], lambda dx: run([*none[:k], dx, *none[k + 1 :]]), pull
+def _concatenate(parts, axis=0):
+    y = np.concatenate([value_of(part) for part in parts], axis)
+    ends = np.cumsum([0, *(np.shape(part)[axis] for part in parts)])
 
-    return made(run([value_of(part) for part in parts]), *map(parent, range(len(parts))))
+    def parent(part, a, b):
+        place = (*[slice(None)] * (axis % y.ndim), slice(a, b))
+        return part, lambda dx: lambda into: _add_at(into, place, dx), lambda seed: seed[place]
+
+    return made(y, *map(parent, parts, ends, ends[1:]))
 
 
 def _matmul(a, b):
@@ -268,7 +274,13 @@ def _cross(a, b):
 
 
 def _einsum(letters: str, *x, optimize=False):
-    plain = [value_of(a) for a in x]
+    plain, letters = [value_of(a) for a in x], letters.replace(" ", "")
+    given = letters.partition("->")[0].replace(".", "").split(",")
+    if "->" not in letters or any(len(set(word)) < len(word) for word in given):
+        raise TypeError(
+            f"np.einsum({letters!r}) has no derivative here: write its -> out, take np.diagonal for a letter that stands "
+            "twice in one array, or write jvp and vjp beside value"
+        )
     further = [np.ndim(a) - len(word) + 3 for a, word in zip(plain, letters.split("->")[0].split(",")) if "..." in word]
     words, out = letters.replace("...", "ABCDEF"[: max(further, default=0)]).split("->")
     words = words.split(",")
@@ -312,22 +324,35 @@ def _eigvalsh(A):
     return made(np.linalg.eigvalsh(A.value), (A, push, lambda seed: np.einsum("...ia,...a,...ja->...ij", n, seed, n)))
 
 
-# derivatives by each argument, of the value and the arguments; that of a root is zero where it is
+def _norm(x, ord=None, axis=None, keepdims=False):
+    if ord is not None:
+        raise TypeError(f"np.linalg.norm of ord {ord!r} has no derivative here: write jvp and vjp beside value")
+    return np.sqrt((x * x).sum(axis, keepdims))
+
+
+# changes for that of each argument, which are adjoints, too, of the value and the arguments; that of a root is zero where
+# it is
 PARTIALS = {
-    np.add: (lambda y, a, b: 1.0, lambda y, a, b: 1.0),
-    np.subtract: (lambda y, a, b: 1.0, lambda y, a, b: -1.0),
-    np.multiply: (lambda y, a, b: b, lambda y, a, b: a),
-    np.divide: (lambda y, a, b: 1 / b, lambda y, a, b: -y / b),
-    np.power: (lambda y, a, n: n * a ** (n - 1), lambda y, a, n: y * np.log(a)),
-    np.arctan2: (lambda y, a, b: b / (a * a + b * b), lambda y, a, b: -a / (a * a + b * b)),
-    np.maximum: (lambda y, a, b: (a >= b) * 1.0, lambda y, a, b: (a < b) * 1.0),
-    np.negative: (lambda y, a: -1.0,),
-    np.absolute: (lambda y, a: np.sign(a),),
-    np.exp: (lambda y, a: y,),
-    np.log: (lambda y, a: 1 / a,),
-    np.sin: (lambda y, a: np.cos(a),),
-    np.cos: (lambda y, a: -np.sin(a),),
-    np.sqrt: (lambda y, a: np.divide(0.5, y, out=np.zeros_like(y), where=y > 0),),
+    np.add: (lambda d, y, a, b: d, lambda d, y, a, b: d),
+    np.subtract: (lambda d, y, a, b: d, lambda d, y, a, b: -d),
+    np.multiply: (lambda d, y, a, b: d * b, lambda d, y, a, b: d * a),
+    np.divide: (lambda d, y, a, b: d / b, lambda d, y, a, b: -d * (y / b)),
+    np.power: (
+        lambda d, y, a, n: d * (n * a ** np.where(n == 0, 1, n - 1)[()]),
+        lambda d, y, a, n: d * (y * np.log(np.where(a == 0, 1, a))),
+    ),
+    np.arctan2: (lambda d, y, a, b: d * b / (a * a + b * b), lambda d, y, a, b: -d * a / (a * a + b * b)),
+    np.maximum: (lambda d, y, a, b: d * (a >= b), lambda d, y, a, b: d * (a < b)),
+    np.minimum: (lambda d, y, a, b: d * (a <= b), lambda d, y, a, b: d * (a > b)),
+    np.negative: (lambda d, y, a: -d,),
+    np.absolute: (lambda d, y, a: d * np.sign(a),),
+    np.square: (lambda d, y, a: d * 2 * a,),
+    np.exp: (lambda d, y, a: d * y,),
+    np.log: (lambda d, y, a: d / a,),
+    np.sin: (lambda d, y, a: d * np.cos(a),),
+    np.cos: (lambda d, y, a: -d * np.sin(a),),
+    np.tanh: (lambda d, y, a: d * (1 - y * y),),
+    np.sqrt: (lambda d, y, a: d * np.divide(0.5, y, out=np.zeros_like(y), where=y > 0),),
 }
 FUNCTIONS = {
     np.sum: Recorded.sum,
@@ -335,15 +360,19 @@ FUNCTIONS = {
     np.reshape: Recorded.reshape,
     np.swapaxes: Recorded.swapaxes,
     np.moveaxis: lambda x, a, b: linear(x, lambda x: np.moveaxis(x, a, b), lambda seed: np.moveaxis(seed, b, a)),
+    np.expand_dims: lambda x, axis: x.reshape(np.expand_dims(x.value, axis).shape),
+    np.broadcast_to: lambda x, shape: linear(x, lambda x: np.broadcast_to(x, shape), lambda seed: seed),
+    np.concatenate: _concatenate,
+    np.stack: lambda parts, axis=0: _concatenate([np.expand_dims(part, axis) for part in parts], axis),
     np.einsum: _einsum,
     np.cross: _cross,
     np.where: _where,
-    np.clip: lambda x, low, high: _where((x > low) & (x < high), x, np.clip(x.value, low, high)),
-    np.linalg.norm: lambda x, axis=None, keepdims=False: np.sqrt((x * x).sum(axis, keepdims)),
+    np.clip: lambda x, low, high: np.minimum(np.maximum(x, low), high),
+    np.linalg.norm: _norm,
     np.linalg.inv: _inv,
     np.linalg.solve: lambda A, b: np.linalg.inv(A) @ b,
     np.linalg.det: _det,
     np.linalg.eigvalsh: _eigvalsh,
 }
-MOVING = {np.stack, np.concatenate, np.broadcast_to, np.repeat, np.tile, np.roll, np.diagonal, np.expand_dims}
-WITHOUT = {np.shape, np.ndim, np.size, np.zeros_like, np.ones_like}
+MOVING = {np.repeat, np.tile, np.roll, np.diagonal, np.transpose, np.squeeze, np.ravel, np.flip, np.take}
+WITHOUT = {np.shape, np.ndim, np.size, np.zeros_like, np.ones_like, np.argmax, np.argmin, np.argsort}

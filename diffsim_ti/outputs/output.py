@@ -185,7 +185,7 @@ class _Recording:
     def tangent(self, y, change: "Change") -> np.ndarray:
         """Change of what was made of the frames."""
         changes = [(leaf, getattr(change, name)) for name, leaf in self.leaves.items()]
-        return forward(y, [*changes, (self.numbers, change.inputs)])
+        return forward(y, [*changes, (self.numbers, change.inputs or None)])
 
     def adjoint(self, y, seed: np.ndarray) -> "Change":
         """Gradient for that by what was made of them."""
@@ -204,9 +204,9 @@ class Output(metaclass=Public):
     Write one outside the package by giving it `name`, `shape` and `value`, in NumPy and float64; it is then in
     `frames[name]` and `Rollout.tangents`, takes a seed in `Rollout.vjp(frames, name=...)`, and has a field under
     `ti.ad.Tape` and a tensor in torch. `frames` (`Frames`) holds the states and, in `frames.inputs`, the values of
-    all inputs. Derivatives are found from `value` (differentiation/arrays.py), which says with a TypeError what it has none
-    of; there write `jvp` and `vjp` beside it. Rollout.tangents and Rollout.vjp must then agree in <w, J d> = <J^T w, d>:
-    check that, and differences.
+    all inputs. Derivatives are found from `value` (differentiation/arrays.py), where an error says what has none; there
+    write `jvp` and `vjp` beside it. What `np.where` does not choose has to be finite for them, too. Rollout.tangents and
+    Rollout.vjp must then agree in <w, J d> = <J^T w, d>: check that, and differences.
     Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.
     """
 
