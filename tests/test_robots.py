@@ -372,7 +372,7 @@ def test_every_gradient_goes_through_body_and_joints(pressing, kind):
     assert (sides[0] - sides[1]) / (2 * size) == pytest.approx(whole, rel=1e-5)
 
 
-def test_what_links_do_to_vertices_they_feel_in_the_same_step(pressing):
+def test_what_links_do_to_vertices_acts_back_in_the_same_step(pressing):
     """The joints' equation with forces that the body has, from Pinocchio alone: left over is the rounding of the solve."""
     import pinocchio as pin
 

@@ -291,7 +291,7 @@ def _by_element(mesh: TetrahedralMesh, nodal: np.ndarray, parents: np.ndarray, c
 
 
 def _of_steps(own: Replay, frames: "Frames", number: Number, values: dict) -> tuple[float, float]:
-    """Error of the steps, and how large it is before it cancels: by steps of half the length, and the order of the solver."""
+    """Error of the steps, and that before it cancels: by steps of half the length, and the order of the solver."""
     rollout, solver = own.rollout, own.rollout.solver
     if not solver.order:
         return 0.0, 0.0

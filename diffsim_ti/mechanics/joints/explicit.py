@@ -10,7 +10,7 @@ is solved for w by Newton's method: links move by J A^-1 J^T times what vertices
 the other loses, to round-off, whatever is left of this equation. Fixed vertices do not stop links.
 
 Vertices that links hold are kicked like all, to velocities v*, and then go where links have them, y(q), at d = (y(q + h w) -
-y(q)) / h: joints feel J^T m (d - v*), which joins the equation. All of P counts in it, b = 1, so that v' = w and d stays.
+y(q)) / h: on joints acts J^T m (d - v*), which joins the equation. All of P counts in it, b = 1, so that v' = w and d stays.
 """
 
 import weakref
@@ -159,8 +159,8 @@ class JointStage(Stage):
         x = self.joints.places(self.joints.u_n)[1][self.near]
         return np.concatenate([own.sum(1), np.cross(x, own).sum(1)], 1).reshape(-1, 2, 6)
 
-    def felt(self, wrenches: np.ndarray) -> np.ndarray:
-        """What joints feel of them, by push and by friction, shape (2, joints): J^T."""
+    def on_joints(self, wrenches: np.ndarray) -> np.ndarray:
+        """What acts on joints by them, by push and by friction, shape (2, joints): J^T."""
         return np.einsum("la,ad,lkd->ka", self.carried, self.joints.S_n, wrenches)
 
     def bent(self) -> np.ndarray:
@@ -169,7 +169,7 @@ class JointStage(Stage):
         return np.einsum("la,lb,bad,lkd->kba", self.carried, self.carried, turns, self.wrenches)
 
     def bent_by_held(self) -> np.ndarray:
-        """How what joints feel of vertices that links hold changes as joint b turns where the pass begins, [b, a]."""
+        """How what acts on joints by vertices that links hold changes as joint b turns where the pass begins, [b, a]."""
         J, out = self.joints, np.zeros((self.joints.count, self.joints.count))
         turns, pull = J.turns(J.S_n), self.pull
         for rows, _, carried in J.grips:
@@ -177,9 +177,9 @@ class JointStage(Stage):
             out += (turns[..., :3] @ force + turns[..., 3:] @ moment) * carried * carried[:, None]
         return out
 
-    def weighed(self, felt: np.ndarray) -> np.ndarray:
+    def weighed(self, acts: np.ndarray) -> np.ndarray:
         """What counts of it in the equation of w."""
-        return self.blend * felt[0] + felt[1]
+        return self.blend * acts[0] + acts[1]
 
     def left(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(what is left of that equation, sizes of what it adds up, what digits of places leave)"""
@@ -188,7 +188,7 @@ class JointStage(Stage):
         x, given = J.places(J.u_n)[1][self.near], np.abs(self.given[self.own])
         sizes = np.concatenate([given.sum(1), np.abs(np.cross(np.abs(x), given)).sum(1)], 1).reshape(-1, 2, 6)
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
-        F = self.weighed(self.felt(self.wrenches)) - J.h * own + np.einsum("iad,id->a", self.J_n, self.pull)
+        F = self.weighed(self.on_joints(self.wrenches)) - J.h * own + np.einsum("iad,id->a", self.J_n, self.pull)
         speeds = np.abs(self.chord) + np.abs(self.v_star), 1e-15 * np.abs(self.y_n) / J.h
         held, rounding = (np.einsum("iad,id->a", np.abs(self.J_n), self.m * x) for x in speeds)
         return F, J.h * size + met + held, J.h * noise + rounding
@@ -241,10 +241,10 @@ class JointStage(Stage):
 
     def rebound(self) -> np.ndarray:
         """(1 - b) A^-1 J^T P"""
-        return (1 - self.blend) * np.linalg.solve(self.inertia, self.felt(self.wrenches)[0])
+        return (1 - self.blend) * np.linalg.solve(self.inertia, self.on_joints(self.wrenches)[0])
 
     def answers(self) -> np.ndarray:
-        """Changes of what joints feel by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
+        """Changes of what acts on joints, by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
         displacements, velocities and impulses of the vertices that are near; follows: by what v* of those that links hold
         changes."""
         J, change = self.joints, self.change
@@ -260,7 +260,7 @@ class JointStage(Stage):
             self.launch("press_jvp", rate_dot=0.0)
             du, dv = (runtime.fetch_row(x, 0)[self.near] for x in (change.u, change.v))
             given = runtime.look(change.impulse)[:, self.near].astype(np.float64)
-            out[:, :, b] = self.felt(self.wrenches_of(given))
+            out[:, :, b] = self.on_joints(self.wrenches_of(given))
             self.moves.append((b, du, dv, given))
             self.follows[:, b] = np.einsum("iad,id->a", self.J_n[held], self.m[held] * dv[near])
         return out
@@ -329,13 +329,13 @@ class JointStageTangent(Stage):
             wrenches = stage.wrenches_of(given[:, near])
             dx = (du_n + own.tangent.rest)[near]
             wrenches[..., 3:] += np.cross(dx, stage.given[stage.own]).sum(1).reshape(-1, 2, 3)
-            felt = stage.felt(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
-            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers) - stage.follows, dF + stage.weighed(felt))
-            felt = felt[0] + answers[0] @ dw
+            acts = stage.on_joints(wrenches) + np.einsum("kba,b->ka", stage.bent(), own.dq)
+            dw = -np.linalg.solve(stage.slope() + stage.weighed(answers) - stage.follows, dF + stage.weighed(acts))
+            acts = acts[0] + answers[0] @ dw
             _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
             by_q, by_m = stage.mass_derivatives(z)
             dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
-            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * felt - dA)
+            dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * acts - dA)
             for b, du_b, dv_b, given_b in stage.moves:
                 u[0, near] += du_b * dw[b]
                 v[0, near] += dv_b * dw[b]
@@ -416,7 +416,7 @@ class JointStageAdjoint(JointAdjoint):
             runtime.fill(run.u, p[None])
             runtime.fill(run.v, q[None])
         if touches:
-            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what joints feel
+            by = np.stack([by_push - stage.blend * w, -w])  # adjoints of what acts on joints
             seeds = self._with(seeds, by)
             own = stage.carried[:, None] * by  # (links, 2, joints)
             turn = np.repeat((own @ J.S_n[:, 3:]).reshape(-1, 1, 3), len(near), 1)
@@ -439,7 +439,7 @@ class JointStageAdjoint(JointAdjoint):
             self.add_frame(frame)
 
     def _with(self, seeds, by: np.ndarray) -> np.ndarray:
-        """Adjoints of all impulses, with those by what joints feel."""
+        """Adjoints of all impulses, with those by what acts on joints."""
         stage, J = self.stage, self.joints
         out = np.zeros((2 * len(stage.ws.arrays.obstacles), *self.by_rest.shape)) + seeds
         arms = moved(J.S_n, J.places(J.u_n)[1][stage.near])  # (near, joints, 3)

@@ -15,7 +15,7 @@ link's point there by J_a = v_a + w_a x x. Since turning link and vertex togethe
 J' being taken at the place where the step begins, from which friction takes its arm.
 
 Vertices that a link holds move with it, u_a = y(q) - X, and are no unknowns of their own. With R_a what acts on them, less
-their inertia, and J = dy/dq, the joints feel J^T R_a, and to K come, u being the other vertices,
+their inertia, and J = dy/dq, on the joints acts J^T R_a, and to K come, u being the other vertices,
 
     K_uq += K_ua J,    K_qq += J^T K_aq + K_qa J + J^T K_aa J - R_a . dJ/dq.
 """
@@ -194,7 +194,7 @@ class Joints:
         self.stiff = STIFF * self.robots.typical / (self.h if self.moves else AT_REST) ** 2
         self.k = np.where(self.robots.prescribed, self.stiff, self.k)
         self.c = self.moves * (self.c + self.robots.damping)
-        self.q, self._held, self._placed, self._anchor, self.felt = self.q_n.copy(), None, None, None, 0.0
+        self.q, self._held, self._placed, self._anchor, self.by_vertices = self.q_n.copy(), None, None, None, 0.0
         self._back = None
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
         self._put_rates(rows, np.zeros(self.count))
@@ -339,7 +339,7 @@ class Joints:
         """Of each joint's own forces, by the digits of their positions."""
         reach = np.abs(self.q) + np.abs(self.q_n) + self.h * np.abs(self.v_n)
         own = 1e-15 * (np.abs(self.M) @ reach / self.h**2 + self.yielding * reach) + 1e-300
-        return own + self.eps * self.felt
+        return own + self.eps * self.by_vertices
 
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
@@ -490,7 +490,7 @@ class Joints:
             w = np.zeros((n, 3))
             w[self.at] = J[:, a]
             own[..., a] = self.of_places(w)
-        self.felt = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
+        self.by_vertices = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
         turns, y = self.turns(self.S), self.places(self.p.held_at)[0][self.at]
         for rows, _, carried in self.grips:
             force, moment = -self.pull[rows].sum(0), -np.cross(y[rows], self.pull[rows]).sum(0)
