@@ -199,7 +199,7 @@ def test_what_turns_towards_a_body_within_a_step_is_met_in_time(monkeypatch):
     turn, axis, found = (lambda t: (0, 0, 0, 0, 0, 4.6 * t)), np.array([0.05, -0.3, 0.05]), []
     points = ds.MeshObstacle([axis, axis + [0.34, -0.09, -0.02]], path=turn, about=axis, **BARRIER)
     for many in (1, 10**6):
-        monkeypatch.setattr(mesh_obstacle, "MOST_HELD", many)
+        monkeypatch.setattr(mesh_obstacle, "FEW", many)
         simulator = ds.Simulator(ds.SemiImplicitSolver(cube(points, velocity=(0, 0, 0)), dt=0.095, substeps=50))
         count = simulator.workspace.pairs.nearby.corners.count
         simulator.run(4)
