@@ -451,9 +451,7 @@ class JointStageAdjoint(JointAdjoint):
     def collect(self, out) -> None:
         """Add what was summed up."""
         super().collect(out)
-        at = self.ws.arrays.features().gravity
-        if at >= 0:
-            out.parameters[at : at + 3] += self.by_gravity
+        self.ws.arrays.gravity_of(out)[:] += self.by_gravity
         out.joints += self.by_steps.joints
         if out.mass is not None:
             out.mass = out.mass + self.by_mass

@@ -201,11 +201,11 @@ class Joints:
 
     def load(self, j: int, stage: Stage) -> None:
         """Take targets, torques and weight of pass j; statics lay on a share of these."""
-        schedule, given, at, self.j = self.ws.solver.schedule, self.a.rows["joints"], self.a.features().gravity, j
+        schedule, given, self.j = self.ws.solver.schedule, self.a.rows["joints"], j
         self.share, self.laid = self.ws.share_at_stage(j, stage), 1.0 if self.moves else self.ws.load_share(j, stage)
         self.targets = schedule.pressure(given, j, self.share)
         self.torques = self.laid * given[schedule.load_row(given, j)][:, 2]
-        self.gravity = self.laid * self.a.values.parameters[at : at + 3] if at >= 0 else np.zeros(3)
+        self.gravity = self.laid * self.a.gravity_of(self.a.values)
         self._weigh()
         self.forget()
 

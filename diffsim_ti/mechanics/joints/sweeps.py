@@ -118,8 +118,7 @@ class JointTangent(JointSweep):
         J, moved_numbers, out = self.joints, self.tangent, np.zeros(self.joints.count)
         _, _, dk, dc, dm = J.robots.numbers(moved_numbers.parameters)
         dk = np.where(J.robots.prescribed, 0.0, dk)
-        at = J.a.features().gravity
-        dg = moved_numbers.parameters[at : at + 3] if at >= 0 else np.zeros(3)
+        dg = J.a.gravity_of(moved_numbers)
         for robot, own in self._each():
             by_q, by_v, by_m, by_g = J.derivatives(robot, own)
             out[own] -= by_q @ self.dq_on[own] + by_v @ self.dv_on[own] + by_m @ dm[own] + J.laid * by_g @ dg
