@@ -85,10 +85,8 @@ class Accuracy(metaclass=Public):
 
     @property
     def relative(self) -> float:
-        """Size of the error, or of 0.43 uncancelled of the mesh where that is more, with rounding, over that of the number's
-        change."""
-        error = max(abs(self.error), MISSED * self.uncancelled["mesh"])
-        return (error + abs(self.rounding)) / max(self.size, np.finfo(float).tiny)
+        """Size of the error, with rounding, over that of the number's change."""
+        return (abs(self.error) + abs(self.rounding)) / max(self.size, np.finfo(float).tiny)
 
     def __str__(self) -> str:
         cost = self.cost

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.accuracy.estimate import CANCEL, MISSED, Accuracy
+from diffsim_ti.accuracy.estimate import CANCEL
 from diffsim_ti.accuracy.finer import HELD, is_named, on_finer, on_ten_nodes
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.grid import PATTERNS, box
@@ -78,11 +78,6 @@ def on_coarser(scene: Scene, mesh: TetrahedralMesh) -> Scene:
 
 STEP = 0.1  # of a number's change: what steps may make wrong where its error by the mesh is asked for
 MOST_SUBSTEPS = 64
-
-
-def _error(bar: Accuracy, part: str) -> float:
-    """That of the mesh or of the steps over the number's change, or what is allowed for where it cancels."""
-    return max(abs(getattr(bar, part)), MISSED * bar.uncancelled[part]) / bar.size
 
 
 @dataclass
@@ -188,10 +183,10 @@ class ElementTrials:
             if made.mesh.order == 1 or 40 * seconds <= self.budget:  # of ten nodes the finer mesh has more
                 try:
                     bar = self.quantity.accuracy(self._implicit(made, substeps))
-                    while not _error(bar, "step") <= STEP and substeps < MOST_SUBSTEPS:
+                    while not abs(bar.step) <= STEP * bar.size and substeps < MOST_SUBSTEPS:
                         substeps *= 2
                         bar = self.quantity.accuracy(self._implicit(made, substeps))
-                    error, counted = _error(bar, "mesh"), tuple(CANCEL.format(part) for part in bar.uncancelled)
+                    error, counted = abs(bar.mesh) / bar.size, CANCEL.format("mesh")  # by the finer mesh itself
                     doubts = [note for note in bar.notes if not note.startswith(counted)]
                     doubts = doubts if error < 0.5 else ()  # others are out of the question anyway
                 except (ValueError, FloatingPointError) as problem:
