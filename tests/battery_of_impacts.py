@@ -5,7 +5,7 @@
         [--solver NAME]
 
 Each case runs once; where it raises, what the error advises is done and the case runs again, three times at most.
---turning: obstacles turn about a point near them as well. --rough: they rub. --reduced: the body, or what comes first of it
+--turning: obstacles turn about a point near them as well. --rough: friction. --reduced: the body, or what comes first of it
 and is stiffer, moves by few numbers, in implicit steps and static solves. --order 2: of ten-node tetrahedra, on the
 same grids. --pairs: points and edges of obstacles act by pairs. --meshed: obstacles are triangles, a segment or a point.
 """

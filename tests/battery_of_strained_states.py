@@ -45,9 +45,9 @@ def states(n: int) -> dict[str, tuple[Callable, int]]:
         return scene_of(mesh, lambda t: [0.5 * speed * t, 0.0, 0.0], np.where(stiff, 1e7, 1e3))
 
     def pressed(speed):
-        mesh, felt = cube(), dict(width=2e-3, stiffness_per_area=1e8)
+        mesh, barrier = cube(), dict(width=2e-3, stiffness_per_area=1e8)
         lid = ds.Box(
-            [0.5, 1.127, 0.5], [2.0, 0.25, 2.0], path=lambda t: [0.0, -0.3 * speed * t, 0.0], friction=0.5, **felt
+            [0.5, 1.127, 0.5], [2.0, 0.25, 2.0], path=lambda t: [0.0, -0.3 * speed * t, 0.0], friction=0.5, **barrier
         )
         return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, [lid], fixed="ymin", precision="f64")
 

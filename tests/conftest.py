@@ -90,5 +90,5 @@ def pytest_terminal_summary(terminalreporter, config):
 
 @pytest.fixture
 def vertices_alone(monkeypatch):
-    """Scenes in which nothing but vertices feels obstacles, as for points that happen to have faces between them."""
+    """Scenes in which obstacles act on vertices alone, as for points that happen to have faces between them."""
     monkeypatch.setattr("diffsim_ti.terms.obstacles.obstacle.longest_edge", lambda mesh: 0.0)

@@ -56,7 +56,7 @@ def resting_gap(force: float, stiffness: float = 1e4, width: float = 0.01) -> fl
 
 
 def points(mesh, obstacle, mass: float = 1.0, fixed=(3,), terms=(), **options) -> ds.Scene:
-    """Vertices of one tetrahedron that do not feel each other, `mass` [kg] each; the apex is held."""
+    """Vertices of one tetrahedron that do not act on each other, `mass` [kg] each; the apex is held."""
     return ds.Scene(
         mesh,
         ds.LinearElastic(1e-6, 0.0),

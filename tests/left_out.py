@@ -145,7 +145,7 @@ LEFT_OUT = {
     "rigid ones": """
         test_reduced_explicit::test_all_threads_do_what_one_does[affine]
     """,
-    "rigid sets that rub; sets of a basis that slide": """
+    "rigid sets with friction; sets of a basis that slide": """
         test_reduced_explicit::test_surfaces_push_a_set[rigid-0.0]
     """,
     "its shape, place and width in `test_mesh_obstacle.py`; paths and friction of other shapes": """
@@ -295,7 +295,7 @@ LEFT_OUT = {
         test_loads_together::test_and_beside_patches_and_self_contact[ImplicitEulerSolver-True-options2]
     """,
     "one ball in semi-implicit steps": """
-        test_curved_contact::test_curved_faces_feel_a_ball_where_they_are[ImplicitEulerSolver]
+        test_curved_contact::test_a_ball_acts_on_curved_faces_where_they_are[ImplicitEulerSolver]
     """,
     "the same obstacles by velocity Verlet; the others of backward Euler": """
         test_contact_force::test_seeds_are_the_transpose_of_tangents[euler round]

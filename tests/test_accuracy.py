@@ -94,7 +94,7 @@ def test_new_vertices_go_onto_a_round_surface():
 
 @pytest.mark.parametrize("name, order, size", [("cook", 1, 2), ("cook", 2, 2), ("lame", 1, 3)])
 def test_the_estimate_is_the_true_error(name, order, size):
-    """Effectivity 0.7 to 1.4, where the mesh is solved and by the adjoint, of equilibria and of implicit steps."""
+    """Effectivity 0.7 to 1.4, of equilibria and of implicit steps."""
     found, true = BARS.measured(name, order, size)
     assert 0.7 < found.error / true < 1.4 and abs(true) < found.bar
     assert found.shares.sum() == pytest.approx(found.mesh, rel=1e-6)
@@ -112,6 +112,13 @@ def block(order: int = 1, precision: str = "f64", tolerance: float = 1e-8) -> ds
 def test_a_mesh_without_an_error_has_a_bar_as_small_as_the_tolerance():
     found, true = BARS.measured("uniaxial", 1, 2)
     assert found.relative < 1e-8 and abs(found.error - true) < 1e-12 and not found.notes
+
+
+def test_what_cancels_is_of_the_frames_that_the_number_is_of():
+    off = {"end": np.array([3.0, -1.0])[:, None, None] * [0, 0, 1]}
+    for of_frames, most in (([0, 1], 3.0), ([1, 0], 3.0), ([0.5, 1], 3.0), ([1, 2], 6.0), ([2, 1], 7.0)):
+        number = estimate.Number(block(), "end", np.array(of_frames)[:, None, None] * [0, 0, 1])
+        assert number.largest(off, {"end": 0 * off["end"]}) == most
 
 
 @pytest.fixture

@@ -69,15 +69,15 @@ GAS = [(kind, "f64") for kind in SOLVERS] + [
 def test_every_number_of_a_gas(kind, precision):
     """By a dot product each; the pressure is given for each step (the fuzz has keyframes)."""
     terms = [gas(pressure=1.1 * 101325 * np.array([1.0, 1.1]))]
-    unfelt = ("drag_rate",) if kind is ds.StaticSolver else ()
+    without = ("drag_rate",) if kind is ds.StaticSolver else ()
     gate = (1e-12 if kind.explicit else 1e-8) if precision == "f64" else (3e-5 if kind.explicit else 2e-3)
-    assert_transposed(rollout_of(kind, hollow(terms, precision)), gate, unfelt)
+    assert_transposed(rollout_of(kind, hollow(terms, precision)), gate, without)
 
 
 @pytest.mark.parametrize("kind", [*IMPLICIT, ds.StaticSolver], ids=lambda s: s.__name__)
 def test_every_number_of_a_held_volume(kind):
-    unfelt = ("density",) if kind is ds.StaticSolver else ()
-    assert_transposed(rollout_of(kind, filled()), 1e-8, unfelt)
+    without = ("density",) if kind is ds.StaticSolver else ()
+    assert_transposed(rollout_of(kind, filled()), 1e-8, without)
 
 
 def assert_outputs_transposed(rollout, gate=1e-8) -> None:
@@ -110,7 +110,9 @@ def assert_tangents(rollout, keys, gate=1e-6) -> None:
                 for t in (s, s / 2)
             )  # fmt: off
             exact = (4 * fine - coarse) / 3
-            size = max(np.abs(exact).max(), 3e-5 * np.abs(frames[name]).max())  # a gas of held volume feels no modulus
+            size = max(
+                np.abs(exact).max(), 3e-5 * np.abs(frames[name]).max()
+            )  # no modulus changes a gas of held volume
             assert tangents[name] == pytest.approx(exact, rel=gate, abs=gate * size), (key, name)
 
 

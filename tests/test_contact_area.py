@@ -65,7 +65,7 @@ def test_areas_turn_and_grow_with_the_body():
     np.testing.assert_allclose(areas_of(mesh, 2 * x), 4 * areas_of(mesh, x), rtol=1e-12)
 
 
-# ---- what is felt does not depend on the mesh -------------------------------------------------------------------------
+# ---- contact does not depend on the mesh -----------------------------------------------------------------------------
 
 
 def test_the_gap_under_a_cube_does_not_depend_on_its_mesh():
@@ -164,7 +164,7 @@ def on_a_needle(precision="f64", **options) -> ds.Rollout:
 
 def test_faces_have_areas_too():
     rollout = on_a_needle(stiffness_per_area=1e7)
-    assert_transposed(rollout, 1e-7, ("capsule_start",))  # its other end is felt
+    assert_transposed(rollout, 1e-7, ("capsule_start",))  # its other end acts
     report = ds.check_gradients(rollout, inputs=["rest_positions", "barrier_stiffness_per_area", "barrier_width"])
     assert report.passed, report
 

@@ -56,7 +56,7 @@ def belt(kind) -> ds.Rollout:
     moving = ds.Ground(-0.011, friction=1.5, path=lambda t: [-20 * t, 0, 0], name="floor", **rough)
     wall = ds.HalfSpace([-0.011, 0, 0], [1, 0.2, 0.1], friction=0.3, name="wall", **rough)
     body = points(tetrahedron(), [moving, wall], fixed=[1, 2, 3], initial_velocities=[-1.0, -6.0, 0.3], precision="f64")
-    named = [*outputs()[:2], outputs()[3], ds.ContactForce("wall", "friction", name="rubbed")]
+    named = [*outputs()[:2], outputs()[3], ds.ContactForce("wall", "friction", name="slowed")]
     return ds.Rollout(kind(body, dt=1e-3, contact_damping=0.02), 3, save_every=1, outputs=named, gradients="all")
 
 
@@ -279,18 +279,18 @@ def test_the_impulse_of_a_bounce_is_the_change_of_momentum(kind, gate):
 
 
 def test_friction_that_a_vertex_takes_a_share_of_counts():
-    """Of a free vertex that feels no other force."""
+    """Of a free vertex on which no other force acts."""
     rollout = belt(ds.SemiImplicitSolver)
     frames, mass = rollout.forward(), rollout.scene.inputs.derive(rollout.scene.inputs.values).mass[0]
     forces = frames["held"] + frames["each"].sum(1)
     gained = mass * np.diff(frames.velocities[:, 0], axis=0)
     assert gained == pytest.approx(1e-3 * forces[1:], abs=1e-9 * np.abs(gained).max())  # the law's modulus is 1e-6 Pa
-    assert np.abs(frames["rubbed"]).max() > 0 and np.abs(frames["dragged"]).max() > 0
+    assert np.abs(frames["slowed"]).max() > 0 and np.abs(frames["dragged"]).max() > 0
 
 
 @pytest.mark.parametrize("round_one", [False, True])
-def test_what_faces_feel_counts(round_one):
-    """Of a ball that is smaller than a face, which is felt between corners."""
+def test_what_acts_on_faces_counts(round_one):
+    """Of a ball that is smaller than a face, which acts between corners."""
     scene = pressed(round_one=round_one, terms=pressed(round_one=round_one).terms[:2])
     rollout = ds.Rollout(
         ds.VelocityVerletSolver(scene, dt=1e-3),
@@ -304,7 +304,7 @@ def test_what_faces_feel_counts(round_one):
     assert frames["each"].sum(1) == pytest.approx(frames["held"])
 
 
-def test_each_of_two_that_faces_feel_has_its_own_force():
+def test_each_of_two_that_act_on_faces_has_its_own_force():
     scene = pressed(terms=between(), initial_velocities=(0, 0, 0))
     solver = ds.VelocityVerletSolver(scene, dt=1e-3)
     rollout = ds.Rollout(

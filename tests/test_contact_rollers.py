@@ -1,4 +1,4 @@
-"""Obstacles at vertices that are fixed in some directions: the contact stage pushes and rubs them in the others."""
+"""Obstacles at vertices that are fixed in some directions: the contact stage acts on them in the others."""
 
 import numpy as np
 import pytest

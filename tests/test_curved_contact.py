@@ -1,4 +1,4 @@
-"""Obstacles, and surfaces that meet each other, feel the faces of ten-node tetrahedra as curved as they are."""
+"""Obstacles, and surfaces that meet each other, act on the faces of ten-node tetrahedra as curved as they are."""
 
 import re
 import warnings
@@ -51,7 +51,7 @@ def ball_on_a_ball(solver, **options) -> ds.Rollout:
 
 
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, IMPLICIT])
-def test_curved_faces_feel_a_ball_where_they_are(solver):
+def test_a_ball_acts_on_curved_faces_where_they_are(solver):
     """The gap is that of the curved face to a tenth of a width; gradients know the smaller triangles."""
     rollout = ball_on_a_ball(solver, friction=0.3)
     simulator = ds.Simulator(rollout.solver)
@@ -61,7 +61,7 @@ def test_curved_faces_feel_a_ball_where_they_are(solver):
     assert ds.dot_product_test(rollout) < (1e-11 if solver.explicit else 1e-8)
 
 
-def test_what_is_felt_at_nodes_alone_is_said():
+def test_what_acts_at_nodes_alone_is_said():
     with pytest.warns(
         UserWarning, match=r"lie up to .* m from the triangles of their nodes, where Ground.*a width of (\S+) m"
     ) as said:
@@ -160,14 +160,14 @@ def test_a_run_that_finds_faces_bent_through_each_other_has_smaller_triangles_on
     assert simulator.smallest_gap() > 0 and isinstance(simulator.workspace.pairs, CurvedPairs)
 
 
-def rubbing_balls(precision="f64", friction=0.4, **options) -> ds.Scene:
+def rough_balls(precision="f64", friction=0.4, **options) -> ds.Scene:
     contact = ds.SelfContact(2e3, W, friction=friction, friction_speed=5e-3)
     return balls_face_to_face(precision=precision, **options).replace(terms=[contact])
 
 
 @pytest.mark.parametrize("solver, precision", [(EXPLICIT, "f64"), (ds.BDF2Solver, "f64"), (EXPLICIT, "f32")])
 def test_curved_faces_rub_on_each_other(solver, precision):
-    scene, exact = rubbing_balls(precision), {} if solver.explicit else dict(tolerance=1e-12)
+    scene, exact = rough_balls(precision), {} if solver.explicit else dict(tolerance=1e-12)
     dt, steps = (5e-5, 4) if solver.explicit else (2e-3, 2)
     rollout = ds.Rollout(solver(scene, dt=dt, **exact), steps, gradients="all")
     frames = rollout.forward()
@@ -184,7 +184,7 @@ def test_curved_faces_rub_on_each_other(solver, precision):
         assert ds.check_gradients(rollout, inputs=names, verbose=False).passed
 
 
-def test_rubbing_of_curved_faces_adds_no_energy(monkeypatch):
+def test_friction_of_curved_faces_adds_no_energy(monkeypatch):
     """Whatever the coefficient and the friction speed."""
     seen = follow_parts(monkeypatch)
     for mu, eps in ((1e-2, 1e-5), (1e3, 1e-3)):
@@ -195,9 +195,9 @@ def test_rubbing_of_curved_faces_adds_no_energy(monkeypatch):
 
 
 def test_sets_that_rub_have_points_between_their_nodes():
-    """Those whose nodes are all in the set; so named bodies rub as all do."""
-    scene = rubbing_balls(friction={("body_0", "body_1"): 0.4})
-    named, all_ = (ds.Rollout(EXPLICIT(s, dt=5e-5), 2, gradients=[]).forward() for s in (scene, rubbing_balls()))
+    """Those whose nodes are all in the set; so named bodies have the friction that all have."""
+    scene = rough_balls(friction={("body_0", "body_1"): 0.4})
+    named, all_ = (ds.Rollout(EXPLICIT(s, dt=5e-5), 2, gradients=[]).forward() for s in (scene, rough_balls()))
     np.testing.assert_array_equal(named.positions, all_.positions)
     surface = CollisionSurface(scene.mesh, 1)
     both = np.concatenate([surface.vertex_sets[name] for name in ("body_0", "body_1")])

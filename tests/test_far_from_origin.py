@@ -43,7 +43,7 @@ def all_of_them(**options) -> ds.Scene:
         ds.SelfContact(300.0, 0.1),
         ds.Spring(2, ds.Anchor([0.3, 0.5, 0.6]), 40.0, name="tie"),
         ds.Cable([3, ds.Anchor([0.1, 0.9, 0.2]), 7], length=0.4, stiffness=30.0),
-        *([] if "fixed" in options else [ds.SurfaceDrag(100.0)]),  # which equilibria do not feel
+        *([] if "fixed" in options else [ds.SurfaceDrag(100.0)]),  # which equilibria do not have
         **options,
     )
 

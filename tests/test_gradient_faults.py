@@ -261,7 +261,7 @@ GROUND = ("ground_height", "barrier_stiffness", "barrier_width")
 
 @by_solver
 def test_never_touching(solver):
-    """Zero, not small, by everything about the ground; and I6: no stiffness is felt in free fall."""
+    """Zero, not small, by everything about the ground; and I6: no stiffness acts in free fall."""
     rollout = falling(50, solver)
     frames = rollout.forward()
     w = np.ones(frames.positions[-1].shape)

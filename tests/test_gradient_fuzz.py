@@ -47,8 +47,8 @@ def test_verdicts(seed):
 
 
 @pytest.mark.thorough
-def test_they_feel_what_they_should():
-    """Scenes go where gradients are hard: contact is felt, friction sticks and slides, bodies and statics press."""
+def test_they_meet_what_they_should():
+    """Scenes go where gradients are hard: contact acts, friction sticks and slides, bodies and statics press."""
     report = Report()
     for seed in EXPLICIT + IMPLICIT + OF_EACH_KIND:
         report.add(result(seed))

@@ -115,9 +115,9 @@ def test_no_step_is_too_large_for_the_barrier(speed):
     assert frames.positions[:, :, 1].min() > 0 and frames.velocities[-1, :, 1].mean() > -0.1 * speed
 
 
-def rubbing(solver, shape="ground", **options) -> ds.Rollout:
+def rough(solver, shape="ground", **options) -> ds.Rollout:
     """A body pressed on a moving, rough obstacle, sliding and sticking."""
-    # nearer to what faces feel, these are pushed with 1e6 N at first, and rounding is as large
+    # nearer to what acts on faces, these are pushed with 1e6 N at first, and rounding is as large
     height = 0.02 if shape in ("sphere", "box") else 0.006
     mesh, rng = tetrahedron(height), np.random.default_rng(0)
     obstacle = SHAPES[shape](
@@ -140,7 +140,7 @@ def rubbing(solver, shape="ground", **options) -> ds.Rollout:
 @every
 def test_gradients_through_friction_on_a_moving_obstacle(solver):
     # a deep barrier against a soft body: differences of equilibria see no more than four or five digits
-    report = ds.check_gradients(rubbing(solver), verbose=False, tolerance=1e-4 if solver is ds.StaticSolver else 1e-6)
+    report = ds.check_gradients(rough(solver), verbose=False, tolerance=1e-4 if solver is ds.StaticSolver else 1e-6)
     assert report.passed, str(report)
     assert {"ground_path", "friction", "friction_speed"} <= {row.input for row in report.rows}
 
@@ -156,14 +156,14 @@ def test_gradients_through_friction_on_a_moving_obstacle(solver):
     ],
 )
 def test_reverse_sweep_against_tangent_on_every_shape(shape):
-    assert ds.dot_product_test(rubbing(ds.ImplicitEulerSolver, shape)) < 1e-9
+    assert ds.dot_product_test(rough(ds.ImplicitEulerSolver, shape)) < 1e-9
 
 
 @solvers
 def test_checkpoints_give_the_same_bits(solver):
     results = []
     for every_so_many in (None, 1):
-        rollout = rubbing(solver, checkpoint_every=every_so_many)
+        rollout = rough(solver, checkpoint_every=every_so_many)
         frames = rollout.forward()
         results.append(rollout.vjp(frames, np.ones(frames.positions.shape)))
     for name, gradient in results[0].items():

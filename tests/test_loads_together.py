@@ -42,7 +42,7 @@ def terms() -> dict[str, ds.terms.Term]:
         ),
         "rope": ds.Cable([int(TOP[3]), int(TOP[-1])], length=np.array([0.1, 0.12]), stiffness=80.0, name="rope"),
         "bed": ds.ElasticFoundation(2e4, 1e3, "top", name="bed"),
-        # its friction_speed is felt while the body sticks
+        # its friction_speed counts while the body sticks
         "wall": ds.HalfSpace([0.31, 0, 0], [-1, 0, 0], **ROUGH, name="wall"),
     }
 
@@ -51,7 +51,7 @@ def scene_of(order=None, leave=(), more=(), precision="f64", **options) -> ds.Sc
     named = terms()
     listed = [*more, *(named[name] for name in (order or named) if name not in leave)]
     law = ds.StableNeoHookean(1e5 * np.random.default_rng(2).uniform(0.7, 1.3, BODY.num_tetrahedra), 0.3)
-    moving = np.random.default_rng(6).standard_normal(BODY.vertices.shape)  # so that all springs are felt at once
+    moving = np.random.default_rng(6).standard_normal(BODY.vertices.shape)  # so that all springs act at once
     moving[BODY.vertex_sets["bottom"]] = 0
     given = dict(fixed="bottom", precision=precision, initial_velocities=moving)
     return ds.Scene(BODY, law, 1000.0, listed, **given | options)
@@ -70,8 +70,8 @@ def rollout_of(kind, scene=None, **options) -> ds.Rollout:
 
 @every
 def test_every_number_beside_all_others(kind):
-    unfelt = ("drag_rate",) if kind is ds.StaticSolver else ()
-    assert_transposed(rollout_of(kind), 1e-12 if kind.explicit else 1e-8, unfelt)
+    without = ("drag_rate",) if kind is ds.StaticSolver else ()
+    assert_transposed(rollout_of(kind), 1e-12 if kind.explicit else 1e-8, without)
 
 
 @pytest.mark.executed_ptx

@@ -251,10 +251,10 @@ def test_a_simulation_of_the_command_line_writes_and_draws_forces(tmp_path, caps
     assert arrays["reaction"].shape == arrays["contact"].shape == arrays["friction"].shape == (3, 8, 3)
     top = arrays["rest_positions"][:, 1] > 0.09
     assert np.abs(arrays["reaction"][-1, top]).max() > 0 and not arrays["reaction"][-1, ~top].any()
-    assert arrays["contact"][-1, ~top, 1].sum() > 0  # the floor presses from below and rubs
+    assert arrays["contact"][-1, ~top, 1].sum() > 0  # the floor presses from below, with friction
     normal = (arrays["contact"] - arrays["friction"])[-1, ~top, 1]
-    rubbed = np.linalg.norm(arrays["friction"][-1, ~top], axis=1)
-    assert rubbed.max() > 0 and np.all(rubbed <= 0.5001 * normal)
+    friction = np.linalg.norm(arrays["friction"][-1, ~top], axis=1)
+    assert friction.max() > 0 and np.all(friction <= 0.5001 * normal)
     saved = SavedSeries(tmp_path / "a.pvd").frame(2).fields["contact"]  # in single precision
     assert saved == pytest.approx(arrays["contact"][2], rel=1e-6)
     with pytest.raises(SystemExit) as end:

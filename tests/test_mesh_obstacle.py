@@ -83,7 +83,7 @@ def test_distances_are_exact(name):
 
 
 def test_a_large_tree_finds_what_a_look_at_all_finds():
-    """A bumpy ball of 960 triangles, felt from both sides as one of them is missing."""
+    """A bumpy ball of 960 triangles, which acts to both sides as one of them is missing."""
     x, t = shapes.ball((0, 0, 0), 0.5)
     x = x * (1 + 0.1 * RNG.uniform(-1, 1, (len(x), 1)))
     term = ds.MeshObstacle(x, t[1:])
@@ -129,7 +129,7 @@ def test_flat_and_finely_bent_edges_do_not_act_by_pairs():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_sheet_is_felt_from_both_sides(sign):
+def test_a_sheet_acts_to_both_sides(sign):
     sheet = ds.MeshObstacle(SHEET, SQUARE, path=lambda t: [0, 0.5 * sign * t, 0], **BARRIER | dict(width=0.05))
     lift = 0.02 if sign > 0 else -0.52
     simulator = fallen(sheet, ds.SemiImplicitSolver, lift=lift, velocity=(0, -sign, 0), substeps=8)
@@ -246,7 +246,7 @@ def test_a_crease_presses_by_both_of_its_sides():
 def in_a_groove(solver, dt, steps, path=None, obstacles=(slice(0, 4),)):
     """Two sides with 60 degrees between them hold a wedge of weight N by N / (2 sin 30) each, so that it slides along them
     against mu N / sin 30. The bottom of the groove is out of reach: thick sides are nearer. obstacles: the triangles of
-    each. Returns what presses and rubs at frames, over mu / sin 30, and the frames."""
+    each. Returns normal forces and friction at frames, over mu / sin 30, and the frames."""
     mu, width, radius = 0.2, 0.01, 0.02
     sides = np.array([[x, abs(z), z * np.tan(np.pi / 6)] for x in (-1, 3) for z in (-1.0, 0.0, 1.0)])
     groove = [

@@ -108,7 +108,7 @@ def test_a_block_slides_on_rails_that_no_vertex_meets():
 
 
 def below(kind: str, gap: float = GAP):
-    """An obstacle that no vertex of the cube feels, by a gap below the middle of its bottom, or of an edge of it."""
+    """An obstacle that acts on no vertex of the cube, by a gap below the middle of its bottom, or of an edge of it."""
     if kind == "pin":
         return ds.MeshObstacle([[0.02, -gap, 0.07]], **BARRIER)
     if kind == "ball":
@@ -199,7 +199,7 @@ def test_what_turns_towards_a_body_within_a_step_is_met_in_time(monkeypatch):
     turn, axis, found = (lambda t: (0, 0, 0, 0, 0, 4.6 * t)), np.array([0.05, -0.3, 0.05]), []
     points = ds.MeshObstacle([axis, axis + [0.34, -0.09, -0.02]], path=turn, about=axis, **BARRIER)
     for many in (1, 10**6):
-        monkeypatch.setattr(mesh_obstacle, "MOST_HELD", many)
+        monkeypatch.setattr(mesh_obstacle, "FEW", many)
         simulator = ds.Simulator(ds.SemiImplicitSolver(cube(points, velocity=(0, 0, 0)), dt=0.095, substeps=50))
         count = simulator.workspace.pairs.nearby.corners.count
         simulator.run(4)
@@ -210,7 +210,7 @@ def test_what_turns_towards_a_body_within_a_step_is_met_in_time(monkeypatch):
 
 @lru_cache
 def caught(solver=ds.ImplicitEulerSolver, steps=8, dt=1e-3, outputs=(), **options):
-    """A cube that falls on a wire that turns between its vertices, and would meet itself; all rub."""
+    """A cube that falls on a wire that turns between its vertices, and would meet itself; all with friction."""
     turn = lambda t: (6e-3 * np.sin(30 * t), 0.1 * t, 0.02 * t, 0.5 * t, 3 * t, t)  # noqa: E731
     ends = (-0.03, -0.0115, 0.033), (0.13, -0.013, 0.042)
     rough = dict(friction=0.3, friction_speed=0.05, by_pairs=True, **BARRIER)

@@ -63,7 +63,7 @@ def scene():
     return ds.Scene(cube, law, 1000.0, terms, initial_velocities=(0.1, -0.5, 0.05), precision="f64")
 
 
-def test_that_nothing_is_felt_of_it_between_vertices_is_said(scene):
+def test_that_it_does_not_act_between_vertices_is_said(scene):
     """Unless it was asked for, as in the scene."""
     with pytest.warns(UserWarning, match="Ring.*acts at their vertices alone: .* or pass by_pairs=False"):
         scene.replace(terms=[ring()])
@@ -137,11 +137,11 @@ class TetherForce(VertexwiseForce):
     """Of each vertex; its numbers k, c, d stand in the parameters from `first` on."""
 
     first: int
-    name, reads_rates, adjoints = "tethered", True, dict(tether_felt="vectors")
+    name, reads_rates, adjoints = "tethered", True, dict(by_tether="vectors")
 
     @traced
     def sizes(self, plan):
-        return dict(tether_felt=2 * plan.num_vertices)
+        return dict(by_tether=2 * plan.num_vertices)
 
     @ti.func
     def numbers(self, p: ti.template()):
@@ -163,8 +163,8 @@ class TetherForce(VertexwiseForce):
     def force_vjp(self, i, u, v, w, now: ti.template(), scene: ti.template(), adjoint: ti.template()):
         k, c, d = self.numbers(scene.parameters)
         zero = ti.cast(0, self.fp)
-        adjoint.tether_felt[2 * i] += self.vector(w.dot(d - u), -v.dot(w), zero, zero)
-        adjoint.tether_felt[2 * i + 1] += k * w
+        adjoint.by_tether[2 * i] += self.vector(w.dot(d - u), -v.dot(w), zero, zero)
+        adjoint.by_tether[2 * i + 1] += k * w
         return -k * w, -c * w
 
 
@@ -208,12 +208,12 @@ class Tethers(Interaction):
         return TetherOnHost(self.scene.inputs.parameters.of(self.terms[0]))
 
     def adjoints(self, values, shape):
-        return dict(tether_felt=(2 * self.mesh.num_vertices,))
+        return dict(by_tether=(2 * self.mesh.num_vertices,))
 
     def collect(self, found, out, shape):
-        felt = found["tether_felt"]
-        out.parameters[..., self.first : self.first + 2] += felt[..., ::2, :2].sum(-2)
-        out.parameters[..., self.first + 2 : self.first + 5] += felt[..., 1::2, :].sum(-2)
+        by_each = found["by_tether"]
+        out.parameters[..., self.first : self.first + 2] += by_each[..., ::2, :2].sum(-2)
+        out.parameters[..., self.first + 2 : self.first + 5] += by_each[..., 1::2, :].sum(-2)
 
 
 class Tether(ds.terms.Term):
@@ -230,11 +230,11 @@ class SwingForce(VertexwiseForce):
     """f = b of the step that each kick lies in, alike on all vertices: rows of steps that scenes have for it alone."""
 
     name, asks_for_steps = "swing", True
-    derived, adjoints = dict(swing="vectors2"), dict(swing_felt="vectors2")
+    derived, adjoints = dict(swing="vectors2"), dict(by_swing="vectors2")
 
     @traced
     def sizes(self, plan):
-        return super().sizes(plan) | dict(swing_felt=plan.num_vertices)
+        return super().sizes(plan) | dict(by_swing=plan.num_vertices)
 
     @ti.func
     def mean(self, now: ti.template(), rows: ti.template()):
@@ -251,7 +251,7 @@ class SwingForce(VertexwiseForce):
     @ti.func
     def force_vjp(self, i, u, v, w, now: ti.template(), scene: ti.template(), adjoint: ti.template()):
         for row, share in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
-            adjoint.swing_felt[row, i] = adjoint.swing_felt[row, i] + share * w
+            adjoint.by_swing[row, i] = adjoint.by_swing[row, i] + share * w
         return self.vector(0), self.vector(0)
 
 
@@ -284,10 +284,10 @@ class Swings(Interaction):
         return SwingOnHost()
 
     def adjoints(self, values, shape):
-        return dict(swing_felt=(len(values.swing), self.mesh.num_vertices))
+        return dict(by_swing=(len(values.swing), self.mesh.num_vertices))
 
     def collect(self, found, out, shape):
-        out.swing[..., 0, :] += found["swing_felt"].sum(-2)
+        out.swing[..., 0, :] += found["by_swing"].sum(-2)
 
 
 class Swing(ds.terms.Term):
@@ -319,7 +319,7 @@ def test_a_force_of_ones_own_acts_in_every_solver(tethered, kind):
     assert ds.check_gradients(rollout, inputs=names).passed
 
 
-def test_implicit_and_explicit_steps_feel_the_same(tethered):
+def test_implicit_and_explicit_steps_have_the_same_force(tethered):
     explicit = ds.Rollout(ds.VelocityVerletSolver(tethered, dt=1e-4), 100).forward().positions[-1]
     implicit = ds.Rollout(ds.ImplicitMidpointSolver(tethered, dt=5e-4), 20).forward().positions[-1]
     way = np.abs(explicit - tethered.mesh.vertices).max()

@@ -181,7 +181,7 @@ def test_pressure_on_a_part_is_the_integral_of_its_shape_functions():
 
 
 @EXPLICIT
-def test_explicit_steps_feel_the_same_pressure(solver):
+def test_explicit_steps_have_the_same_pressure(solver):
     """The first acceleration is that of the host's forces."""
     mesh, h = wavy(), 1e-7
     terms = [ds.Pressure(2e4, "lid", name="a"), ds.Pressure(-1e4, "xmin", name="b")]
@@ -295,7 +295,7 @@ def test_every_number_of_a_gas(make, solver):
 
 
 @pytest.mark.parametrize("make", [hollow, pitted])
-def test_explicit_steps_feel_the_gas(make):
+def test_explicit_steps_have_the_gas(make):
     scene, bare, h = make([ds.GasChamber(**GAS)]), make([]), 1e-7
     u = scene.supports.free(0.002 * np.random.default_rng(9).normal(size=scene.mesh.vertices.shape))
     moved = [

@@ -117,7 +117,7 @@ def test_gradients_are_those_of_differences(solver):
 
 @pytest.mark.parametrize("by_differences", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_gradients_where_supports_guide_and_move(by_differences):
-    """Held neighbours are felt by inertia: rollers along directions that are no axes, moved."""
+    """Held neighbours act by inertia: rollers along directions that are no axes, moved."""
     rollout = rollout_of(ds.ImplicitMidpointSolver, fixed={"xmin": (1, 1, 0), "xmax": (0, 1, 2)})
     if by_differences:
         report = ds.verify.check_gradients(rollout, ds.verify.linear_loss(rollout), BY_MASS)

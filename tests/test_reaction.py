@@ -109,7 +109,7 @@ def test_a_simulator_has_them_step_by_step():
     keyed = ds.Traction(lambda t: (2e5 * t, 0.0, -100.0), "xmax")
     floor = ds.Ground(-0.004, stiffness_per_area=3e5, width=0.01, friction=0.4, name="floor")
     named = [ds.Reaction("xmin", per_vertex=True), ds.Reaction(name="all"), ds.Stress(von_mises=True)]
-    named += [ds.ContactForce("floor", per_vertex=True), ds.ContactTraction("floor", "friction", "rubbed")]
+    named += [ds.ContactForce("floor", per_vertex=True), ds.ContactTraction("floor", "friction", "slowed")]
     options = dict(terms=[ds.Gravity(), keyed, floor], initial_velocities=(0.3, -0.4, 0.0))
     for kind in (ds.SemiImplicitSolver, ds.VelocityVerletSolver, ds.ImplicitEulerSolver):
         solver = kind(scene_of(**options), dt=5e-4, substeps=2)
@@ -122,7 +122,7 @@ def test_a_simulator_has_them_step_by_step():
                 if k < 6:
                     simulator.step()
             simulator.reset()
-        assert np.abs(frames["contact_force"][-1]).max() > 0 and np.abs(frames["rubbed"][-1]).max() > 0
+        assert np.abs(frames["contact_force"][-1]).max() > 0 and np.abs(frames["slowed"][-1]).max() > 0
     plain = ds.Simulator(solver)
     assert np.array_equal(plain.output(named[1]), frames["all"][0])
     with pytest.raises(ValueError, match="contact_forces=True"):

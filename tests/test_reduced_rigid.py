@@ -106,7 +106,7 @@ def test_a_ball_rolls_down_a_slope():
 
 @pytest.mark.parametrize("number", [1, 6, 16, 20])
 def test_nothing_passes_through_them(number):
-    """What a battery of impacts found hard: a needle, plates and balls that come, turn and rub."""
+    """What a battery of impacts found hard: a needle, plates and balls that come, turn and slide."""
     solvers = {name: kind for name, kind in ALL.items() if not kind.explicit}
     case = replace(draw(number, 7, solvers, number % 2 == 1, 1, True, number % 3 == 0), reduced="rigid")
     (row,) = battery([case], show=lambda text: None).values()

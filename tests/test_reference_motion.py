@@ -307,7 +307,7 @@ def distorted_mesh(slivers=True):
 @backends
 @materials
 def test_affine_patch(material, precision):
-    """Whatever the affine state, vertices inside feel no force; tetrahedra are distorted, some are slivers."""
+    """Whatever the affine state, no force acts on vertices inside; tetrahedra are distorted, some are slivers."""
     with pytest.warns(UserWarning, match="sliver"):
         mesh = ds.TetrahedralMesh(*distorted_mesh())
     assert mesh.quality.min() < 1e-2
@@ -603,9 +603,9 @@ def standing_tetrahedron(height):
 
 @backends
 @solvers
-def test_ground_beyond_its_width_is_not_felt(solver, precision):
+def test_ground_beyond_its_width_does_not_act(solver, precision):
     """Exactly nothing at and beyond the width, a push within."""
-    for gap, felt in ((0.01 * (1 + 1e-6), False), (0.05, False), (0.0099, True)):
+    for gap, acts in ((0.01 * (1 + 1e-6), False), (0.05, False), (0.0099, True)):
         mesh = standing_tetrahedron(0.0)
         scene = ds.Scene(
             mesh,
@@ -616,8 +616,8 @@ def test_ground_beyond_its_width_is_not_felt(solver, precision):
         )
         simulator = ds.Simulator(solver(scene, dt=1e-3))
         simulator.run(3)
-        assert simulator.velocities.any() == felt
-        assert simulator.compute_energy().parts["contact"] > 0 if felt else simulator.compute_energy() == 0
+        assert simulator.velocities.any() == acts
+        assert simulator.compute_energy().parts["contact"] > 0 if acts else simulator.compute_energy() == 0
 
 
 @pytest.mark.parametrize("solver", FORCE + RESTING)

@@ -43,7 +43,7 @@ def test_what_is_free_flies_straight(kind):
 
 @pytest.mark.parametrize("order, tolerance", [(1, 0.02), (2, 2e-5)])
 def test_a_spinning_bar_grows_as_the_closed_form_says(order, tolerance):
-    """Held at its hub, of length L and nu = 0: by rho Omega^2 L^3 / (3 E); its hub feels rho A Omega^2 L^2 / 2."""
+    """Held at its hub, of length L and nu = 0: by rho Omega^2 L^3 / (3 E); on its hub acts rho A Omega^2 L^2 / 2."""
     L, E, rho, rate = 1.0, 1e7, 1000.0, 5.0
     mesh = ds.TetrahedralMesh.create_box((9, 2, 2), (L, 0.1, 0.1), origin=(0, -0.05, -0.05))
     mesh = mesh if order == 1 else mesh.quadratic()

@@ -90,8 +90,8 @@ def bodies(turn=0.1):
     return ds.TetrahedralMesh(mesh.vertices, mesh.tetrahedra, vertex_sets=sets)
 
 
-def rubbing(friction=0.4, terms=(), precision="f64", material=None, **options):
-    """They meet and rub: the upper one comes down and sidewards."""
+def rough(friction=0.4, terms=(), precision="f64", material=None, **options):
+    """They meet with friction: the upper one comes down and sidewards."""
     velocity = np.zeros((8, 3))
     velocity[4:] = [0.5, -3.0, 0.2]
     contact = ds.SelfContact(2e4, 5e-3, friction=friction, friction_speed=0.05)
@@ -104,7 +104,7 @@ def rubbing(friction=0.4, terms=(), precision="f64", material=None, **options):
 @pytest.mark.parametrize("solver", EXPLICIT)
 def test_momentum(solver):
     """Linear momentum is kept to round-off; friction takes energy that goes nowhere else."""
-    simulators = [ds.Simulator(solver(rubbing(mu), dt=1e-4)) for mu in (0.0, 0.4)]
+    simulators = [ds.Simulator(solver(rough(mu), dt=1e-4)) for mu in (0.0, 0.4)]
     kinetic = []
     for simulator in simulators:
         mass, before = simulator._start.mass[:, None], simulator.velocities
@@ -119,7 +119,7 @@ def test_momentum(solver):
 def test_momentum_of_implicit_steps(solver):
     """Linear momentum is kept to the tolerance of the solves."""
     for tolerance in (1e-4, 1e-10):
-        simulator = ds.Simulator(solver(rubbing(0.4), dt=5e-4, tolerance=tolerance))
+        simulator = ds.Simulator(solver(rough(0.4), dt=5e-4, tolerance=tolerance))
         mass, before = simulator._start.mass[:, None], simulator.velocities
         simulator.run(8)
         lost = np.abs((mass * (simulator.velocities - before)).sum(0)).max() / (mass * np.abs(before)).sum()
@@ -135,8 +135,8 @@ def turned(width, friction, solver, steps, **options):
     scene = ds.Scene(
         mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, [contact], initial_velocities=velocity, precision="f64"
     )
-    rubbed, dt = ds.SelfContactForce(range(4, 8), "friction"), 1.6 * width / steps
-    frames = ds.Rollout(solver(scene, dt=dt, **options), steps, save_every=1, outputs=rubbed, gradients=[]).forward()
+    impulse, dt = ds.SelfContactForce(range(4, 8), "friction"), 1.6 * width / steps
+    frames = ds.Rollout(solver(scene, dt=dt, **options), steps, save_every=1, outputs=impulse, gradients=[]).forward()
     mass = scene.inputs.derive(scene.inputs.values).mass[:, None]
     L = (mass * np.cross(frames.positions, frames.velocities)).sum(1)
     return np.linalg.norm(L[-1] - L[0]), np.linalg.norm(frames["self_contact_force"].sum(0) * dt)
@@ -159,13 +159,13 @@ def test_angular_momentum_but_for_the_couple_of_friction_across_the_gap(solver, 
 
 @pytest.mark.parametrize("solver", EXPLICIT)
 def test_tangent_and_adjoint_agree(solver):
-    rollout = ds.Rollout(solver(rubbing(terms=[ds.Drag(2.0)]), dt=1e-4), 60, save_every=20, gradients="all")
+    rollout = ds.Rollout(solver(rough(terms=[ds.Drag(2.0)]), dt=1e-4), 60, save_every=20, gradients="all")
     assert verify.dot_product_test(rollout) <= 1e-13
 
 
 @pytest.mark.parametrize("solver", IMPLICIT)
 def test_tangent_and_adjoint_of_implicit_steps_agree(solver):
-    scene = rubbing(terms=[ds.Drag(2.0)])
+    scene = rough(terms=[ds.Drag(2.0)])
     rollout = ds.Rollout(solver(scene, dt=5e-4, tolerance=1e-12), 12, save_every=4, gradients="all")
     assert verify.dot_product_test(rollout) <= 1e-9
 
@@ -179,16 +179,16 @@ MORE = ["self_contact_width", "self_contact_stiffness", "density", "drag_rate", 
 )
 def test_gradients(solver, dt, names):
     options = dict(tolerance=1e-12) if solver in IMPLICIT else {}
-    made = solver(rubbing(terms=[ds.Drag(2.0)]), dt=dt, **options)
+    made = solver(rough(terms=[ds.Drag(2.0)]), dt=dt, **options)
     assert ds.check_gradients(ds.Rollout(made, round(4e-3 / dt), gradients=names)).passed
 
 
 @pytest.mark.parametrize("solver, dt, tolerance", [(ds.VelocityVerletSolver, 1e-4, 1e-13), (ds.BDF2Solver, 5e-4, 1e-9)])
 def test_with_everything_else(solver, dt, tolerance):
-    """An obstacle that rubs too, what is held in one direction or moves, a law of rates, two coefficients."""
+    """An obstacle with friction too, what is held in one direction or moves, a law of rates, two coefficients."""
     ground = ds.Ground(height=-0.088, stiffness=2e4, width=0.01, friction=0.3, path=lambda t: [t, 0, 0])
     friction = {("body_0", "body_1"): 0.4, ("body_0", "body_0"): 0.1}
-    scene = rubbing(
+    scene = rough(
         friction,
         terms=[ds.Drag(2.0), ground],
         material=ds.KelvinVoigt(ds.StableNeoHookean(5e4, 0.3), time=1e-3),
@@ -211,7 +211,7 @@ def test_forces_on_a_body_are_what_its_momentum_gains():
     """Nothing else acts on the whole of it; all forces add up to zero; friction lies across the normal part."""
     named = [ds.SelfContactForce("body_1"), ds.SelfContactForce(name="each", per_vertex=True)]
     named += [ds.SelfContactForce("body_1", part, name=part) for part in ("normal", "friction")]
-    scene, dt = rubbing(), 1e-4
+    scene, dt = rough(), 1e-4
     made = ds.SemiImplicitSolver(scene, dt=dt, substeps=2)
     frames = ds.Rollout(made, 60, save_every=3, outputs=named, gradients=[]).forward()
     mass = scene.inputs.derive(scene.inputs.values).mass[4:, None]
@@ -274,7 +274,7 @@ def test_forces_have_derivatives():
         ds.SelfContactForce("body_0", "normal", name="p", about=(0, 0.1, 0)),
     ]
     named += [ds.SelfContactForce(name="each", per_vertex=True, part="friction")]
-    solver, rng = ds.SemiImplicitSolver(rubbing(terms=[ds.Drag(2.0)]), dt=1e-4), np.random.default_rng(0)
+    solver, rng = ds.SemiImplicitSolver(rough(terms=[ds.Drag(2.0)]), dt=1e-4), np.random.default_rng(0)
     rollout = ds.Rollout(solver, 20, save_every=10, outputs=named, gradients="all")
     frames = rollout.forward()
     seeds = {name: rng.normal(size=frames[name].shape) for name in rollout.computed}
@@ -292,7 +292,7 @@ def test_forces_have_derivatives():
 
 
 def dragged(solver, end, **options):
-    """Two soft blocks, the upper one pressed down and dragged by its top until the time `end`, and a floor that rubs too."""
+    """Two soft blocks, the upper one pressed down and dragged by its top until the time `end`, and a floor with friction."""
     low = ds.TetrahedralMesh.create_box((2, 2, 2), (0.2, 0.1, 0.2))
     up = ds.TetrahedralMesh.create_box((2, 2, 2), 0.1).rotated([0, 1, 0], 0.2).translated([0.05, 0.103, 0.05])
     mesh = ds.TetrahedralMesh.joined([low, up])
@@ -335,7 +335,7 @@ def test_friction_at_rest_balances_the_supports(load_steps):
 
 
 def test_friction_of_implicit_steps_is_what_momentum_gains():
-    scene, dt = rubbing(), 2e-4
+    scene, dt = rough(), 2e-4
     rollout = ds.Rollout(
         ds.ImplicitEulerSolver(scene, dt, tolerance=1e-11), 20, save_every=1, outputs=parts_of("body_1")
     )
@@ -387,13 +387,13 @@ def test_forces_that_cannot_be():
 
 
 def end_of(friction, **options):
-    solver = ds.SemiImplicitSolver(rubbing(friction), dt=1e-4, **{k: v for k, v in options.items() if k == "parallel"})
+    solver = ds.SemiImplicitSolver(rough(friction), dt=1e-4, **{k: v for k, v in options.items() if k == "parallel"})
     own = {k: v for k, v in options.items() if k != "parallel"}
     return ds.Rollout(solver, 60, gradients="all", **own)
 
 
 def test_pairs_of_sets():
-    """Pairs that are named rub as they would alone; others do not."""
+    """Pairs that are named have the friction that they would alone; others have none."""
     ends = {}
     for friction in (0.0, 0.4, {("body_0", "body_1"): 0.4}, {("body_1", "body_1"): 0.4, ("body_0", "body_1"): 0.0}):
         ends[str(friction)] = end_of(friction).forward().positions[-1]
@@ -416,7 +416,7 @@ def test_threads_and_checkpoints_do_not_change_a_bit():
 
 
 def test_single_precision():
-    rollout = ds.Rollout(ds.SemiImplicitSolver(rubbing(precision="f32"), dt=1e-4), 60, gradients="all")
+    rollout = ds.Rollout(ds.SemiImplicitSolver(rough(precision="f32"), dt=1e-4), 60, gradients="all")
     np.testing.assert_allclose(rollout.forward().positions[-1], end_of(0.4).forward().positions[-1], atol=2e-6)
     assert verify.dot_product_test(rollout) <= 2e-5
 
@@ -437,6 +437,6 @@ def test_wrong_numbers(options, words):
 
 def test_wrong_sets():
     with pytest.raises(ValueError, match="'palm', which is no set of vertices or tetrahedra of the mesh; it has"):
-        rubbing({("palm", "body_0"): 0.5})
+        rough({("palm", "body_0"): 0.5})
     with pytest.raises(ValueError, match="vertex 6 is in 'body_1' and in 'rail'"):
-        rubbing({("rail", "body_1"): 0.5})
+        rough({("rail", "body_1"): 0.5})

@@ -190,7 +190,7 @@ def test_nothing_passes_through(kind, solver, dt, precision):
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.8, 0.9])
-def test_parts_far_apart_at_rest_feel_the_width_that_was_asked_for(share):
+def test_parts_far_apart_at_rest_have_the_width_that_was_asked_for(share):
     """Ends of an open C, four widths apart at rest and bent towards each other, press when they are nearer than one."""
     mesh, opening = c_shape(gap=4 * WIDTH), 4 * WIDTH / 0.03
     x, y, z = mesh.vertices.T

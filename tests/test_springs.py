@@ -77,10 +77,10 @@ def rollout_of(kind, terms, precision="f64", steps=STEPS, **options) -> ds.Rollo
     + [(kind, "f32") for kind in (ds.VelocityVerletSolver, ds.ImplicitEulerSolver, ds.StaticSolver)],
 )
 def test_every_number(kind, precision):
-    """By a dot product each, in f32 in one solver of each family; a slack cable is not felt."""
+    """By a dot product each, in f32 in one solver of each family; a slack cable does not act."""
     gate = (1e-12 if kind.explicit else 1e-8) if precision == "f64" else (3e-5 if kind.explicit else 1e-3)
-    unfelt = ("slack.length", "slack.stiffness") + (("drag_rate",) if kind is ds.StaticSolver else ())
-    assert_transposed(rollout_of(kind, attached(lidded()), precision), gate, unfelt)
+    without = ("slack.length", "slack.stiffness") + (("drag_rate",) if kind is ds.StaticSolver else ())
+    assert_transposed(rollout_of(kind, attached(lidded()), precision), gate, without)
 
 
 @every
@@ -191,7 +191,7 @@ def test_one_anchor_that_holds_many():
 
 
 def test_tension_is_what_holds_an_anchor():
-    """A spring's pull is k (L - l), and by direction what its ends feel; a term may be named by itself."""
+    """A spring's pull is k (L - l), and by direction the force on its ends; a term may be named by itself."""
     mesh, place = lidded(), np.array([0.5, 2.0, 0.4])
     spring = ds.Spring(7, ds.Anchor(place), 900.0, rest_length=0.4)
     of = scene([spring, ds.Gravity()], mesh=mesh, fixed="xmin", initial_positions=None)

@@ -1,7 +1,7 @@
 """The order of a scene's terms means nothing: the same bits of motion and of every gradient, compared term by term.
 
-Two obstacles of one kind keep their order. Swapped, they agree to round-off, except where both rub on one vertex in explicit
-steps: their frictions act one after the other, and what that splitting leaves falls with the substep.
+Two obstacles of one kind keep their order. Swapped, they agree to round-off, except where the friction of both acts on one
+vertex in explicit steps: their frictions act one after the other, and what that splitting leaves falls with the substep.
 """
 
 from functools import cache
@@ -22,7 +22,7 @@ EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
 IMPLICIT = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 SOLVERS = (*EXPLICIT, *IMPLICIT, ds.StaticSolver)
 ORDERS = 6
-ROUGH = dict(friction=0.3, friction_speed=20.0)  # so that it sticks, and friction_speed is felt
+ROUGH = dict(friction=0.3, friction_speed=20.0)  # so that it sticks, and friction_speed counts
 MESH = ds.TetrahedralMesh.joined([tetrahedron(0.15), tetrahedron(0.7)])  # an apex 5 cm below a face
 
 
@@ -238,7 +238,7 @@ def swapped(solver, wall, substep=2e-3) -> tuple[float, float]:
     return np.abs(apart).max() / np.abs(way).max(), max(gradients)
 
 
-CEILING = [0, 0.8, 0], [0, -1, 0]  # felt by another vertex than the slope
+CEILING = [0, 0.8, 0], [0, -1, 0]  # acts on another vertex than the slope
 CORNER = [-0.1, 0, 0], [1, 0.1, 0]  # by the same
 
 

@@ -69,7 +69,7 @@ def test_midpoint_says_where_it_gains_energy():
 
 
 @pytest.mark.parametrize("solver", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver])
-def test_a_face_exactly_at_the_width_feels_nothing(solver):
+def test_no_force_acts_on_a_face_exactly_at_the_width(solver):
     """The barrier's energy and force are zero at d = width, to the last bit: what rests there stays."""
     mesh = ds.TetrahedralMesh.create_cube(3, 0.25).translated((0, 0.125, 0))
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, ds.Ground(0.0, 1e4, 0.125), precision="f64")

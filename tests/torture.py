@@ -65,7 +65,7 @@ ROWS = {
         "a column bends beyond its buckling load": "implicit:a_column_beyond_its_buckling_load_bends",
     },
     "Contact and friction": {
-        "beyond the barrier nothing is felt": "reference_motion:ground_beyond_its_width_is_not_felt",
+        "beyond the barrier no force acts": "reference_motion:ground_beyond_its_width_does_not_act",
         "the barrier is smooth down to its end": "contact:barrier_near_its_ends",
         "weights rest where the barrier carries them": "reference_motion:weight_at_rest_on_the_ground "
         "implicit_contact:weight_rests_at_the_gap_where_the_barrier_carries_it",
@@ -77,7 +77,7 @@ ROWS = {
         "two bodies collide head-on": "self_contact:head_on_collision_exchanges_velocities "
         "self_contact:head_on_collision_ends_where_rigid_bodies_would",
         "slow impact of a ball as by Hertz": "hertz:slow_impact_of_a_ball_converges_to_hertz",
-        "symmetric contact stays symmetric; a face exactly where the barrier begins feels nothing": "contact:symmetric_contact_stays_symmetric torture:a_face_exactly_at_the_width_feels_nothing",
+        "symmetric contact stays symmetric; no force on a face exactly where the barrier begins": "contact:symmetric_contact_stays_symmetric torture:no_force_acts_on_a_face_exactly_at_the_width",
     },
     "Gradients": {
         "Taylor's test of every input": "gradients:every_input_by_itself gradients:a_smooth_thousand_steps",

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 CANCELS = 1.5  # times the estimate: where shares sum up to more by size, it is the small difference of large numbers
 CANCEL = "errors of the {} cancel"  # how its note begins
-FELT = 1e-6  # of the number's change: what is less is left over by solvers
+SMALL = 1e-6  # of the number's change: what is less is left over by solvers
 # estimates were at least 0.7 times the error of problems with known answers (examples/benchmarks/error_bars.py): what they
 # missed is at most this share of them
 MISSED = 1 / 0.7 - 1
@@ -43,7 +43,7 @@ class Accuracy(metaclass=Public):
     rounding: what rounding may cost: of float32 the distance from float64, of float64 a bound without sign; of explicit
         steps as if each rounded the number.
     uncancelled: {"mesh": ..., "step": ...}, how large these are before they cancel: the most of any frame, or the sum of
-        the shares by size.
+        the shares or of the frames by size.
     shares: of `mesh` by tetrahedron; their sum is `mesh`. `save_picture(path, mesh, positions, accuracy.shares)` shows them.
     cost: seconds of the run itself and of the finer mesh; unknowns of both.
     notes: why the estimate may be off.
@@ -159,10 +159,12 @@ class Number:
         return float(value), seed
 
     def largest(self, frames: "Frames", others: "Frames") -> float:
-        """The largest difference of two runs in any frame, by the weights of the last."""
-        (_, slope), y, z = self.of(frames), *(np.asarray(x[self.output], np.float64) for x in (frames, others))
-        slope, apart = self._own(slope)[-1], self._own(y) - self._own(z)
-        return float(np.abs((slope * apart).reshape(len(apart), -1).sum(1)).max())
+        """The difference of two runs before it cancels: the sum of the frames by size, or the most of any frame by the
+        weights of the last that has some."""
+        slope, *both = self.of(frames)[1], *(np.asarray(x[self.output], np.float64) for x in (frames, others))
+        slope, y, z = (self._own(x).reshape(len(x), -1) for x in (slope, *both))
+        last, apart = slope.any(1).nonzero()[0].max(initial=0), y - z
+        return float(max(np.abs((slope * apart).sum(1)).sum(), np.abs(apart[: last + 1] @ slope[last]).max()))
 
 
 def accuracy(
@@ -287,7 +289,7 @@ def _by_element(mesh: TetrahedralMesh, nodal: np.ndarray, parents: np.ndarray, c
 
 
 def _of_steps(own: Replay, frames: "Frames", number: Number, values: dict) -> tuple[float, float]:
-    """Errors of the steps, in the end and in the worst frame: by steps of half the length, and the order of the solver."""
+    """Error of the steps, and that before it cancels: by steps of half the length, and the order of the solver."""
     rollout, solver = own.rollout, own.rollout.solver
     if not solver.order:
         return 0.0, 0.0
@@ -296,14 +298,15 @@ def _of_steps(own: Replay, frames: "Frames", number: Number, values: dict) -> tu
     else:
         finer = solver.for_scene(rollout.scene, substeps=2 * solver.substeps)
     halved, part = rollout.on(finer).forward(**values), 1 - 0.5**solver.order
-    return (number.of(frames)[0] - number.of(halved)[0]) / part, number.largest(frames, halved) / part
+    step = (number.of(frames)[0] - number.of(halved)[0]) / part
+    return step, max(abs(step), number.largest(frames, halved) / part)
 
 
 def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
     """What may make an estimate of the mesh's error wrong, in words."""
     notes, sizes = [], np.sort(np.abs(found.shares))[::-1]
     few = max(1, int(FEW * len(sizes)))
-    matters = abs(found.mesh) > FELT * found.size
+    matters = abs(found.mesh) > SMALL * found.size
     if matters and len(sizes) >= 1 / FEW and sizes[:few].sum() > MOST * sizes.sum():
         notes.append(
             f"{few} of {len(sizes)} tetrahedra have more than half of the error: near what is singular, such as corners "
@@ -312,7 +315,7 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
         )
     for name, remedy in dict(mesh="refine the mesh once", step="halve the steps").items():
         size = found.uncancelled[name]
-        if size > max(CANCELS * abs(getattr(found, name)), 0.1 * abs(found.error), FELT * found.size):
+        if size > max(CANCELS * abs(getattr(found, name)), 0.1 * abs(found.error), SMALL * found.size):
             notes.append(
                 f"{CANCEL.format(name)}: before they do they are {size:.2g}, and the estimate may be off by as much "
                 f"as it is, for which the bar is wider: {remedy}, and compare"

@@ -340,9 +340,9 @@ class Rollout(metaclass=Public):
         values: of inputs, as in `forward`.
 
         The finer mesh is solved, from the run's states on. Forces that are out of balance where these are put on it, times
-        the adjoint of the number, are the error to first order, and say the share of each tetrahedron. Where shares cancel,
-        or something else makes the estimate unsure, `Accuracy.notes` say so, and the bar is wider. Shares of explicit steps
-        and of what is held exactly are by volume alone. Steps of half the length say what steps cost.
+        the adjoint of the number, are the error to first order, and say the share of each tetrahedron. Where shares cancel
+        the bar is wider; `Accuracy.notes` say so, and what else makes the estimate unsure. Shares of explicit steps and of
+        what is held exactly are by volume alone. Steps of half the length say what steps cost.
         Raises ValueError for what a finer mesh cannot have.
         Becker, Rannacher 2001, doi:10.1017/S0962492901000010.
 

@@ -1,7 +1,7 @@
 """What a tactile pad reads where a ball presses on it: Hertz's pressure on three meshes.
 
 A quarter of an elastic block, of a side of eight radii of the contact, is pressed by a rigid sphere of radius R. With the
-force F that its base feels, the radius a of the contact and its pressure are, by Hertz (Johnson 1985, Contact Mechanics,
+force F on its base, the radius a of the contact and its pressure are, by Hertz (Johnson 1985, Contact Mechanics,
 ch. 4, doi:10.1017/CBO9781139171731),
 
     a^3 = 3 F R / (4 E*),    p = 3 F / (2 pi a^2) (1 - r^2 / a^2)^(1/2),    E* = E / (1 - nu^2)

@@ -1,4 +1,4 @@
-"""What is felt of an obstacle as the mesh is refined: stiffness per area against the same stiffness at every vertex.
+"""How an obstacle acts as the mesh is refined: stiffness per area against the same stiffness at every vertex.
 
 The gap under a cube at rest, the force of one that is pressed down, the way of a slab that slides. The stiffness of a
 vertex is what makes it much the same on the mesh with 25 vertices in a face.

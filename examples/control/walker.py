@@ -1,7 +1,7 @@
 """A soft quadruped learns to walk on a rough floor by its muscles: trained through the simulator from a torch network.
 
 Each of its legs has two muscles, upright fibres in its front and in its back half, which bend and shorten it. Every 0.2 s a
-network of 600 weights feels where the body is, its turn and its speed; from these and a clock of 6 Hz it gives
+network of 600 weights reads where the body is, its turn and its speed; from these and a clock of 6 Hz it gives
 the eight activations of each 0.02 s to come. The loss is the way forward, what the body strays and turns, and the effort,
 differentiated over 0.2 s at a time: through the contacts of a whole second gradients say nothing.
 
@@ -65,8 +65,8 @@ class Walker:
         for span in range(spans):
             t = DT * (SPAN * span + torch.arange(SPAN))[:, None]
             clock = torch.sin(2 * np.pi * CLOCK * t + torch.arange(4) * np.pi / 2)
-            felt = torch.cat([u.mean(0)[1:] * 20, v.mean(0), turn[None] * 20])
-            asked, activation = torch.sigmoid(4 * network(torch.cat([clock, felt.expand(SPAN, 6)], 1))), []
+            state = torch.cat([u.mean(0)[1:] * 20, v.mean(0), turn[None] * 20])
+            asked, activation = torch.sigmoid(4 * network(torch.cat([clock, state.expand(SPAN, 6)], 1))), []
             for one in asked:  # muscles take time
                 before = 0.5 * before + 0.5 * one
                 activation.append(before)

@@ -1,6 +1,6 @@
 """Find Young's modulus and friction of a soft block from the force on a ball that is pressed in and dragged.
 
-A laboratory records force against displacement. The ball goes down 8 mm, then 12 mm to the side; the force that it feels is
+A laboratory records force against displacement. The ball goes down 8 mm, then 12 mm to the side; the force on it is
 `ContactForce`. `identify` finds both numbers. Data carry noise of 0.2 % of the largest force.
 
     python examples/identify/indentation.py [folder for a picture]

@@ -227,7 +227,7 @@ class Judge:
         kink = abs(sides[0][0] - sides[1][0]) > gate
         return KINK if kink and any(max(e, abs(row.reverse - side)) <= gate for side, e in sides) else FAILED
 
-    def faces_felt(self) -> bool:
+    def acts_on_faces(self) -> bool:
         """Whether narrow obstacles press on faces by pairs at the end of explicit steps."""
         if not self.configuration.structure.explicit or not self.configuration.placed:
             return False
@@ -240,7 +240,7 @@ class Judge:
         """What contacts do in this configuration."""
         configuration = self.configuration
         watched = configuration.rollout(save_every=1).forward()
-        felt = sticks = slides = False
+        acts = sticks = slides = False
         ends = watched.times
         for placed, path in zip(configuration.placed, configuration.paths):
             for k in range(1, len(ends)):
@@ -250,18 +250,18 @@ class Judge:
                     v = x - watched.positions[k - 1]
                 touching, speed = placed.touching(x.astype(np.float64), v, here, (here - before) / dt)
                 touching[configuration.scene.fixed] = False
-                felt = felt or np.any(touching)
+                acts = acts or np.any(touching)
                 if placed.kind.friction:
                     slow = speed < placed.friction_speed
                     sticks, slides = sticks or np.any(touching & slow), slides or np.any(touching & ~slow)
         presses = bool(self.gradients.get("self_contact_stiffness", 0.0))
         return dict(
-            obstacle=bool(felt),
+            obstacle=bool(acts),
             sticks=bool(sticks),
             slides=bool(slides),
             self_contact=presses,
-            faces=self.faces_felt(),
-            static_contact=bool(felt) and configuration.structure.static,
+            faces=self.acts_on_faces(),
+            static_contact=bool(acts) and configuration.structure.static,
         )
 
 

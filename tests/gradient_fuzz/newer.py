@@ -1,4 +1,4 @@
-"""What joins configurations by draws of its own: unequal steps, scaled masses, muscles, growth, poses, surfaces that rub."""
+"""What joins configurations by draws of its own: unequal steps, scaled masses, muscles, growth, poses, rough surfaces."""
 
 import numpy as np
 
@@ -56,7 +56,7 @@ def motions(rng, mesh, count: int):
 
 
 def accepted(kind, scene):
-    """The scene, without reduced sets where explicit steps refuse them: by chambers, narrow obstacles, surfaces that rub."""
+    """The scene, without reduced sets where explicit steps refuse them: by chambers, narrow obstacles, rough surfaces."""
     if kind.explicit and scene.reduced:
         try:
             check_bodies(scene, kind.contact)
@@ -170,12 +170,12 @@ def pose(kind, seed: int, number: int, path, x, duration: float, calm: float) ->
 
 
 def comes_late(obstacle, seed: int, number: int) -> bool:
-    """A third of what moves begins where only some passes feel it."""
+    """A third of what moves begins where it acts in some passes alone."""
     return obstacle.path and np.random.default_rng([41, seed, number]).random() < 1 / 3
 
 
-def rubbing(kind, seed: int, mesh, duration: float) -> dict:
-    """How surfaces rub on each other, in three fifths of the structures with self-contact; two bodies by their names."""
+def rough(kind, seed: int, mesh, duration: float) -> dict:
+    """Friction of surfaces with each other, in three fifths of the structures with self-contact; bodies by their names."""
     if np.random.default_rng([32, kind.number]).random() > 0.6:
         return {}
     rng = np.random.default_rng([33, seed])

@@ -1,4 +1,4 @@
-"""Obstacles of every kind, laid against a body so that their barriers are felt from the start, or from some time on."""
+"""Obstacles of every kind, laid against a body so that their barriers act from the start, or from some time on."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -68,7 +68,7 @@ def place(
     kind: ObstacleKind, rng, x: np.ndarray, n: np.ndarray, width: float, options: dict, p=None, calm=1.0, late=False
 ) -> Placed:
     """An obstacle that pushes the points x along n and begins a part of its width below the lowest of them, or below p.
-    calm: share of a blade that is there; late: about all of its width, so that what moves is felt by some passes alone."""
+    calm: share of a blade that is there; late: about all of its width, so that what moves acts in some passes alone."""
     p, gap = x[np.argmin(x @ n)] if p is None else p, width * (rng.uniform(0.3, 0.8) + 0.4 * late)
     foot, turned = p - gap * n, frame(n, rng)
     aside = turned[:, 0] * rng.uniform(-1, 1) + turned[:, 2] * rng.uniform(-1, 1)

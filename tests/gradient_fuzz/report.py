@@ -7,7 +7,7 @@ from .judge import CLASSES, FAILED, INACCURATE, KINK, PASSED, REFUSED, SINGLE_RO
 ENOUGH = 10  # non-zero derivatives that passed, of every law, solver and input
 SHARES = {"obstacle": 0.5, "sticks": 0.2, "slides": 0.2, "self_contact": 0.2, "static_contact": 0.1, "faces": 0.05}
 SAID = {
-    "obstacle": "an obstacle is felt",
+    "obstacle": "an obstacle acts",
     "sticks": "friction sticks",
     "slides": "friction slides",
     "self_contact": "pairs of self-contact press",

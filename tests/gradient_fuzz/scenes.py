@@ -139,7 +139,7 @@ def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configu
     if kind.forces != "none":
         terms.append(_forces(kind, rng, mesh, steps, mass.mean()))
     if kind.self_contact:
-        stiffness, rough = calm * stiff * rng.uniform(0.05, 0.3), newer.rubbing(kind, seed, mesh, duration)
+        stiffness, rough = calm * stiff * rng.uniform(0.05, 0.3), newer.rough(kind, seed, mesh, duration)
         terms.append(ds.SelfContact(stiffness=stiffness, width=bodies.SELF_WIDTH, **rough))
     terms = [terms[k] for k in rng.permutation(len(terms))]
     more = np.random.default_rng([21, seed])
