@@ -268,7 +268,7 @@ def test_every_input_in_a_crowd(solver, damping):
         (EXPLICIT[1], ["density", "ground_height", "sphere_path"]),
     ],
 )
-def test_inputs_in_a_crowd_that_faces_feel(solver, names):
+def test_inputs_in_a_crowd_that_acts_on_faces(solver, names):
     assert check_rows(crowded(solver, 0.02), names) == len(names)
 
 

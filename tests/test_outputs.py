@@ -124,6 +124,7 @@ RECORDED = [
         lambda a: np.tanh(np.stack([a[0], a[1]], -1)).T + np.minimum(a[2], 1.0) + np.squeeze(np.transpose(a)[:, :1]),
         (4, 3),
     ),
+    (lambda a, b: a**b + 2.0**b + np.minimum(a, b) + np.minimum(1.2, np.maximum(b, 0.8)), (4, 3), (4, 3)),
     (lambda a, b: arrays.ratio(a, np.linalg.norm(b, axis=1, keepdims=True)), (4, 3), (4, 3)),
     (lambda a, b: arrays.replaced(b, np.array([3, 1]), a) + arrays.summed_at(np.array([0, 2]), a, 4), (2, 3), (4, 3)),
 ]
@@ -144,6 +145,13 @@ def test_sweeps_over_what_arrays_record(function, shapes):
     assert (seed * change).sum() == pytest.approx(pulled, rel=1e-12)
 
 
+def test_roots_powers_and_bounds_have_derivatives_at_their_ends():
+    x, dx = arrays.Recorded(np.array([0.0, 0.0, 2.0])), np.array([1.0, -1.0, 3.0])
+    y = np.sqrt(x) + x**2 + x**0 + x**1.0 + np.linalg.norm(x[:2]) + np.clip(x, None, 1.0) + np.clip(x, 0.5, None)
+    np.testing.assert_allclose(arrays.forward(y, [(x, dx)]), [2.0, -2.0, 3 / 8**0.5 + 18.0])
+    np.testing.assert_allclose(arrays.reverse(y, np.ones(3), [x])[0], [2.0, 2.0, 1 / 8**0.5 + 6.0])
+
+
 def changed(x):
     x += 1.0
 
@@ -161,6 +169,7 @@ def changed(x):
         lambda x: np.einsum("ii->", x[:, None] * x),
         lambda x: x.astype(int),
         lambda x: x.max(),
+        lambda x: np.concatenate([x, x], axis=None),
     ],
 )
 def test_functions_without_a_derivative_say_so(function):

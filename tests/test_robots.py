@@ -205,7 +205,8 @@ def test_adjoints_of_joints_are_cut_clipped_and_reported(wheel, kind):
         assert cut or max(norms) > 1 and (min(shares) < 1) == clipped
 
 
-def test_links_stand_where_they_are_when_a_run_goes_on():
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.BDF2Solver])
+def test_links_stand_where_they_are_when_a_run_goes_on(kind):
     """A body falls to where a link, and a ball on a path, were when it began."""
     from diffsim_ti.writers.adaptive_run import ForwardRun
 
@@ -219,7 +220,7 @@ def test_links_stand_where_they_are_when_a_run_goes_on():
     scene = scene_of(
         ds.Robot.from_urdf(text, velocities=[3.0], **contact), terms=[ball], initial_velocities=[0, -1.0, 0]
     )
-    solver = ds.ImplicitEulerSolver(scene, dt=1e-2)
+    solver = kind(scene, dt=1e-2)
     first, second = ds.Simulator(solver), ds.Simulator(solver)
     first.run(5)
     kept = first.state
@@ -229,7 +230,7 @@ def test_links_stand_where_they_are_when_a_run_goes_on():
     np.testing.assert_array_equal(first.positions, second.positions)
     with pytest.raises(ValueError, match=r"joint_states: expected finite numbers, float64 of shape \(1, 5\)"):
         second.resume(kept | dict(joint_states=np.zeros((3, 3))))
-    run = ForwardRun(scene, ds.ImplicitEulerSolver, 0.04, dt=1e-2)
+    run = ForwardRun(scene, kind, 0.04, dt=1e-2)
     run.advance()
     assert run.seen.crossed == 0 and run.seen.gap > 0
 
@@ -494,7 +495,7 @@ def differs(rollout, frames, seeds, gradients, change):
     return (sides[0] - sides[1]) / 2e-5, sum(float((gradients[name] * change[name]).sum()) for name in change)
 
 
-@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.BDF2Solver, ds.StaticSolver, ds.SemiImplicitSolver])
 def test_every_gradient_goes_through_vertices_that_links_hold(kind):
     """A block on an arm whose shoulder meets its limit; a link touches it where it is held, a ball elsewhere."""
     tip = ds.Robot.from_urdf(ARM).poses(Q)["robot_tip"][:3]

@@ -247,6 +247,8 @@ def _moved(function: Callable, x, *more, **how):
 
 
 def _concatenate(parts, axis=0):
+    if axis is None:
+        raise TypeError("np.concatenate of axis None has no derivative here: concatenate np.ravel of each")
     y = np.concatenate([value_of(part) for part in parts], axis)
     ends = np.cumsum([0, *(np.shape(part)[axis] for part in parts)])
 
@@ -297,6 +299,10 @@ def _einsum(letters: str, *x, optimize=False):
         return x[k], lambda dx: np.einsum(letters, *plain[:k], dx, *plain[k + 1 :], optimize=optimize), pull
 
     return made(np.einsum(letters, *plain, optimize=optimize), *map(parent, range(len(x))))
+
+
+def _at_most(x, high):
+    return x if high is None else np.minimum(x, high)
 
 
 def _where(condition, a, b):
@@ -367,7 +373,7 @@ FUNCTIONS = {
     np.einsum: _einsum,
     np.cross: _cross,
     np.where: _where,
-    np.clip: lambda x, low, high: np.minimum(np.maximum(x, low), high),
+    np.clip: lambda x, low=None, high=None: _at_most(x if low is None else np.maximum(x, low), high),
     np.linalg.norm: _norm,
     np.linalg.inv: _inv,
     np.linalg.solve: lambda A, b: np.linalg.inv(A) @ b,

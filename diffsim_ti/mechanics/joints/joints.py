@@ -41,9 +41,8 @@ from diffsim_ti.terms.robots.model import bracket
 
 STIFF = 1e6  # of a prescribed joint's drive, and of a limit, over inertia / h^2
 AT_REST = 0.01  # [s], h of these in equilibria
-STABLE = (
-    1e-9  # least stiffness of what is held in an equilibrium, over the largest that a joint meets, or inertia / s^2
-)
+# least stiffness of what is held in an equilibrium, over the largest that a joint meets, or inertia / s^2
+STABLE = 1e-9
 HELD = "hold the joint by drive_stiffness, prescribe it, or take a solver with inertia"
 FALLS = 0.8  # how steeply Phi may rise along a step where it ends, against how it fell
 
