@@ -17,7 +17,7 @@ from diffsim_ti.common.public import Public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene.locking import LOCKING_RATIO
 from diffsim_ti.state.schedule import UnequalSteps
-from diffsim_ti.terms import SelfContact
+from diffsim_ti.terms import Robot, SelfContact
 
 if TYPE_CHECKING:
     from diffsim_ti.rollout import Frames, Rollout
@@ -70,7 +70,8 @@ class Accuracy(metaclass=Public):
 
     @property
     def bar(self) -> float:
-        """How far the truth may be from the value: |mesh| + |step| + 0.43 uncancelled + |solver| + |rounding|.
+        """How far the truth may be from the value: |mesh| + |step| + |solver| + |rounding|, and 0.43 times the sum
+        of `uncancelled`.
 
         Where no errors cancel that is (|mesh| + |step|) / 0.7: estimates were at least 0.7 times the error of problems with
         known answers (examples/benchmarks/error_bars.py). What they missed was mostly below 0.43 of what cancels. It is no
@@ -242,8 +243,11 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     n, mesh, eps = scene.mesh.num_vertices, fine.scene.mesh, np.finfo(float).eps
     replay, residuals = Replay(fine, [P @ u for u in own.each("places")]), ()
     nodal, rounding, of_solver, unplaced = np.zeros(mesh.num_vertices), eps * abs(value), 0.0, ""
-    if solver.explicit or scene.has_multipliers:  # of whose equations `Replay` has no residual, or only a part
-        unplaced = "explicit steps and what is held exactly have no residual by vertices on the finer mesh"
+    whole = not (
+        solver.explicit or scene.has_multipliers or scene.term(Robot)
+    )  # whether `Replay` has all of its residual
+    if not whole:
+        unplaced = "explicit steps, robots and what is held exactly have no residual by vertices on the finer mesh"
         rounding *= own.rollout.sweep.num_passes
         if tight:
             of_solver = number.of(own.rollout.on(solver.for_scene(scene, **tight)).forward(**values))[0] - value
@@ -317,11 +321,11 @@ def _doubts(scene, found: Accuracy, exact: dict) -> list[str]:
         size = found.uncancelled[name]
         if size > max(CANCELS * abs(getattr(found, name)), 0.1 * abs(found.error), SMALL * found.size):
             notes.append(
-                f"{CANCEL.format(name)}: before they do they are {size:.2g}, and the estimate may be off by as much "
-                f"as it is, for which the bar is wider: {remedy}, and compare"
+                f"{CANCEL.format(name)}: before they do they are {size:.2g}, and the estimate may be wrong by as much "
+                f"as its own size, which the bar allows for: {remedy}, and compare"
             )
     if exact["unplaced"]:
-        notes.append(f"{exact['unplaced']}: shares are by volume alone, and whether they cancel is not known")
+        notes.append(f"{exact['unplaced']}: shares are by volume alone, and whether shares cancel is not known")
     if exact["contact"]:
         notes.append("parts in contact: the estimate is of the finer mesh's own contacts, and jumps where these change")
     locks = scene.mesh.order == 1 and scene.volume == "tetrahedra"

@@ -201,7 +201,7 @@ class Batch(metaclass=Public):
         if resolution and any(np.isfinite(resolution(b).smallest_gap) for b in range(self.num_scenes)):
             warn(
                 f"{FacesBend(off)} where obstacles act at their nodes alone: refine the mesh there, or take a width of "
-                f"{2 * off:.3g} m or more"
+                f"{2.2 * off:.3g} m or more"
             )
 
     def _positions(self, values: dict, u: np.ndarray) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Derivatives of a formula, from the formula: numbers that record what is done to them, and functions of them."""
+"""Derivatives of a formula, from the formula: numbers that record what is done to them, and functions of them;
+of NumPy arrays `arrays.py`."""
 
 from diffsim_ti.differentiation.functions import (
     exp,

@@ -37,7 +37,7 @@ class Recorded(Node, NDArrayOperatorsMixin):
             "np.concatenate or np.where, and y = y + x for y += x, or write jvp and vjp beside value"
         )
 
-    __array__ = __float__ = __bool__ = __setitem__ = _refuse
+    __array__ = __float__ = __int__ = __index__ = __bool__ = __setitem__ = _refuse
 
     def __getattr__(self, name: str):
         raise AttributeError(f"arrays have no derivative by .{name} here: write jvp and vjp beside value")
@@ -294,7 +294,7 @@ def _einsum(letters: str, *x, optimize=False):
         def pull(seed):
             found = np.einsum(f"{','.join((out, *others))}->{kept}", seed, *own, optimize=optimize)
             summed = [axis for axis, letter in enumerate(words[k]) if letter not in kept]
-            return np.broadcast_to(np.expand_dims(found, tuple(summed)), np.shape(plain[k]))
+            return _fitted(np.expand_dims(found, tuple(summed)), np.shape(plain[k]))
 
         return x[k], lambda dx: np.einsum(letters, *plain[:k], dx, *plain[k + 1 :], optimize=optimize), pull
 
@@ -324,7 +324,8 @@ def _det(A):
 
 
 def _eigvalsh(A):
-    """Where some coincide, changes are those in the directions that the eigenvectors happen to have."""
+    """Of arrays that are symmetric and stay so. Where some coincide, changes are those in the directions that the
+    eigenvectors happen to have."""
     n = np.linalg.eigh(A.value)[1]
     push = lambda dA: np.einsum("...ia,...ij,...ja->...a", n, dA, n)  # noqa: E731
     return made(np.linalg.eigvalsh(A.value), (A, push, lambda seed: np.einsum("...ia,...a,...ja->...ij", n, seed, n)))
@@ -336,6 +337,11 @@ def _norm(x, ord=None, axis=None, keepdims=False):
     return np.sqrt((x * x).sum(axis, keepdims))
 
 
+def _ends(a, n):
+    """Where a^n has no derivative, or is constant: that of roots is zero where they are."""
+    return (a == 0) & (n < 1)
+
+
 # changes for that of each argument, which are adjoints, too, of the value and the arguments; that of a root is zero where
 # it is
 PARTIALS = {
@@ -344,10 +350,10 @@ PARTIALS = {
     np.multiply: (lambda d, y, a, b: d * b, lambda d, y, a, b: d * a),
     np.divide: (lambda d, y, a, b: d / b, lambda d, y, a, b: -d * (y / b)),
     np.power: (
-        lambda d, y, a, n: d * (n * a ** np.where(n == 0, 1, n - 1)[()]),
+        lambda d, y, a, n: d * np.where(_ends(a, n), 0.0, n * np.where(_ends(a, n), 1.0, a) ** (n - 1.0)),
         lambda d, y, a, n: d * (y * np.log(np.where(a == 0, 1, a))),
     ),
-    np.arctan2: (lambda d, y, a, b: d * b / (a * a + b * b), lambda d, y, a, b: -d * a / (a * a + b * b)),
+    np.arctan2: (lambda d, y, a, b: d * ratio(b, a * a + b * b), lambda d, y, a, b: -d * ratio(a, a * a + b * b)),
     np.maximum: (lambda d, y, a, b: d * (a >= b), lambda d, y, a, b: d * (a < b)),
     np.minimum: (lambda d, y, a, b: d * (a <= b), lambda d, y, a, b: d * (a > b)),
     np.negative: (lambda d, y, a: -d,),

@@ -1,4 +1,5 @@
-"""The chain rule as a list of links: each a function with its derivatives beside it, and three loops over all of them."""
+"""The chain rule as a list of links: each a function whose derivatives are found from it or stand beside it, and three loops
+over all of them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence

@@ -42,7 +42,8 @@ class Material(metaclass=Public):
     says the units of numbers that are not in Pa, such as {"exponent": "-", "viscosity": "Pa s"}. `from_own` is a
     constant matrix from a spelling's numbers, vectors spread out, to the coefficients. `lame` says the moduli of small
     strains (those of the stiffest direction), which the limit of explicit steps and the stiffness of a barrier are
-    taken from.
+    taken from; its derivatives are found from it, so that it takes NumPy functions that record
+    (differentiation/arrays.py), and `as_array` in place of np.asarray.
 
     Raises ValueError with rule, value and remedy.
     """

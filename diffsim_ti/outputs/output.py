@@ -1,5 +1,5 @@
-"""An output, which losses use like positions: a function of a run's frames and inputs, with its derivatives beside it;
-and the states themselves as outputs, which every rollout has."""
+"""An output, which losses use like positions: a function of a run's frames and inputs; and the states themselves as
+outputs, which every rollout has."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
@@ -164,7 +164,13 @@ class _Recording:
         return self.leaves[name] if name in self.leaves else getattr(self.frames, name)
 
     def __getitem__(self, name: str):
-        return getattr(self, name)
+        return getattr(self, name) if name in ("positions", "velocities", "displacements") else self.outputs
+
+    @property
+    def outputs(self):
+        raise TypeError(
+            "another output has no derivative here: compute it from states, or write jvp and vjp beside value"
+        )
 
     @cached_property
     def inputs(self) -> dict[str, Recorded]:
@@ -205,7 +211,8 @@ class Output(metaclass=Public):
     `frames[name]` and `Rollout.tangents`, takes a seed in `Rollout.vjp(frames, name=...)`, and has a field under
     `ti.ad.Tape` and a tensor in torch. `frames` (`Frames`) holds the states and, in `frames.inputs`, the values of
     all inputs. Derivatives are found from `value` (differentiation/arrays.py), where an error says what has none; there
-    write `jvp` and `vjp` beside it. What `np.where` does not choose has to be finite for them, too. Rollout.tangents and
+    write `jvp` and `vjp` beside it. Both branches of `np.where` are differentiated, so that the one which is not taken has
+    to be finite, with its slope; `np.linalg.eigvalsh` is of arrays that stay symmetric. Rollout.tangents and
     Rollout.vjp must then agree in <w, J d> = <J^T w, d>: check that, and differences.
     Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.
     """

@@ -289,9 +289,10 @@ class Simulator(metaclass=Public):
     @property
     def state(self) -> dict[str, np.ndarray]:
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
-        two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps and what
-        multigrid has learned there, joint_states of robots, what steps were given over time, and substeps where more were
-        taken than at the start. `np.savez(file, **simulator.state)` keeps it, to the bit."""
+        two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps and
+        what multigrid has learned there, joint_states of robots with positions and velocities before (joints, 5), what
+        steps were given over time, and substeps where more were taken than at the start. `np.savez(file,
+        **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:

@@ -68,6 +68,10 @@ def on_coarser(scene: Scene, mesh: TetrahedralMesh) -> Scene:
                 "none of its vertices lies between vertices that are fixed by their indices: name them as a set"
             )
         mesh, given["fixed"] = mesh.with_vertex_set(HELD, own), HELD
+    for term in scene.terms:
+        named = [getattr(term, kind, None) for kind in ("vertices", "tetrahedra")]
+        if not all(map(is_named, [*named, *(getattr(term, "attached", None) or {}).values()])):
+            raise ValueError(f"{type(term).__name__} is on vertices or tetrahedra by their indices: name them as a set")
     nodes = mesh.quadratic()
     for name, origin in (("initial_positions", scene.mesh.vertices), ("initial_velocities", 0.0)):
         if np.ndim(given[name]) == 2:

@@ -190,17 +190,17 @@ class JointStage(Stage):
         """Find w; meets: with vertices, else without contact. Raises NotConverged where it is not found."""
         J = self.joints
 
-        def left():
+        def kicked():
             if len(J.at):
                 self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
-            return self.left()
 
         def stand(w):
             self.go(w)
             if meets:
                 self.launch("press")
                 self.look()
-            return left()
+                kicked()
+            return self.left()
 
         def direction(R):
             step, w = np.linalg.solve(self.slope(meets), R), J.w
@@ -208,10 +208,11 @@ class JointStage(Stage):
                 step = np.linalg.solve(self.slope(), R)
             return step, 1.0, lambda t: stand(w + t * step)
 
-        R, size, noise = balanced(left(), direction, max(1e-14, 4 * J.eps), J.loose, ROUNDS)
+        kicked()
+        R, size, noise = balanced(self.left(), direction, max(1e-14, 4 * J.eps), J.loose, ROUNDS)
         share = float(np.max(np.abs(R) / (size + noise / J.loose)))
         if not share <= J.loose:
-            remedy = "take smaller steps, or begin with links outside of the body"
+            remedy = "take smaller steps" + (", or begin with links outside of the body" if self.own.size else "")
             error = NotConverged(f"joints of robots are out of balance by {share:.2g}: {remedy}", [share])
             raise self.ws.dated(error, self.at.j, self.at.num_passes)
         J.w = J.w + np.linalg.solve(self.slope(), R)  # so that momentum is kept to round-off

@@ -271,9 +271,8 @@ class Joints:
             self.check_stable()
         smaller = "take smaller steps" if self.moves else "give positions of joints nearer to the equilibrium"
         if not self.left <= max(self.ws.solver.tolerance, self.loose):
-            remedy = smaller if self.moves else HELD
             raise NotConverged(
-                f"the joints of robots are out of balance by {self.left:.2g} of their forces: {remedy}", [self.left]
+                f"the joints of robots are out of balance by {self.left:.2g} of their forces: {smaller}", [self.left]
             )
         meets = self.links or len(self.at) and len(self.rows)
         met = self.ws.collisions.detection.nearest(self.p.held_at, self.rows[::3]) if meets else None

@@ -54,7 +54,7 @@ class Robot(GivenOverTime, Term):
     of the contact stage: what vertices do to them turns joints in the same substep, by J M^-1 J^T. Fixed vertices do not
     stop links there.
     Links touch the body alone: not one another, the ground, or other obstacles. `Simulator.set_state` leaves the joints
-    where they are. `compute_energy` and the guard of the energy are those of the body; `LinkEnergy` is that of links.
+    where they are. `compute_energy` is that of the body, `LinkEnergy` that of links; no guard watches the energy.
     Vertices that are `attached` move exactly as their links do, from where they and the joints are as a run starts: they are
     no unknowns of their own, and what acts on them acts on the joints, inertia included. `Reaction` of their set is the
     force of the link on them, or its moment. Give the body `initial_velocities` that go with those of the joints. In
