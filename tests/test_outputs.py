@@ -177,6 +177,24 @@ def test_functions_without_a_derivative_say_so(function):
         function(arrays.Recorded(np.ones(3)))
 
 
+def test_another_output_within_an_output_is_refused_in_derivatives():
+    class Twice(Output):
+        name = "twice"
+
+        def shape(self, num_frames):
+            return (num_frames, 3)
+
+        def value(self, frames):
+            return 2.0 * frames["center_of_mass"]
+
+    scene = ds.Scene(ds.TetrahedralMesh.create_cube(2), ds.StableNeoHookean(1e4, 0.3), precision="f64")
+    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-4), 1, outputs=[ds.CenterOfMass(), Twice()])
+    frames = rollout.forward()
+    np.testing.assert_array_equal(frames["twice"], 2 * frames["center_of_mass"])
+    with pytest.raises(TypeError, match="another output has no derivative here"):
+        rollout.vjp(frames, twice=np.ones((2, 3)))
+
+
 def outputs():
     return [ds.MaterialPoints(POINTS, name="markers"), KineticEnergy("ymax", "xmax")]
 

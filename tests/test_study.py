@@ -341,6 +341,8 @@ def test_ten_nodes_are_tried_on_half_the_cells():
     own, coarse = (found[name] for name in ("linear", "quadratic, coarser mesh"))
     assert coarse.error < 0.5 * own.error and not trials.notes
     held = ElementTrials(scene.replace(fixed=mesh.vertex_sets["xmin"]), 0.1, 2, 1e-3)
+    by_index = ElementTrials(scene.replace(terms=[ds.ExternalForce((0.0, 1.0, 0.0), [3])]), 0.1, 2, 1e-3)
+    assert not by_index.on_coarser_mesh() and "by their indices: name them as a set" in by_index.notes[0]
     made = held.on_coarser_mesh()["quadratic, coarser mesh"]
     assert set(made.fixed) == set(made.mesh.vertex_sets["xmin"]) and not held.notes
 
