@@ -49,8 +49,8 @@ CONTACT_REVERSE = NO_TRAFFIC | dict(launches=19, copies_to_device=4, bytes_to_de
 # ... for a new list; every eighth puts the primitives in order anew, on the host
 NEW_LIST = NO_TRAFFIC | dict(launches=55, copies_to_device=16, copies_to_host=11, fills=2)
 # ... for each implicit step of this scene, whose rounds of Newton's method read a few numbers, and for a product of the host
-IMPLICIT_FORWARD = NO_TRAFFIC | dict(launches=340, copies_to_device=65, copies_to_host=28, fills=4)
-IMPLICIT_REVERSE = NO_TRAFFIC | dict(launches=60, copies_to_device=11, copies_to_host=10, fills=2)
+IMPLICIT_FORWARD = NO_TRAFFIC | dict(launches=310, copies_to_device=68, copies_to_host=31, fills=4)
+IMPLICIT_REVERSE = NO_TRAFFIC | dict(launches=62, copies_to_device=15, copies_to_host=11, fills=2)
 PRODUCT = NO_TRAFFIC | dict(launches=3, copies_to_device=2, copies_to_host=1)
 # ... for a whole explicit run, besides its substeps: arrays go each way once, zeroing is a memset
 ONCE_FORWARD = dict(synchronisations=0, copies_to_device=17, copies_to_host=8, fills=4)
@@ -164,7 +164,7 @@ def test_implicit_steps_stay_below_their_ceilings(driver, cube):
 
 
 def test_ten_iterations_on_the_device_bring_a_few_numbers_to_the_host(driver, monkeypatch):
-    """Besides arguments of launches nothing goes to the card."""
+    """Besides arguments of launches nothing goes to the card; nor is anything compiled for other numbers of iterations."""
     monkeypatch.setattr(Multigrid, "direct", 0)
     mesh = TetrahedralMesh.create_box((9, 4, 4), (0.8, 0.3, 0.3))
     held = Scene(mesh, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity()], fixed="xmin", precision="f64")
@@ -174,7 +174,7 @@ def test_ten_iterations_on_the_device_bring_a_few_numbers_to_the_host(driver, mo
     workspace.potential.place(0 * b)
     multigrid, _ = workspace.preconditioner(none)
     multigrid.update(0 * b)
-    for iterations in (10, 10, 20):
+    for iterations in (10, 10, 20, 7, 13, 29):
         driver.restart()
         _, _, count, _ = multigrid.solver(none, None, False, b * workspace.free, 1e-30, iterations, 1e-16)
         assert count == iterations
@@ -183,6 +183,7 @@ def test_ten_iterations_on_the_device_bring_a_few_numbers_to_the_host(driver, mo
     assert more["copies_to_host"] == 1 and more["bytes_to_host"] <= 8 * ROOM and more["synchronisations"] == 0
     assert more["fills"] == more["copies_on_device"] == 0
     assert more["bytes_to_device"] <= 1024 * more["launches"]
+    assert [found[iterations]["modules"] for iterations in (7, 13, 29)] == [0, 0, 0]
 
 
 def test_every_kernel_is_launched_again_and_again(driver, cube):

@@ -10,6 +10,7 @@ import taichi as ti
 import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.stress.projection import Projection
+from diffsim_ti.solvers.implicit import cycle
 from diffsim_ti.solvers.implicit.contact_kernels import ContactKernels
 from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
@@ -146,6 +147,17 @@ def test_a_cycle_is_symmetric_and_positive_definite(static):
         sizes = np.sqrt((a * Ma).sum() * (b * Mb).sum())
         assert abs((a * Mb).sum() - (b * Ma).sum()) < 2e-6 * sizes
         assert (a * Ma).sum() > 0 and not Ma[static.free[:, 0] == 0].any()
+
+
+def test_threads_that_share_rows_of_a_cycle_find_what_one_thread_does(static, monkeypatch):
+    """As on a card, up to rounding in single precision."""
+    r, found = np.random.default_rng(1).standard_normal(static.potential.held_at.shape) * static.free, {}
+    for threads in (1, 8):
+        monkeypatch.setattr(cycle, "threads_of", lambda M, threads=threads: threads)
+        own = Multigrid(static.potential, np.zeros((len(r), 1)), static.free)
+        assert len(own.cycle.levels) == 2
+        found[threads] = own(r)
+    assert np.abs(found[8] - found[1]).max() <= 1e-5 * np.abs(found[1]).max()
 
 
 def test_a_cycle_solves_nearly(static):

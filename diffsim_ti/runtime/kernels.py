@@ -153,6 +153,7 @@ class Repeated:
         launch = Launch(made, *arrays, vectorized=vectorized, **options)
         own = [(n, None if k is None else own_numbers[k]) for k, n in numbers]
         self._launch = lambda times, given: launch(*((given if x is None else x)[n] for n, x in own), times)
+        self._sizes = None if one_thread else (16, 4, 1)  # of launches: the driver compiles each number of times anew
 
     @staticmethod
     def is_possible(parallel: bool) -> bool:
@@ -160,7 +161,10 @@ class Repeated:
         return runs_on_cpu() and not parallel or can_repeat()
 
     def __call__(self, times: int, **numbers) -> None:
-        self._launch(times, numbers)
+        while times:
+            size = next(n for n in self._sizes or (times,) if n <= times)
+            self._launch(size, numbers)
+            times -= size
 
 
 @lru_cache(maxsize=None)

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, Kernel
+from diffsim_ti.runtime import PRECISIONS, Kernel, runs_on_cpu
 
 A = ti.template()
 # places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature, 3 r . z <= 0
@@ -37,11 +37,34 @@ class CGKernels:
     @ti.func
     def add_up(self, part: A, rows: A, b, plan: A):
         """The first chunk c of system b; part[k, c] = the sum of what its chunks have left in each of so many rows k."""
-        first = b * (plan.chunks // plan.systems)
-        for c in range(first + 1, first + plan.chunks // plan.systems):
+        count = plan.chunks // plan.systems
+        first = b * count
+        if ti.static(self.at_once == 1):
+            for c in range(first + 1, first + count):
+                for k in ti.static(range(rows)):
+                    part[k, first] = part[k, first] + part[k, c]
+        else:
+            whole = first + 1 + (count - 1) // self.at_once * self.at_once
             for k in ti.static(range(rows)):
-                part[k, first] = part[k, first] + part[k, c]
+                total, c = part[k, first], first + 1
+                while c < whole:
+                    for j in ti.static(range(self.at_once)):
+                        total += part[k, c + j]
+                    c += self.at_once
+                for j in range(whole, first + count):
+                    total += part[k, j]
+                part[k, first] = total
         return first
+
+    @property
+    def at_once(self) -> int:
+        """Numbers that a thread asks for before it waits for the first of them."""
+        return 1 if runs_on_cpu() else 8
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether a thread goes through all systems: where there are several, a card has a thread for each."""
+        return not self.several or runs_on_cpu()
 
     @ti.func
     def system(self, i, count, plan: A):
@@ -128,7 +151,7 @@ class CGKernels:
             for i in range(begin, end):
                 rz += self.dot(cg.r[0, i], cg.z[0, i])
             cg.part[0, c] = rz
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=self.one_by_one)
         for b in range(plan.systems):
             if cg.state[b, STOPPED] == 0:
                 rz, old = cg.part[0, self.add_up(cg.part, 1, b, plan)], cg.state[b, RZ]
@@ -225,7 +248,7 @@ class CGKernels:
             if cg.state[self.system(c, plan.chunks, plan), STOPPED] == 0:
                 begin, end = self.span(c, plan.length, plan.nodes, plan)
                 self.multiply(c, begin, end, cg, at)
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=self.one_by_one)
         for b in range(plan.systems):
             if cg.state[b, STOPPED] == 0:
                 self.choose(b, cg, plan)
@@ -234,7 +257,7 @@ class CGKernels:
             b = self.system(c, plan.chunks, plan)
             if cg.state[b, STOPPED] == 0:
                 self.go(c, b, cg, plan)
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=self.one_by_one)
         for b in range(plan.systems):
             if cg.state[b, STOPPED] == 0:
                 cg.state[b, SQUARE] = cg.part[0, self.add_up(cg.part, 1, b, plan)]

@@ -32,6 +32,13 @@ def block_matrix(M) -> SimpleNamespace:
     )
 
 
+def threads_of(M) -> int:
+    """How many threads share a row of blocks: several on a card, where one waits for each entry in turn, if rows are long and
+    too few to occupy it."""
+    long, few = len(M.data) > 16 * nodes_of(M), nodes_of(M) <= 2**14
+    return 8 if long and few and not runtime.runs_on_cpu() else 1
+
+
 def nodes_of(M) -> int:
     """Rows of blocks."""
     return M.shape[0] // M.blocksize[0]
@@ -57,7 +64,7 @@ class Level:
         self.values = upload_rows(M.data[self._off])
         self.b, self.x, self.d, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(4))
         self.diagonal, self.inverse = (runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2))
-        self.kernels = kernels_of(LevelKernels, self.numbers, "f32", parallel)
+        self.threads, self.parallel = threads_of(M), parallel
         self._measure(M)
 
     def _measure(self, M) -> None:
@@ -151,16 +158,21 @@ class Cycle:
         self.levels = [Level(M, self._wide(M, parallel)) for M in matrices]
         self._entries = [len(M.data) for M in (*matrices, *ways)]
         self._down, self._up = [], []  # (kernel, records, numbers)
-        for level, below, P in zip(self.levels, self.levels[1:], ways):
-            kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel))
-            between = dict(
-                level=level, down=block_matrix(P.T.tobsr(P.blocksize[::-1])), up=block_matrix(P), below=below
-            )
+        downs = [P.T.tobsr(P.blocksize[::-1]) for P in ways]
+        last, inverse = self.levels[-1], inverse_matrix(matrices[-1])
+        own = [level.threads for level in self.levels[:-1]] + [threads_of(inverse)]
+        for level, threads, above in zip(self.levels, own, [1, *map(threads_of, downs)]):
+            if max(threads, above) > 1:
+                level.part = runtime.array(ROWS[level.numbers], level.nodes * max(threads, above))
+        for level, below, P, down in zip(self.levels, self.levels[1:], ways, downs):
+            threads = level.threads, threads_of(down)
+            kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel), *threads)
+            between = dict(level=level, down=block_matrix(down), up=block_matrix(P), below=below)
             self._down.append((kernels.down, between, dict(nodes=level.nodes, below=below.nodes)))
             self._up.insert(0, (kernels.up, between, dict(nodes=level.nodes)))
-        last, self._inverse = self.levels[-1], block_matrix(inverse_matrix(matrices[-1]))
-        inverse = dict(level=last, inverse=self._inverse)
-        self._solve = last.kernels.solve, inverse, dict(nodes=last.nodes)
+        self._inverse = block_matrix(inverse)
+        kernels = kernels_of(LevelKernels, last.numbers, "f32", last.parallel, own[-1])
+        self._solve = kernels.solve, dict(level=last, inverse=self._inverse), dict(nodes=last.nodes)
         vectors = "f32" if runtime.arch_name() == "vulkan" else "f64"
         self._ends = kernels_of(LevelKernels, 3, vectors, self._wide(matrices[0], parallel))
         self._bound = {}

@@ -16,11 +16,11 @@ def matrix_arrays(rows: int) -> dict:
     return dict(start="ints", column="ints", values=f"rows{rows}")
 
 
-def level_arrays(numbers: int) -> dict:
+def level_arrays(numbers: int, threads: int = 1) -> dict:
     """Of a level with 3 or 6 numbers at a node: its matrix without the diagonal blocks, these, their damped inverses, and
-    vectors: right-hand side, approximation, its last change, another one."""
-    kind = f"rows{numbers}"
-    return matrix_arrays(numbers) | dict.fromkeys(("diagonal", "inverse", "b", "x", "d", "y"), kind)
+    vectors: right-hand side, approximation, its last change, another one; parts of rows where several threads share one."""
+    kind, more = f"rows{numbers}", ("part",) if threads > 1 else ()
+    return matrix_arrays(numbers) | dict.fromkeys(("diagonal", "inverse", "b", "x", "d", "y", *more), kind)
 
 
 def chebyshev(terms: int, share: float) -> tuple[float, list[tuple[float, float]]]:
@@ -40,11 +40,14 @@ THETA, FACTORS = chebyshev(3, 0.1)  # measured: with one or two terms as fast in
 
 @dataclass(frozen=True)
 class CycleKernels:
-    """Between a level with `fine` numbers at a node and the next with `coarse` ones."""
+    """Between a level with `fine` numbers at a node and the next with `coarse` ones. So many threads share a row of the
+    level's matrix, and of the one down to the next (`threads_of`)."""
 
     fine: int
     coarse: int
     parallel: bool
+    threads: int = 1
+    threads_down: int = 1
 
     @ti.func
     def zero(self, numbers: A):
@@ -59,19 +62,41 @@ class CycleKernels:
         return y
 
     @ti.func
-    def row(self, i, matrix: A, x: A, total, columns: A):
-        """total + (row i of a matrix) x"""
+    def share(self, rows, matrix: A, x: A, of: A, numbers: A, columns: A, threads: A):
+        """of.part: what each of several threads makes of its share of a row's entries, for `row`."""
+        if ti.static(threads > 1):
+            ti.loop_config(serialize=not self.parallel)
+            for t in range(rows * threads):
+                i, y = t // threads, self.zero(numbers)
+                k, end = matrix.start[i] + t % threads, matrix.start[i + 1]
+                while k < end:
+                    other = x[matrix.column[k]]
+                    y += self.block(matrix.values, k, other, columns)
+                    k += threads
+                of.part[t] = y
+
+    @ti.func
+    def row(self, i, matrix: A, x: A, of: A, total, columns: A, threads: A):
+        """total + (row i of a matrix) x; what several threads share, `share` has left in of.part."""
         y = total
-        for k in range(matrix.start[i], matrix.start[i + 1]):
-            other = x[matrix.column[k]]
-            y += self.block(matrix.values, k, other, columns)
+        if ti.static(threads > 1):
+            for t in ti.static(range(threads)):
+                y += of.part[threads * i + t]
+        else:
+            for k in range(matrix.start[i], matrix.start[i + 1]):
+                other = x[matrix.column[k]]
+                y += self.block(matrix.values, k, other, columns)
         return y
 
     @ti.func
-    def left(self, i, level: A, x: A, numbers: A):
-        """(b - A x) of row i."""
+    def share_level(self, level: A, x: A, plan: A):
+        self.share(plan.nodes, level, x, level, self.fine, self.fine, self.threads)
+
+    @ti.func
+    def left(self, i, level: A, x: A):
+        """(b - A x) of row i, after `share_level`."""
         own = x[i]
-        y = self.row(i, level, x, self.block(level.diagonal, i, own, numbers), numbers)
+        y = self.row(i, level, x, level, self.block(level.diagonal, i, own, self.fine), self.fine, self.threads)
         return level.b[i] + y * ti.cast(-1, ti.f32)
 
     @ti.func
@@ -84,64 +109,73 @@ class CycleKernels:
     @ti.func
     def change(self, i, k: A, level: A, x: A, target: A):
         """target = x + change k, which is not the first."""
-        left = self.left(i, level, x, self.fine)
+        left = self.left(i, level, x)
         d = self.block(level.inverse, i, left, self.fine) * ti.cast(FACTORS[k][1], ti.f32)
         d += level.d[i] * ti.cast(FACTORS[k][0], ti.f32)
         level.d[i] = d
         target[i] = x[i] + d
 
     @ti.func
-    def restrict(self, level: A, down: A, below: A, plan: A):
+    def changes(self, level: A, plan: A):
+        """The two changes of x that are not the first."""
+        self.share_level(level, level.x, plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             self.change(i, 0, level, level.x, level.y)
+        self.share_level(level, level.y, plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             self.change(i, 1, level, level.y, level.x)
+
+    @ti.func
+    def restrict(self, level: A, down: A, below: A, plan: A):
+        self.changes(level, plan)
+        self.share_level(level, level.x, plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
-            level.y[i] = self.left(i, level, level.x, self.fine)
+            level.y[i] = self.left(i, level, level.x)
+        self.share(plan.below, down, level.y, below, self.coarse, self.fine, self.threads_down)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.below):
-            b = self.row(i, down, level.y, self.zero(self.coarse), self.fine)
+            b = self.row(i, down, level.y, below, self.zero(self.coarse), self.fine, self.threads_down)
             below.b[i] = b
             self.begin(i, below, b, self.zero(self.coarse), below.x, self.coarse)
 
     @cached_property
     def down(self) -> Kernel:
         """From the first x of a level to b and the first x of the next."""
-        arrays = dict(level=level_arrays(self.fine), down=matrix_arrays(self.coarse), below=level_arrays(self.coarse))
+        level, below = level_arrays(self.fine, self.threads), level_arrays(self.coarse, self.threads_down)
+        arrays = dict(level=level, down=matrix_arrays(self.coarse), below=below)
         return Kernel("down", self.restrict, "f32", arrays, dict(nodes="int", below="int"))
 
     @ti.func
     def correct(self, level: A, up: A, below: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
-            level.y[i] = self.row(i, up, below.x, level.x[i], self.coarse)
+            level.y[i] = self.row(i, up, below.x, level, level.x[i], self.coarse, 1)
+        self.share_level(level, level.y, plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
-            self.begin(i, level, self.left(i, level, level.y, self.fine), level.y[i], level.x, self.fine)
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.nodes):
-            self.change(i, 0, level, level.x, level.y)
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.nodes):
-            self.change(i, 1, level, level.y, level.x)
+            self.begin(i, level, self.left(i, level, level.y), level.y[i], level.x, self.fine)
+        self.changes(level, plan)
 
     @cached_property
     def up(self) -> Kernel:
         """From the last x of the next level to the last of this."""
-        arrays = dict(level=level_arrays(self.fine), up=matrix_arrays(self.fine), below=level_arrays(self.coarse))
+        level = level_arrays(self.fine, self.threads)
+        arrays = dict(level=level, up=matrix_arrays(self.fine), below=level_arrays(self.coarse))
         return Kernel("up", self.correct, "f32", arrays, dict(nodes="int"))
 
 
 @dataclass(frozen=True)
 class LevelKernels:
-    """Within a level with so many numbers at a node; precision: of vectors outside the cycle."""
+    """Within a level with so many numbers at a node; precision: of vectors outside the cycle; so many threads share a row of
+    its inverse."""
 
     numbers: int
     precision: str
     parallel: bool
+    threads: int = 1
 
     @cached_property
     def between(self) -> CycleKernels:
@@ -149,14 +183,16 @@ class LevelKernels:
 
     @ti.func
     def multiply(self, level: A, inverse: A, plan: A):
+        self.between.share(plan.nodes, inverse, level.b, level, self.numbers, self.numbers, self.threads)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
-            level.x[i] = self.between.row(i, inverse, level.b, self.between.zero(self.numbers), self.numbers)
+            zero = self.between.zero(self.numbers)
+            level.x[i] = self.between.row(i, inverse, level.b, level, zero, self.numbers, self.threads)
 
     @cached_property
     def solve(self) -> Kernel:
         """x = A^-1 b by the inverse, a matrix of blocks."""
-        arrays = dict(level=level_arrays(self.numbers), inverse=matrix_arrays(self.numbers))
+        arrays = dict(level=level_arrays(self.numbers, self.threads), inverse=matrix_arrays(self.numbers))
         return Kernel("solve", self.multiply, "f32", arrays, dict(nodes="int"))
 
     @ti.func

@@ -1,6 +1,7 @@
 """Conjugate gradients on the device: of what crosses to the host, a few numbers every few iterations."""
 
 from collections.abc import Callable
+from math import isqrt
 
 import numpy as np
 import taichi as ti
@@ -21,16 +22,18 @@ class DeviceCG:
     An iteration is one kernel, but on Vulkan, and a launch makes many.
     """
 
-    most_chunks, shortest = 256, 32
     systems, several = 1, False  # how many; whether there may be more than one
     many = 50  # iterations in a launch on one thread, which stops by itself
+    ahead = 16  # iterations before a card is asked for the residual
 
     def __init__(self, potential, cycle, free: Free, parallel: bool):
         n = potential.arrays.num_vertices
         self.potential, self.cycle, self.nodes, self.parallel = potential, cycle, n, parallel
         self.precision = "f64" if arch_name() != "vulkan" else "f32"
         self._vector, fp = array_types(self.precision)["vectors"].dtype, PRECISIONS[self.precision]
-        self.length = max(self.shortest, -(-n // max(self.most_chunks, self.systems)))
+        self.length = max(32, -(-n // max(256, self.systems)))
+        if not runs_on_cpu():  # a thread waits for each entry of its chunk in turn, then one for chunks, eight at a time
+            self.length = max(8, isqrt(n // self.systems) // 6)
         self.chunks = self.systems * -(-n // (self.systems * self.length))
         self.x, self.r, self.z, self.p, self.q = (runtime.array(self._vector, 1, n) for _ in range(5))
         self.part, self.state = runtime.array(fp, 6, self.chunks), runtime.array(fp, self.systems, ROOM)
@@ -46,8 +49,8 @@ class DeviceCG:
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n, systems=self.systems)
         self.is_one_kernel = Repeated.is_possible(parallel)
         whole = runs_on_cpu() and not parallel and self.is_one_kernel
-        # iterations between looks at the state; on a card so many as the solve before took
-        self._look, self.last = self.many if whole else 1 if runs_on_cpu() else 0, 10
+        # iterations between looks at the state; on a card as many as seem to be left
+        self._look = self.many if whole else 1 if runs_on_cpu() else 0
         # (with a matrix, convex) -> iterate(times, rounding), numbers of its products, what tells whether arrays are others
         self._iterations, self._served = {}, None
         self._room = -1  # blocks of that matrix
@@ -136,10 +139,17 @@ class DeviceCG:
                     own.update(now)
         return kept[0]
 
-    def iterate(self, done: int, most: int, eps: float, more: bool = False, convex: bool = False) -> None:
-        """Some of at most so many iterations, of which some are done."""
-        times = min(self._look or max(2, self.last - done, done), most - done)
+    def iterate(self, state: np.ndarray, most: int, eps: float, more: bool = False, convex: bool = False) -> None:
+        """Some of at most so many iterations; state: rows of the systems that go on."""
+        times = min(self._look or self._left(state), most - int(state[:, COUNT].max()))
         self.iterations(more, convex)(times, 10 * eps)
+
+    def _left(self, state: np.ndarray) -> int:
+        """Iterations that are left if the residual, which was 1, goes on to fall as it did; at most `ahead`."""
+        count, square, least = (state[:, k] for k in (COUNT, SQUARE, LEAST))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = count * (np.log(least) / np.log(square) - 1)
+        return int(np.clip(np.ceil(np.where((count > 0) & (square < 1), left, count).max()), 1, self.ahead))
 
     def put_system(self, mass: Mass, more) -> None:
         """Bring the mass and the matrix of a system, if it has one, to the device."""
@@ -157,11 +167,11 @@ class DeviceCG:
         runtime.fill(self.r, (rows / np.where(wanted, size, np.inf)[:, None]).reshape(1, -1, 3))
         state[:, LEAST], state[:, LIMIT], state[:, STOPPED] = tolerance**2, most, ~wanted
         runtime.fill(self.state, state)
-        while done < most and ((state[:, STOPPED] == 0) & np.isfinite(state[:, SQUARE])).any():
-            self.iterate(done, most, eps, more, convex)
+        while done < most and (on := (state[:, STOPPED] == 0) & np.isfinite(state[:, SQUARE])).any():
+            self.iterate(state[on], most, eps, more, convex)
             state = runtime.fetch(self.state)
             done = max(done + 1, int(state[:, COUNT].max()))
-        self.last, x = int(state[:, COUNT].max()), runtime.fetch_row(self.x, 0).reshape(rows.shape)
+        x = runtime.fetch_row(self.x, 0).reshape(rows.shape)
         first = (state[:, STOPPED] == 2) & (state[:, COUNT] == 1)
         if first.any():
             x = np.where(first[:, None], runtime.fetch_row(self.p, 0).reshape(rows.shape), x)

@@ -105,7 +105,7 @@ class NewtonKernels:
                         newton.step[0, i] = self.cg.to(PRECISIONS[self.scene], d)
                     slope += self.cg.dot(newton.R[i], d)
             cg.part[0, c] = slope
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=self.cg.one_by_one)
         for b in range(plan.systems):
             cg.state[b, FRESH] = ti.cast(0, self.fp)
             if cg.state[b, PHASE] == SOLVE and cg.state[b, STOPPED] == 1:
@@ -125,12 +125,14 @@ class NewtonKernels:
 
     @ti.func
     def shorten(self, cg: A, out: A, plan: A):
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=not self.parallel)
+        for j in range(plan.count):
+            b, share = self.cg.system(j, plan.count, plan), ti.cast(out.found[j], self.fp)
+            if cg.state[b, FRESH] == 1 and share < cg.state[b, LONGEST]:
+                ti.atomic_min(cg.state[b, LONGEST], share)
+        ti.loop_config(serialize=self.cg.one_by_one)
         for b in range(plan.systems):
             if cg.state[b, FRESH] == 1:
-                own = plan.count // plan.systems
-                for j in range(b * own, (b + 1) * own):
-                    cg.state[b, LONGEST] = ti.min(cg.state[b, LONGEST], ti.cast(out.found[j], self.fp))
                 cg.state[b, FRACTION] = ti.min(cg.state[b, FRACTION], cg.state[b, LONGEST])
                 if cg.state[b, FRACTION] < 1:
                     cg.state[b, CUTS] = cg.state[b, CUTS] + ti.cast(1, self.fp)
@@ -253,7 +255,7 @@ class NewtonKernels:
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
             self.sum_energies(c, self.cg.system(c, plan.chunks, plan), cg, newton, at, plan)
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=self.cg.one_by_one)
         for b in range(plan.systems):
             if self.is_tried(b, cg):
                 self.decide(b, cg, plan)
@@ -375,7 +377,7 @@ class NewtonKernels:
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
             self.sum_residual(c, self.cg.system(c, plan.chunks, plan), cg, newton, at, barriers, plan)
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=self.cg.one_by_one)
         for b in range(plan.systems):
             cg.state[b, ACCEPTED] = ti.cast(0, self.fp)
             if cg.state[b, PHASE] == JUDGE:
@@ -416,12 +418,16 @@ class NewtonKernels:
 
     @ti.func
     def check(self, cg: A, body: A, plan: A):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
+        ti.loop_config(serialize=not self.parallel)
+        for c in range(plan.chunks):
             hard = 0
-            for i in range(plan.nodes):
+            begin, end = self.cg.span(c, plan.length, plan.nodes, plan)
+            for i in range(begin, end):
                 hard = hard | body.hard[i]
-            if cg.state[0, PHASE] == UPDATE and hard == 0:
+            cg.part[0, c] = ti.cast(hard, self.fp)
+        ti.loop_config(serialize=True)
+        for b in range(1):
+            if cg.state[0, PHASE] == UPDATE and cg.part[0, self.cg.add_up(cg.part, 1, b, plan)] == 0:
                 cg.state[0, PHASE], cg.state[0, STOPPED] = ti.cast(SOLVE, self.fp), ti.cast(0, self.fp)
 
     @cached_property

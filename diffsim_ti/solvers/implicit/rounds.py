@@ -214,7 +214,7 @@ class Rounds:
 
     def advance(self) -> None:
         """From one phase to the next until it is over."""
-        cg, served = self.cg, False
+        served = False
         numbers = self._always | self.potential.sizes() | dict(rounding=10 * self.newton.eps)
         if nk.START in self.state[:, nk.PHASE]:
             self.preconditioner.follow(self.potential.held_at)
@@ -252,10 +252,8 @@ class Rounds:
                 self._update(1, **numbers)
             if self.whole or not solves:
                 self._receive()
-            elif (self.state[:, STOPPED] == 1).any():
-                cg.last = int(self.state[:, COUNT].max())
-                if not self.several:
-                    self.preconditioner.learn(float(np.sqrt(self.state[0, SQUARE])), cg.last)
+            elif not self.several and self.state[0, STOPPED] == 1:
+                self.preconditioner.learn(float(np.sqrt(self.state[0, SQUARE])), int(self.state[0, COUNT]))
             if judges and self.beside:
                 taken = self.state[:, nk.ACCEPTED] == 1
                 self._base = self.potential.held_at if taken.all() else self._where(taken, self._base)
@@ -294,8 +292,7 @@ class Rounds:
         friction, more = self.potential.surface_friction, self._more is not None
         with friction.bounded(self.newton.turning) if friction else nullcontext():
             while np.any(on := (self.state[:, STOPPED] == 0) & ~self._odd()):
-                done, most = (int(self.state[on, k].max()) for k in (COUNT, LIMIT))
-                self.cg.iterate(done, most, self.newton.eps, more)
+                self.cg.iterate(self.state[on], int(self.state[on, LIMIT].max()), self.newton.eps, more)
                 self._receive()
 
     def _solve(self, odd: np.ndarray) -> None:
