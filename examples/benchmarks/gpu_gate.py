@@ -239,8 +239,8 @@ def implicit_batch(options, scenes: int) -> dict:
     frames = batch.forward(**values)
     seeds = np.ones_like(frames.positions)
     batch.vjp(frames, seeds)
-    forward = seconds(lambda: batch.forward(**values), 1) / (steps * scenes)
-    both = seconds(lambda: batch.vjp(batch.forward(**values), seeds), 1) / (steps * scenes)
+    forward = seconds(lambda: batch.forward(**values), 2) / (steps * scenes)
+    both = seconds(lambda: batch.vjp(batch.forward(**values), seeds), 2) / (steps * scenes)
     alive = bool(frames.alive.all())
     return dict(step_ms=round(1e3 * forward, 3), with_gradient_ms=round(1e3 * both, 3), lanes=batch.lanes, passed=alive)
 

@@ -33,8 +33,8 @@ def block_matrix(M) -> SimpleNamespace:
 
 
 def threads_of(M) -> int:
-    """How many threads share a row of blocks: several on a card, where one waits for each entry in turn, if rows are long and
-    too few to occupy it."""
+    """How many threads share a row of blocks: several on a card, where one waits for each entry in turn, if rows are long
+    and too few to occupy it."""
     long, few = len(M.data) > 16 * nodes_of(M), nodes_of(M) <= 2**14
     return 8 if long and few and not runtime.runs_on_cpu() else 1
 

@@ -32,7 +32,9 @@ class DeviceCG:
         self.precision = "f64" if arch_name() != "vulkan" else "f32"
         self._vector, fp = array_types(self.precision)["vectors"].dtype, PRECISIONS[self.precision]
         self.length = max(32, -(-n // max(256, self.systems)))
-        if not runs_on_cpu():  # a thread waits for each entry of its chunk in turn, then one for chunks, eight at a time
+        if (
+            not runs_on_cpu()
+        ):  # a thread waits for each entry of its chunk in turn, then one for chunks, eight at a time
             self.length = max(8, isqrt(n // self.systems) // 6)
         self.chunks = self.systems * -(-n // (self.systems * self.length))
         self.x, self.r, self.z, self.p, self.q = (runtime.array(self._vector, 1, n) for _ in range(5))
