@@ -136,6 +136,18 @@ def with_slopes(value, *slopes: tuple):
     return made(value, *(parent(*pair, own) for pair, own in zip(slopes, axes)))
 
 
+def jointly(value, push: Callable, *parents: tuple):
+    """A value whose change is found from those of several arrays at once: push(change of each, None for zero); parents are
+    (array, its adjoint for that of the value), asked for in this order. Arrays that do not record have neither."""
+
+    def place(k):
+        return lambda change: lambda into: into.__setitem__(k, change)
+
+    own = [(x, place(k), pull) for k, (x, pull) in enumerate(parents) if isinstance(x, Node)]
+    changes = Node(None, own, lambda: [None] * len(parents)) if own else None
+    return made(value, (changes, lambda dx: push(*dx), lambda seed: seed))
+
+
 def times(matrix, x):
     """matrix @ x of a SciPy matrix, with all further axes of x beside each other."""
 

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import summed_at
 from diffsim_ti.inputs.chain import Link, Recording
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.reference_element import QUADRATIC, quadrature
@@ -79,6 +80,11 @@ class ConsistentMass:
 
 
 Mass = np.ndarray | ConsistentMass
+
+
+def consistent(elements: np.ndarray, element_masses: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """M x of vectors x of the vertices, shape (n, 3); of arrays that record, too."""
+    return summed_at(elements, element_masses @ x[elements], len(x))
 
 
 def diagonal_of(mass: Mass) -> np.ndarray:

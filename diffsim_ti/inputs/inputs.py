@@ -10,6 +10,7 @@ from diffsim_ti.common.checked import numbers
 from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import FAR, ROUNDING, far_part, warn_of_rounding
 from diffsim_ti.common.rows import Rows
+from diffsim_ti.differentiation.arrays import Node, made
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.consistent_mass import ElementMasses
@@ -69,6 +70,20 @@ class Derived:
     def zeros(self, but=()) -> "Derived":
         """The same shapes, all zero; None for those in `but`."""
         return self.replaced(**dict.fromkeys(but)).mapped(lambda part: np.zeros(part.shape))
+
+
+class DerivedNode(Node):
+    """One whose arrays record what is done to them (differentiation/arrays.py); parents: as of a `Node`."""
+
+    def __init__(self, value: Derived, *parents: tuple):
+        super().__init__(value, parents, value.zeros)
+
+    def __getattr__(self, name: str):
+        def pull(seed):
+            return lambda into: setattr(into, name, seed if getattr(into, name) is None else getattr(into, name) + seed)
+
+        value = getattr(self.value, name)
+        return None if value is None else made(value, (self, lambda change: getattr(change, name), pull))
 
 
 # the names of the arrays of every scene

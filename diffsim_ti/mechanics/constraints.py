@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import summed_at, value_of
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.loads import PressureRows
 from diffsim_ti.mechanics.chambers.pressures import PrescribedVolume
@@ -50,7 +51,7 @@ class ConstraintForce(HostForce):
             return super().take(values, instant)
         self.value = instant.load * pressures_at(values.relations, instant)
         for law, k in zip(self.laws, self.held):
-            law.target = float(self.value[k])
+            law.target = float(value_of(self.value)[k])
         return super().take(values, instant)
 
     def stiffest(self, values, schedule):
@@ -67,24 +68,20 @@ class ConstraintForce(HostForce):
             out[k] = law.gamma
         return out
 
-    def _along(self, u) -> list[float]:
-        return [float((c * u[at]).sum()) for c, at in zip(self.c, self.vertices)]
+    def _along(self, u) -> list:
+        return [(c * u[at]).sum() for c, at in zip(self.c, self.vertices)]
 
-    def _pushes(self, along: list[float]) -> list[float]:
-        """p of each, of c . u."""
-        out = [-k * (x - value) for k, x, value in zip(self.given, along, self.value)]
-        for law, k in zip(self.laws, self.held):
-            out[k] = law.pressure(along[k])
-        return out
-
-    def _spread(self, amounts, shape) -> np.ndarray:
-        out = np.zeros(shape)
-        for amount, c, at in zip(amounts, self.c, self.vertices):
-            np.add.at(out, at, amount * c)
-        return out
+    def _spread(self, amounts, count: int) -> np.ndarray:
+        """Sums at vertices of amounts of the coefficients."""
+        parts = zip(amounts, self.c, self.vertices)
+        return sum((summed_at(at, amount * c, count) for amount, c, at in parts), np.zeros((count, 3)))
 
     def forces(self, u):
-        return self._spread(self._pushes(self._along(u)), u.shape)
+        along = self._along(u)
+        pushes = [-k * (x - value) for k, x, value in zip(self.given, along, self.value)]
+        for law, k in zip(self.laws, self.held):  # in derivatives the target has the slope gamma
+            pushes[k] = law.pressure(along[k]) + law.gamma * (self.value[k] - law.target)
+        return self._spread(pushes, len(u))
 
     def energies(self, u):
         along = self._along(u)
@@ -94,34 +91,8 @@ class ConstraintForce(HostForce):
             out[k] = gone * (0.5 * law.gamma * gone - law.multiplier)
         return out
 
-    def jvp(self, u, du, dv, moved=None):
-        k, along, out = self.k, self._along(u), -self.product(u, du)
-        if moved is None:
-            return out
-        dvalue = self.instant.load * pressures_at(moved.relations, self.instant)
-        parts = zip(self.c, k, self.vertices, along, self._pushes(along), self.rows, dvalue, self.value)
-        for n, (c, stiff, at, x, p, row, dx, value) in enumerate(parts):
-            change = moved.parameters[row]
-            dc, dk = change[: c.size].reshape(-1, 3), 0.0 if n in self.held else change[-1]
-            np.add.at(out, at, -(dk * (x - value) + stiff * (float((dc * u[at]).sum()) - dx)) * c + p * dc)
-        return out
-
-    def vjp(self, u, w, adj=None):
-        if adj is not None:
-            k, pulled, along = self.k, self._along(w), self._along(u)
-            for n, (stiff, at, p, row, x) in enumerate(zip(k, self.vertices, self._pushes(along), self.rows, pulled)):
-                adj.parameters[row][: 3 * len(at)] += (p * w[at] - stiff * x * u[at]).ravel()
-                if n not in self.held:
-                    adj.parameters[row][-1] -= (along[n] - self.value[n]) * x
-            self._add_values(adj, np.array([self.instant.load * stiff * x for stiff, x in zip(k, pulled)]))
-        return -self.product(u, w), 0.0
-
-    def _add_values(self, adj, by_value: np.ndarray) -> None:
-        at = self.instant
-        at.schedule.add_pressure(adj.relations, at.j, at.share, by_value)
-
     def product(self, u, w, convex=False):
-        return self._spread([k * x for k, x in zip(self.k, self._along(w))], u.shape)
+        return self._spread([k * x for k, x in zip(self.k, self._along(w))], len(u))
 
     def blocks(self, u):
         out = np.zeros((len(u), 3, 3))
@@ -147,21 +118,11 @@ class ConstraintForce(HostForce):
         return [along[k] for k in self.held]
 
     def gradients(self, u):
-        return [self._spread(np.arange(len(self.c)) == k, u.shape) for k in self.held]
+        return [self._spread(np.arange(len(self.c)) == k, len(u)) for k in self.held]
 
-    def targets_jvp(self, u, du, moved):
-        dvalue = self.instant.load * pressures_at(moved.relations, self.instant)
-        turned = [moved.parameters[self.rows[k]].reshape(-1, 3) for k in self.held]
-        along = self._along(du)
-        return [dvalue[k] - float((dc * u[self.vertices[k]]).sum()) - along[k] for k, dc in zip(self.held, turned)]
-
-    def add_targets(self, nu, u, adj):
-        by_value, every = np.zeros(len(self.c)), np.zeros(len(self.c))
-        for k, own in zip(self.held, nu):
-            by_value[k], every[k] = self.instant.load * own, -own
-            adj.parameters[self.rows[k]] -= own * u[self.vertices[k]].ravel()
-        self._add_values(adj, by_value)
-        return self._spread(every, u.shape)
+    def missing(self, u):
+        along = self._along(u)
+        return np.stack([self.value[k] - along[k] for k in self.held])
 
 
 class Constraints(Interaction):

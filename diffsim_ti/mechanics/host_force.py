@@ -5,11 +5,13 @@ preconditioners and outputs loop over these and know none of them by name.
 """
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.inputs import Derived
+from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
+from diffsim_ti.inputs import Derived, DerivedNode
 from diffsim_ti.state.schedule import EqualSteps, Schedule
 
 
@@ -33,9 +35,10 @@ class Instant:
 class HostForce:
     """Forces of one kind at displacements u [m], with all derivatives; vectors of vertices have the shape (num_vertices, 3).
 
-    A new force writes `forces`, `jvp` and `vjp`; one that has an energy E, so that f = -dE/du, also `energies` and, where E
-    is stored in the body, `stored`, which balances of energy read. All else has defaults that are right for every force, and
-    may be written where it can be had faster or helps linear solvers.
+    A new force writes `forces`, whose derivatives are found by arrays that record (differentiation/arrays.py) unless `jvp`
+    and `vjp` stand beside it; `take` must then not convert what it takes. One that has an energy E, so that f = -dE/du, also
+    writes `energies` and, where E is stored in the body, `stored`, which balances of energy read. All else has defaults that
+    are right for every force, and may be written where it can be had faster or helps linear solvers.
 
     has_energy: whether it has an energy, which line searches and preconditioners then know. Without one, line searches ask
         for `work`. symmetric: whether df/du is in what may move; else linear systems are solved by GMRES.
@@ -66,20 +69,35 @@ class HostForce:
         """On vertices [N]."""
         raise NotImplementedError
 
-    def jvp(self, u: np.ndarray, du: np.ndarray, dv: np.ndarray, moved: Derived | None = None) -> np.ndarray:
-        """Their change for changes of displacements, velocities and, if `moved` tells them, of numbers."""
-        raise NotImplementedError
-
-    def vjp(self, u: np.ndarray, w: np.ndarray, adj: Derived | None = None) -> tuple:
-        """Adjoints (of displacements, of velocities) for the adjoint w of the forces; adds those of numbers to `adj`. That
-        of velocities is 0 where forces do not read them."""
-        raise NotImplementedError
-
     def energies(self, u: np.ndarray) -> np.ndarray:
         """[J], in as many parts as it likes; of forces that have one."""
         raise NotImplementedError
 
     # ---- what it may write -------------------------------------------------------------------------------------------
+
+    def recorded(self, u: np.ndarray, numbers: bool, what: str = "forces") -> tuple:
+        """(its forces, or another function of displacements; displacements, velocities and, where its numbers are to record,
+        what kernels read), all of which record."""
+        at, v, of, own = Recorded(u), Recorded(self.velocities(u)), DerivedNode(self.values), copy(self)
+        if numbers:
+            own.take(of, self.instant)
+        own.velocities = lambda _: v
+        return getattr(own, what)(at), at, v, *([of] if numbers else [])
+
+    def jvp(self, u: np.ndarray, du: np.ndarray, dv: np.ndarray | None = None, moved=None, what="forces") -> np.ndarray:
+        """Change of the forces, or of another function, for changes of displacements, velocities and, if `moved` tells
+        them, of numbers."""
+        y, *leaves = self.recorded(u, moved is not None, what)
+        return forward(y, zip(leaves, (du, dv, moved)))
+
+    def vjp(self, u: np.ndarray, w: np.ndarray, adj: Derived | None = None, what="forces") -> tuple:
+        """Adjoints (of displacements, of velocities) for the adjoint w of the forces; adds those of numbers to `adj`. That
+        of velocities is 0 where forces do not read them."""
+        y, *leaves = self.recorded(u, adj is not None, what)
+        if adj is not None:
+            leaves[2].zeros = lambda: adj
+        by_u, by_v, *_ = reverse(y, w, leaves)
+        return np.zeros(u.shape) if by_u is None else by_u, 0.0 if by_v is None else by_v
 
     def stored(self, u: np.ndarray) -> dict[str, float]:
         """Energies [J] of the body by name: all that it has, by the name of its class."""
@@ -103,14 +121,18 @@ class HostForce:
 
     def tangent(self, u: np.ndarray, transposed: bool = False) -> Callable:
         """w -> df/du w, for many w; velocities change with u."""
-        if not transposed:
-            return lambda w: self.jvp(u, w, w / self.instant.gamma)
+        gamma = self.instant.gamma
+        push, pull = (lambda w: self.jvp(u, w, w / gamma)), lambda w: self.vjp(u, w)
+        if type(self).vjp is HostForce.vjp:
+            y, *leaves = self.recorded(u, False)
+            push = lambda w: forward(y, zip(leaves, (w, w / gamma)))  # noqa: E731
+            pull = lambda w: (0.0 if by is None else by for by in reverse(y, w, leaves))  # noqa: E731
 
         def pulled(w):
-            by_u, by_v = self.vjp(u, w)
-            return by_u + by_v / self.instant.gamma
+            by_u, by_v = pull(w)
+            return by_u + by_v / gamma
 
-        return pulled
+        return pulled if transposed else push
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of -df/du [N/m], for preconditioners."""

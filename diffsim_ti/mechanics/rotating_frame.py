@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from diffsim_ti.inputs.consistent_mass import ConsistentMass
+from diffsim_ti.inputs.consistent_mass import consistent
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction, VertexwiseForce
 from diffsim_ti.runtime import traced
@@ -98,46 +98,16 @@ class InertialForceOnHost(HostForce):
         return not np.isfinite(self.instant.gamma)
 
     def take(self, values, instant):
-        self.mass, (self.spin, self.center) = self._mass(values), np.split(values.parameters[self.rows], 2)
+        numbers = values.parameters[self.rows]
+        self.spin, self.center = numbers[:3], numbers[3:]
         return super().take(values, instant)
 
-    def _mass(self, values):
-        if values.element_masses is None:
-            return values.mass[:, None]
-        return ConsistentMass.of(self.mesh, values.element_masses)
-
-    def _arms(self, u):
-        return self.values.rest + u - self.center
-
-    def _accelerations(self, u):
-        return -2 * np.cross(self.spin, self.velocities(u)) - np.cross(self.spin, np.cross(self.spin, self._arms(u)))
-
     def forces(self, u):
-        return self.mass * self._accelerations(u)
-
-    def jvp(self, u, du, dv, moved=None):
-        W = self.spin
-        if moved is None:
-            return self.mass * (-2 * np.cross(W, dv) - np.cross(W, np.cross(W, du)))
-        (dW, dc), r = np.split(moved.parameters[self.rows], 2), self._arms(u)
-        da = 2 * (np.cross(dW, self.velocities(u)) + np.cross(W, dv)) + np.cross(dW, np.cross(W, r))
-        da += np.cross(W, np.cross(dW, r) + np.cross(W, moved.rest + du - dc))
-        return self._mass(moved) * self._accelerations(u) - self.mass * da
-
-    def vjp(self, u, w, adj=None):
-        W, z, r = self.spin, self.mass * w, self._arms(u)
-        turned = np.cross(W, z)
-        by_u = -np.cross(W, turned)
-        if adj is not None:
-            by_spin = 2 * np.cross(z, self.velocities(u)) + np.cross(z, np.cross(W, r)) - np.cross(turned, r)
-            adj.parameters[self.rows] += np.concatenate([by_spin.sum(0), -by_u.sum(0)])
-            adj.rest += by_u
-            a, at = self._accelerations(u), self.mesh.elements
-            if adj.element_masses is None:
-                adj.mass += (w * a).sum(1)
-            else:
-                adj.element_masses += w[at] @ np.swapaxes(a[at], 1, 2)
-        return by_u, 2 * turned
+        W, r = self.spin, self.values.rest + u - self.center
+        a = -2 * np.cross(W, self.velocities(u)) - np.cross(W, np.cross(W, r))
+        if self.values.element_masses is None:
+            return self.values.mass[:, None] * a
+        return consistent(self.mesh.elements, self.values.element_masses, a)
 
     def turning(self, u, w):
         return 0.0

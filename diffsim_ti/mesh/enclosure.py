@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import value_of, with_slopes
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.geometry import cross
 from diffsim_ti.mesh.sets import components
@@ -98,6 +99,11 @@ class Enclosure:
         """V at positions x, shape (num_vertices, 3)."""
         a, b, c = np.moveaxis(self._corners(x), 1, 0)
         return float((self.weights[:, None] * a * cross(b, c)).sum()) / -6
+
+    def recorded(self, x: np.ndarray) -> np.ndarray:
+        """V; of arrays that record, too (differentiation/arrays.py)."""
+        places = np.asarray(value_of(x), np.float64)
+        return with_slopes(self.volume(places), (x, lambda: self.gradient(places)))
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """dV/dx, shape (num_vertices, 3); what is held counts too."""

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from diffsim_ti.mesh import reference_face
-from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.ten_nodes import QUARTERS
 
 STRAIGHT = 1e-5  # of its length: what an edge may be off that is straight, in files of single precision too
@@ -31,14 +31,6 @@ class LinearFaces:
         """Normals of the points, as long as their areas [m^2], shape (faces * points, 3)."""
         return triangle_normals(x, self.faces)
 
-    def normals_jvp(self, x: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Their change for one of the vertices."""
-        return triangle_normals_jvp(x, self.faces, change)
-
-    def normals_vjp(self, x: np.ndarray, normals_adj: np.ndarray) -> np.ndarray:
-        """Adjoint of x, shape (num_vertices, 3), for that of the normals."""
-        return triangle_normals_vjp(x, self.faces, normals_adj)
-
     def normals_by_nodes(self, x: np.ndarray) -> np.ndarray:
         """Derivative of each normal by the nodes of its face, shape (faces, points, nodes, 3, 3)."""
         corners = x[self.faces]
@@ -47,10 +39,6 @@ class LinearFaces:
     def to_nodes(self, of_points: np.ndarray) -> np.ndarray:
         """Integrals of the shape functions times what points have (times their areas), shape (faces, nodes, ...)."""
         return np.repeat((of_points / 3)[:, None], 3, 1)
-
-    def from_nodes(self, of_nodes: np.ndarray) -> np.ndarray:
-        """What nodes have, shape (faces, nodes, ...), at the points: the transpose of `to_nodes`."""
-        return of_nodes.sum(1) / 3
 
 
 class QuadraticFaces:
@@ -74,18 +62,6 @@ class QuadraticFaces:
     def normals(self, x):
         return self._half(np.cross(*self._tangents(x)))
 
-    def normals_jvp(self, x, change):
-        (e, f), (de, df) = self._tangents(x), self._tangents(change)
-        return self._half(np.cross(de, f) + np.cross(e, df))
-
-    def normals_vjp(self, x, normals_adj):
-        e, f = self._tangents(x)
-        n = normals_adj.reshape(e.shape) * (reference_face.WEIGHTS / 2)[:, None]
-        by_nodes = np.einsum("qad,dfqi->fai", self._by, np.stack([np.cross(f, n), np.cross(n, e)]), optimize=True)
-        out = np.zeros_like(x)
-        np.add.at(out, self.faces, by_nodes)
-        return out
-
     def normals_by_nodes(self, x):
         e, f = (_crossing(t * (reference_face.WEIGHTS / 2)[:, None])[:, :, None] for t in self._tangents(x))
         by_s, by_t = self._by[None, ..., 0, None, None], self._by[None, ..., 1, None, None]
@@ -94,10 +70,6 @@ class QuadraticFaces:
     def to_nodes(self, of_points):
         by_face = of_points.reshape(len(self.faces), self.points, *of_points.shape[1:])
         return np.einsum("qa,fq...->fa...", self.shares, by_face, optimize=True)
-
-    def from_nodes(self, of_nodes):
-        at = np.einsum("qa,fa...->fq...", self.shares, of_nodes, optimize=True)
-        return at.reshape(-1, *of_nodes.shape[2:])
 
 
 def face_points(faces: np.ndarray) -> LinearFaces | QuadraticFaces:

@@ -84,19 +84,6 @@ def triangle_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return cross(b - a, c - a) / 2
 
 
-def triangle_normals_jvp(vertices: np.ndarray, triangles: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Change of the normals for one of the vertices."""
-    (a, b, c), (da, db, dc) = (x[triangles].transpose(1, 0, 2) for x in (vertices, change))
-    return (cross(db - da, c - a) + cross(b - a, dc - da)) / 2
-
-
-def triangle_normals_vjp(vertices: np.ndarray, triangles: np.ndarray, normals_adj: np.ndarray) -> np.ndarray:
-    """Adjoints of vertices, shape (num_vertices, 3), for those of the normals, sum of x_a x x_b / 2 around a triangle."""
-    x, out = vertices[triangles], np.zeros_like(vertices)
-    np.add.at(out, triangles, np.cross(normals_adj[:, None], np.roll(x, -2, 1) - np.roll(x, -1, 1)) / 2)
-    return out
-
-
 def barycentric_in_plane(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Where a point of a plane lies in triangles with these corners, shape (k, 3, 2 or more), whose first two coordinates
     count: weights of the corners, shape (k, 3); of triangles without area they are not finite."""

@@ -51,7 +51,7 @@ class ChamberPressure(Output):
         follower, out = derived(self.scene, frames).follower, []
         for step, x in zip(map(int, frames.steps), frames.positions):
             row, end = min(max(step - 1, 0), len(follower) - 1), 1 if step else 0  # of its step, which a frame shows
-            numbers, volume = follower[row, self.rows, end], _volume(self.enclosure, x)
+            numbers, volume = follower[row, self.rows, end], self.enclosure.recorded(x)
             self.law.at(value_of(numbers), 1.0)
             V = value_of(volume)
             slopes = (volume, lambda: self.law.slope(V)), (numbers, lambda: self.law.by_numbers(V))
@@ -109,9 +109,4 @@ class EnclosedVolume(Output):
         return (num_frames,)
 
     def value(self, frames: Frames) -> np.ndarray:
-        return -np.stack([_volume(self.enclosure, x) for x in frames.positions])
-
-
-def _volume(enclosure: Enclosure, x: np.ndarray) -> np.ndarray:
-    places = value_of(x).astype(np.float64)
-    return with_slopes(enclosure.volume(places), (x, lambda: enclosure.gradient(places)))
+        return -np.stack([self.enclosure.recorded(x) for x in frames.positions])

@@ -5,13 +5,13 @@ from copy import copy
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import made, value_of, with_slopes
-from diffsim_ti.inputs import ConsistentMass
+from diffsim_ti.differentiation.arrays import value_of, with_slopes
+from diffsim_ti.inputs.consistent_mass import consistent
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import displacement_gradients
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads
-from diffsim_ti.outputs.output import Change, Frames, Output, derived
+from diffsim_ti.outputs.output import Frames, Output, derived
 from diffsim_ti.outputs.stresses import at_points, patch_pressure, with_state
 from diffsim_ti.scene import Scene
 
@@ -123,22 +123,11 @@ class KineticEnergy(Output):
 
     def value(self, frames: Frames) -> np.ndarray:
         v, of = frames.velocities.astype(np.float64), derived(self.scene, frames)
-        momentum = of.mass[:, None] * v if of.element_masses is None else self._momentum(of.element_masses, v)
+        if of.element_masses is None:
+            momentum = of.mass[:, None] * v
+        else:
+            momentum = np.stack([consistent(self.scene.mesh.elements, of.element_masses, frame) for frame in v])
         return (0.5 * (v * momentum).sum(2) @ self.masks.T).reshape(self.shape(len(v)))
-
-    def _momentum(self, masses: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """M v of each frame."""
-        mesh, m, w = self.scene.mesh, value_of(masses), value_of(v)
-
-        def product(masses, v):
-            mass = ConsistentMass.of(mesh, masses)
-            return np.stack([mass * frame for frame in v])
-
-        def by_masses(seed):
-            return np.einsum("feai,febi->eab", seed[:, mesh.elements], w[:, mesh.elements], optimize=True)
-
-        of_v = v, lambda dv: product(m, dv), lambda seed: product(m, seed)
-        return made(product(m, w), of_v, (masses, lambda dm: product(dm, w), by_masses))
 
 
 class WorkOfLoads(Output):
@@ -182,68 +171,16 @@ class WorkOfLoads(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,)
 
-    def _points(self, frames, k: int):
-        """(weight, place, share of a, step, whether as that step begins, frame of held pressures) of each force between
-        frames k - 1 and k."""
-        a, b = frames.positions[k - 1].astype(np.float64), frames.positions[k].astype(np.float64)
-        first, last = int(frames.steps[k - 1]) + 1, int(frames.steps[k])
-        middle = 0.5 * (a + b)
-        before = max(k - 1, 1)
-        return [
-            (1 / 6, a, 1.0, first, True, before),
-            (1 / 3, middle, 0.5, first, True, before),
-            (1 / 3, middle, 0.5, last, False, k),
-            (1 / 6, b, 0.0, last, False, k),
-        ]
-
-    def _held(self, frames, k: int) -> np.ndarray | None:
-        """Of chambers that hold a volume in frame k."""
-        return frames.chamber_pressures[k] if self.scene.holds_volumes else None
-
-    def _gone(self, frames, k: int) -> np.ndarray:
-        return frames.positions[k].astype(np.float64) - frames.positions[k - 1].astype(np.float64)
-
     def value(self, frames: Frames) -> np.ndarray:
-        derived, parts = self.scene.inputs.derive(frames.inputs), [0.0]
-        for k in range(1, len(frames.positions)):
-            mean = 0.0
-            for w, x, _, s, begins, shown in self._points(frames, k):
-                mean = mean + w * self.loads.forces(derived, x, s, begins, self._held(frames, shown))
-            parts.append(float((mean * self._gone(frames, k)).sum()))
-        return np.cumsum(parts)
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        derived = self.scene.inputs.derive(frames.inputs)
-        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
-        dx = np.zeros(frames.positions.shape) if change.positions is None else change.positions
-        parts = [0.0]
-        for k in range(1, len(dx)):
-            mean, dmean = np.zeros((2, *dx.shape[1:]))
-            for w, x, share, s, begins, shown in self._points(frames, k):
-                own, held = share * dx[k - 1] + (1 - share) * dx[k], self._held(frames, shown)
-                mean += w * self.loads.forces(derived, x, s, begins, held)
-                dmean += w * self.loads.jvp(derived, moved, x, own, s, begins, held)
-                if held is not None and change.chamber_pressures is not None:
-                    dmean += w * self.loads.held_jvp(x, change.chamber_pressures[shown])
-            parts.append(float((dmean * self._gone(frames, k) + mean * (dx[k] - dx[k - 1])).sum()))
-        return np.cumsum(parts)
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        derived = self.scene.inputs.derive(frames.inputs)
-        positions, adjoint = np.zeros(frames.positions.shape), derived.zeros()
-        by_held = np.zeros_like(frames.chamber_pressures) if self.scene.holds_volumes else None
-        later = np.cumsum(seed[::-1])[::-1]  # a part counts in all frames after it
-        for k in range(1, len(positions)):
-            gone, mean = later[k] * self._gone(frames, k), np.zeros(positions.shape[1:])
-            for w, x, share, s, begins, shown in self._points(frames, k):
-                held = self._held(frames, shown)
-                mean += w * self.loads.forces(derived, x, s, begins, held)
-                by_x, _ = self.loads.vjp(derived, x, w * gone, s, adjoint, begins, held)
-                if held is not None:
-                    by_held[shown] += self.loads.held_vjp(x, w * gone)
-                positions[k - 1] += share * by_x
-                positions[k] += (1 - share) * by_x
-            positions[k] += later[k] * mean
-            positions[k - 1] -= later[k] * mean
-        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(positions=positions, inputs=inputs, chamber_pressures=by_held)
+        of, work, filled = derived(self.scene, frames), [np.zeros(())], self.scene.holds_volumes
+        places = frames.positions.astype(np.float64)
+        for k in range(1, len(frames.steps)):
+            (a, b), first, last = (places[k - 1], places[k]), int(frames.steps[k - 1]) + 1, int(frames.steps[k])
+            middle, mean = 0.5 * (a + b), 0.0
+            # (weight, place, step, whether as that step begins, frame of held pressures) of each force
+            parts = (1 / 6, a, first, True, max(k - 1, 1)), (1 / 3, middle, first, True, max(k - 1, 1))
+            for w, x, step, begins, shown in (*parts, (1 / 3, middle, last, False, k), (1 / 6, b, last, False, k)):
+                held = frames.chamber_pressures[shown] if filled else None
+                mean = mean + w * self.loads.forces(of, x, step, begins, held)
+            work.append(work[-1] + (mean * (b - a)).sum())
+        return np.stack(work)

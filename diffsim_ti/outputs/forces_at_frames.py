@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.differentiation.arrays import jointly, summed_at, value_of
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
 from diffsim_ti.mechanics.host_force import HostForces, Instant
@@ -36,7 +37,7 @@ class AppliedLoads:
     """Forces [N], shape (num_vertices, 3): weight, dead loads and those of interactions, after so many steps: those of the
     last of these as it ends; with `begins`, as it begins.
 
-    moving: with those that read velocities v [m/s], which `forces`, `jvp` and `vjp` then are to be told.
+    moving: with those that read velocities v [m/s], which `forces` is then to be told.
     held: the pressures [Pa] of the scene's chambers in a frame, of which those are taken that hold a volume.
     """
 
@@ -66,7 +67,7 @@ class AppliedLoads:
         """What gravity acts on, shape (num_vertices,), or its change."""
         if derived.element_masses is None:
             return derived.mass
-        return np.bincount(self.elements.ravel(), derived.element_masses.sum(2).ravel(), len(derived.mass))
+        return summed_at(self.elements, derived.element_masses.sum(2), len(derived.mass))
 
     def _hosts(self, derived: Derived, x, step: int, begins: bool, held, v) -> HostForces:
         """As they are in a frame."""
@@ -79,56 +80,42 @@ class AppliedLoads:
                 law.multiplier = float(held[k])  # without a penalty, gamma: the pressure whatever the volume
         return hosts
 
-    def held_jvp(self, x: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Change of the forces for that of the pressures of constrained volumes."""
-        return sum(change[k] * push for k, push in self._unit_forces(x))
-
-    def held_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Adjoint of the pressures of all chambers, zero of gases, for that of the forces."""
-        out = np.zeros(self.num_chambers)
-        for k, push in self._unit_forces(x):
-            out[k] = float((push * w).sum())
-        return out
-
     def _unit_forces(self, x: np.ndarray) -> list:
         """(place of a chamber that holds a volume, forces of 1 Pa in it) of each."""
         places = self.filled.places if self.filled else []
         return [(place, self.filled.unit_forces(x - self.filled.rest, k)) for k, place in enumerate(places)]
 
     def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False, held=None, v=None) -> np.ndarray:
-        """At places x [m] after so many steps."""
-        out = np.zeros(x.shape)
+        """At places x [m] after so many steps; of arrays that record, too."""
+        of, at, shown, found = value_of(derived), value_of(x), (value_of(held), value_of(v)), []
+        out, u = np.zeros(at.shape), at - of.rest
         if self.gravity is not None:
-            out += self._masses(derived)[:, None] * derived.parameters[self.gravity][:3]
+            out = out + self._masses(derived)[:, None] * derived.parameters[self.gravity][:3]
         if self.dead:
-            out[self.dead.acts_at] += self._dead(step, derived.forces, begins)
-        return out + self._hosts(derived, x, step, begins, held, v).forces(x - derived.rest)
+            out = out + summed_at(self.dead.acts_at, self._dead(step, derived.forces, begins), len(at))
 
-    def jvp(self, derived, moved, x, dx, step: int, begins: bool = False, held=None, v=None, dv=0.0) -> np.ndarray:
-        """Their change, at frozen pressures."""
-        out = np.zeros(x.shape)
-        if self.gravity is not None:
-            g, dg = (of.parameters[self.gravity][:3] for of in (derived, moved))
-            out += self._masses(moved)[:, None] * g + self._masses(derived)[:, None] * dg
-        if self.dead:
-            out[self.dead.acts_at] += self._dead(step, moved.forces, begins)
-        hosts = self._hosts(derived, x, step, begins, held, v)
-        return out + hosts.jvp(x - derived.rest, dx - moved.rest, dv + np.zeros_like(dx), moved)
+        def push(moved, dx, dv, dheld):
+            moved = of.zeros() if moved is None else moved
+            changes = (np.zeros(at.shape) if change is None else change for change in (dx, dv))
+            du, dv = (change - rest for change, rest in zip(changes, (moved.rest, 0.0)))
+            df = self._hosts(of, at, step, begins, *shown).jvp(u, du, dv, moved)
+            return df if dheld is None else df + sum(dheld[k] * push for k, push in self._unit_forces(at))
 
-    def vjp(self, derived, x, w, step: int, adj: Derived, begins: bool = False, held=None, v=None) -> tuple:
-        """Adjoints of x and v for that of the forces; adds those of all else, but for held pressures, to `adj`."""
-        if self.gravity is not None:
-            by_mass = w @ derived.parameters[self.gravity][:3]
-            if derived.element_masses is None:
-                adj.mass += by_mass
-            else:
-                adj.element_masses += by_mass[self.elements][:, :, None]
-            adj.parameters[self.gravity.start : self.gravity.start + 3] += self._masses(derived) @ w
-        if self.dead:
-            self._dead(step, adj.forces, begins)[:] += w[self.dead.acts_at]
-        by_u, by_v = self._hosts(derived, x, step, begins, held, v).vjp(x - derived.rest, w, adj)
-        adj.rest -= by_u
-        return by_u, by_v
+        def by_numbers(w):
+            def add(into):
+                found[:] = self._hosts(of, at, step, begins, *shown).vjp(u, w, into)
+                into.rest = into.rest - found[0]
+
+            return add
+
+        def by_held(w):
+            by = np.zeros(self.num_chambers)  # zero of gases
+            for k, push in self._unit_forces(at):
+                by[k] = float((push * w).sum())
+            return by
+
+        parents = (derived, by_numbers), (x, lambda _: found[0]), (v, lambda _: found[1]), (held, by_held)
+        return out + jointly(self._hosts(of, at, step, begins, *shown).forces(u), push, *parents)
 
 
 @dataclass(frozen=True)
@@ -207,11 +194,40 @@ class BodyForces:
 
     def load(self, values: dict) -> Derived:
         """The numbers of a run; what kernels read of them."""
-        derived = self.scene.inputs.derive(values)
+        return self.take(self.scene.inputs.derive(values))
+
+    def take(self, derived: Derived) -> Derived:
+        """The same, of what kernels read."""
         self.arrays.load(derived)
         a = self.arrays
         self.kernels = runtime.kernels_of(BodyForceKernels, a.law, a.features().of_elements(), a.in_lanes)
         return derived
+
+    def at_frames(self, derived: Derived, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """f at the states of frames, shape (frames, num_vertices, 3): displacements, velocities, what the law remembers; of
+        arrays that record, too."""
+        of, states, found = self.take(value_of(derived)), [value_of(x) for x in (u, v, z)], []
+
+        def each(*more):
+            for state, *others in zip(zip(*states), *more):
+                self.place(*state)
+                yield others
+
+        def push(moved, *changes):
+            moved = of.zeros() if moved is None else moved
+            du, dv, dz = (np.zeros(x.shape) if dx is None else dx for x, dx in zip(states, changes))
+            tangent = self.tangent(moved)
+            return np.stack([self.jvp(a, b, tangent, c) for a, b, c in each(du, dv, dz)])
+
+        def by_numbers(w):
+            adjoint = self.adjoint()
+            found[:] = zip(*[self.vjp(own, adjoint) for (own,) in each(w)])
+            adj = adjoint.collect()
+            adj.element_masses = None
+            return lambda into: into.add(adj)
+
+        parents = [(x, lambda _, k=k: np.stack(found[k])) for k, x in enumerate((u, v, z))]
+        return jointly(np.stack([self.forces() for _ in each()]), push, (derived, by_numbers), *parents)
 
     def _run(self, name: str, **records) -> np.ndarray:
         a = self.arrays

@@ -1,6 +1,7 @@
 """How joints and links of a robot move, what pulls joints, and energies of links."""
 
 from copy import copy
+from functools import cache
 
 import numpy as np
 
@@ -154,10 +155,15 @@ class LinkEnergy(JointPositions):
         """Energies of a frame, of joint positions and velocities, masses and gravity."""
         (q, v, masses, g), model, none = map(value_of, numbers), self.model, np.zeros(3)
         M, _ = model.dynamics(q, 0 * v, masses, none)
-        _, weight = model.dynamics(q, 0 * v, masses, g)
-        by_q, _, by_masses, _ = model.derivatives(q, 0 * v, v, masses, none)
         c = model.centres(q)
-        motion = 0.5 * v @ M @ v, (0.5 * v @ by_q, M @ v, 0.5 * v @ by_masses, none)
-        place = -masses @ c @ g, (weight, 0 * v, -c @ g, -masses @ c)
-        both = [(x, [(of, lambda by=by: by) for of, by in zip(numbers, slopes)]) for x, slopes in (motion, place)]
-        return np.stack([with_slopes(x, *slopes) for x, slopes in both])
+
+        @cache
+        def slopes():
+            _, weight = model.dynamics(q, 0 * v, masses, g)
+            by_q, _, by_masses, _ = model.derivatives(q, 0 * v, v, masses, none)
+            return (0.5 * v @ by_q, M @ v, 0.5 * v @ by_masses, none), (weight, 0 * v, -c @ g, -masses @ c)
+
+        def of(k, x):
+            return with_slopes(x, *((number, lambda i=i: slopes()[k][i]) for i, number in enumerate(numbers)))
+
+        return np.stack([of(0, 0.5 * v @ M @ v), of(1, -masses @ c @ g)])

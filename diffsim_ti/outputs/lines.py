@@ -7,7 +7,7 @@ import numpy as np
 from diffsim_ti.common.deprecated import renamed_arguments
 from diffsim_ti.mechanics.lines.interaction import SpringsAndCables
 from diffsim_ti.outputs.forces_at_frames import at_end
-from diffsim_ti.outputs.output import Change, Frames, Output
+from diffsim_ti.outputs.output import Frames, Output, derived
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms.lines import LineTerm
 
@@ -16,12 +16,10 @@ class _OfLines(Output):
     """One number for each spring or cable of a term, from the state in each frame and the loads at the end of the step that
     leads to it; shape (frames,) of a cable or a single spring, else (frames, k).
 
-    quantity: whose value and derivatives the host form of lines has under this name; numbers: how many of the changes of
-    (segments at rest, a, s, k) it depends on.
+    quantity: which the host form of lines has under this name.
     """
 
     quantity: str
-    numbers: int
     _shown = ("of",)
 
     def __init__(self, of: LineTerm | str, name: str):
@@ -38,39 +36,12 @@ class _OfLines(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,) if self.count == 1 else (num_frames, self.count)
 
-    def _frames(self, frames, derived):
-        """(line elements as they are in each frame, displacements, when that is)"""
-        for step, x in zip(frames.steps, frames.positions.astype(np.float64)):
-            instant = at_end(int(step))
-            yield self.lines.take(derived, instant), x - derived.rest, instant
-
     def value(self, frames: Frames) -> np.ndarray:
-        derived = self.scene.inputs.derive(frames.inputs)
-        found = [getattr(lines, self.quantity)(u)[self.own] for lines, u, _ in self._frames(frames, derived)]
-        return np.reshape(found, self.shape(len(found)))
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        derived = self.scene.inputs.derive(frames.inputs)
-        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
-        dx, out = np.zeros(frames.positions.shape) if change.positions is None else change.positions, []
-        for (lines, u, at), moving in zip(self._frames(frames, derived), dx):
-            numbers = (moved.line_segments, *at.schedule.lines(moved.lines, at.j, at.share))[: self.numbers]
-            out.append(getattr(lines, f"{self.quantity}_jvp")(u, moving - moved.rest, *numbers)[self.own])
-        return np.reshape(out, self.shape(len(out)))
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        derived, positions = self.scene.inputs.derive(frames.inputs), np.zeros(frames.positions.shape)
-        adj, all_lines = derived.zeros(), np.zeros((len(positions), len(self.lines.paths)))
-        all_lines[:, self.own] = seed.reshape(len(positions), -1)
-        for k, (lines, u, at) in enumerate(self._frames(frames, derived)):
-            positions[k], segments, *numbers = getattr(lines, f"{self.quantity}_vjp")(u, all_lines[k])
-            adj.line_segments += segments
-            for by_numbers in numbers:
-                at.schedule.add_lines(adj.lines, at.j, at.share, by_numbers)
-        adj.rest = adj.rest - positions.sum(0)
-        return Change(
-            positions=positions, inputs=self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))
-        )
+        of, out = derived(self.scene, frames), []
+        for step, x in zip(frames.steps, frames.positions.astype(np.float64)):
+            lines = self.lines.take(of, at_end(int(step)))
+            out.append(getattr(lines, self.quantity)(x - of.rest)[self.own])
+        return np.stack(out).reshape(self.shape(len(out)))
 
 
 class Length(_OfLines):
@@ -83,7 +54,7 @@ class Length(_OfLines):
     Zienkiewicz, Taylor 2000, The Finite Element Method, vol. 2, 5th ed., sec. 10.2.
     """
 
-    unit, quantity, numbers = "m", "lengths", 1
+    unit, quantity = "m", "lengths"
 
     @renamed_arguments(tie="of")
     def __init__(self, of: LineTerm | str, name: str = "length"):
@@ -101,7 +72,7 @@ class Tension(_OfLines):
     Zienkiewicz, Taylor 2000, The Finite Element Method, vol. 2, 5th ed., sec. 10.2.
     """
 
-    unit, quantity, numbers = "N", "tensions", 4
+    unit, quantity = "N", "tensions"
 
     @renamed_arguments(tie="of")
     def __init__(self, of: LineTerm | str, name: str = "tension"):

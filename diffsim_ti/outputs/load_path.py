@@ -9,6 +9,8 @@ from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.checked import number, shown
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.common.public import Public, public
+from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
+from diffsim_ti.inputs import DerivedNode
 from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
 from diffsim_ti.mechanics.energy.assembled import assemble
@@ -80,8 +82,13 @@ class Equilibria:
         moved = self.scene.inputs.derive_jvp(self.now, {name: self.own[name] for name in self.load})
         du = np.zeros_like(self.u)
         du[self.scene.held] = self._held(moved)
-        df = self.body.jvp(du, np.zeros_like(du), self.body.tangent(moved))
-        return self.T.T @ (df + self.loads.jvp(self.derived, moved, self.x, du + moved.rest, 1)).ravel(), du
+        of, u, f = self._forces()
+        return self.T.T @ forward(f, [(of, moved), (u, du)]).ravel(), du
+
+    def _forces(self) -> tuple[DerivedNode, Recorded, Recorded]:
+        """(what kernels read, u, f of them), which record."""
+        of, u, none = DerivedNode(self.derived), Recorded(self.u), np.zeros((1, *self.u.shape))
+        return of, u, self.body.at_frames(of, u[None], none, none)[0] + self.loads.forces(of, of.rest + u, 1)
 
     def factorised(self) -> "Tangent":
         """Of -dR/dq."""
@@ -102,13 +109,8 @@ class Equilibria:
 
     def vjp(self, w: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Gradients of w . f, w of shape (num_vertices, 3), by all inputs, and by u."""
-        adjoint, by_loads = self.body.adjoint(), self.derived.zeros()
-        by_u, *_ = self.body.vjp(w, adjoint)
-        by_x, _ = self.loads.vjp(self.derived, self.x, w, 1, by_loads)
-        adj, by_state = adjoint.collect(), by_u + by_x
-        adj.element_masses = None
-        adj.add(by_loads)
-        adj.rest = adj.rest + by_x
+        of, u, f = self._forces()
+        adj, by_state = reverse(f, w, [of, u])
         adj.displacement = np.zeros_like(w)
         held = adj.displacement[self.scene.held] = np.einsum(
             "kij,kj->ki", self.scene.supports.held, by_state[self.scene.held]

@@ -10,8 +10,8 @@ import numpy as np
 
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.public import Public
-from diffsim_ti.differentiation.arrays import Node, Recorded, forward, made, reverse
-from diffsim_ti.inputs import Derived
+from diffsim_ti.differentiation.arrays import Node, Recorded, forward, jointly, made, reverse
+from diffsim_ti.inputs import Derived, DerivedNode
 from diffsim_ti.scene import Scene
 from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import Growth
@@ -91,6 +91,7 @@ class Frames(metaclass=Public):
 
 # what runs note besides states, where outputs read it
 NOTED = ("contact_forces", "chamber_pressures", "law_state", "joint_states")
+STATES = ("positions", "velocities", *NOTED)
 
 
 @dataclass
@@ -119,31 +120,11 @@ class Change:
 
     def add(self, other: "Change") -> None:
         """Add another one."""
-        for name in ("positions", "velocities", *NOTED):
+        for name in STATES:
             mine, theirs = getattr(self, name), getattr(other, name)
             setattr(self, name, mine if theirs is None else theirs if mine is None else mine + theirs)
         for name, value in other.inputs.items():
             self.inputs[name] = self.inputs[name] + value if name in self.inputs else value
-
-
-class _DerivedNode(Node):
-    """What kernels read, of inputs that record: its arrays record, too."""
-
-    def __init__(self, scene: Scene, inputs: Node):
-        read, values = scene.inputs, inputs.value
-
-        def pull(adjoint):
-            return lambda into: _add_to(into, read.derive_vjp(values, adjoint, tuple(values)))
-
-        value = read.derive(values)
-        super().__init__(value, [(inputs, lambda changes: read.derive_jvp(values, changes), pull)], value.zeros)
-
-    def __getattr__(self, name: str):
-        def pull(seed):
-            return lambda into: setattr(into, name, getattr(into, name) + seed)
-
-        value = getattr(self.value, name)
-        return None if value is None else made(value, (self, lambda change: getattr(change, name), pull))
 
 
 def _add_to(into: dict, more: dict) -> None:
@@ -156,12 +137,14 @@ class _Recording:
 
     def __init__(self, frames: Frames):
         self.frames = frames
-        known = {name: getattr(frames, name) for name in ("positions", "velocities", *NOTED)}
-        self.leaves = {name: Recorded(np.asarray(x, np.float64)) for name, x in known.items() if x is not None}
+        self.leaves: dict[str, Recorded] = {}  # of what was asked for
         self.numbers = Node(frames.inputs, (), dict)
 
     def __getattr__(self, name: str):
-        return self.leaves[name] if name in self.leaves else getattr(self.frames, name)
+        x = getattr(self.frames, name)
+        if name not in STATES or x is None:
+            return x
+        return self.leaves.setdefault(name, Recorded(np.asarray(x, np.float64)))
 
     def __getitem__(self, name: str):
         return getattr(self, name) if name in ("positions", "velocities", "displacements") else self.outputs
@@ -184,7 +167,7 @@ class _Recording:
     @cached_property
     def displacements(self) -> Recorded:
         """Of the frames' own digits; they change as positions less the rest shape do."""
-        of_places = self.leaves["positions"], lambda dx: dx, lambda seed: seed
+        of_places = self.positions, lambda dx: dx, lambda seed: seed
         of_rest = self.inputs["rest_positions"], lambda dX: -dX, lambda seed: -seed.sum(0)
         return made(self.frames.displacements.astype(np.float64), of_places, of_rest)
 
@@ -201,7 +184,14 @@ class _Recording:
 
 def derived(scene: Scene, frames: "Frames | _Recording") -> Derived:
     """What kernels read of the inputs of frames."""
-    return _DerivedNode(scene, frames.numbers) if isinstance(frames, _Recording) else scene.inputs.derive(frames.inputs)
+    if not isinstance(frames, _Recording):
+        return scene.inputs.derive(frames.inputs)
+    read, values = scene.inputs, frames.frames.inputs
+
+    def pull(adjoint):
+        return lambda into: _add_to(into, read.derive_vjp(values, adjoint, tuple(values)))
+
+    return DerivedNode(read.derive(values), (frames.numbers, lambda changes: read.derive_jvp(values, changes), pull))
 
 
 class Output(metaclass=Public):
@@ -283,19 +273,15 @@ def taken_from(output: Output, frames: "Frames | _Recording") -> np.ndarray:
         return output.value(frames)
     plain, found = frames.frames, []
 
-    def push(name):
-        return lambda change: output.jvp(plain, Change(**{name: change}))
+    def push(inputs, *states):
+        return output.jvp(plain, Change(inputs=inputs or {}, **dict(zip(STATES, states))))
 
-    def pull(name):
-        return lambda seed: getattr(adjoint(seed), name)
+    def by_inputs(seed):
+        found[:] = [output.vjp(plain, seed)]
+        return lambda into: _add_to(into, found[0].inputs)
 
-    def adjoint(seed):  # asked for once for each leaf
-        found.extend(() if found else [output.vjp(plain, seed)])
-        return found[0]
-
-    states = [(leaf, push(name), pull(name)) for name, leaf in frames.leaves.items()]
-    by_inputs = lambda seed: lambda into: _add_to(into, adjoint(seed).inputs)  # noqa: E731
-    return made(output.value(plain), *states, (frames.numbers, push("inputs"), by_inputs))
+    states = [(getattr(frames, name), lambda _, name=name: getattr(found[0], name)) for name in STATES]
+    return jointly(output.value(plain), push, (frames.numbers, by_inputs), *states)
 
 
 def force_or_moment(forces: np.ndarray, places: np.ndarray, about: np.ndarray | None) -> np.ndarray:

@@ -10,7 +10,7 @@ from diffsim_ti.differentiation.arrays import summed_at
 from diffsim_ti.mesh.named_sets import SetOrIndices
 from diffsim_ti.outputs.deformation import displacement_gradients
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads, BodyForces
-from diffsim_ti.outputs.output import Change, Frames, Output, derived, force_or_moment, taken_from
+from diffsim_ti.outputs.output import Frames, Output, derived, force_or_moment
 from diffsim_ti.outputs.tensors import Stress
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Robot, Tie
@@ -86,85 +86,29 @@ class Reaction(Output):
             onto = np.tile(np.eye(3), (len(out.vertices), 1, 1))
             if np.isin(out.vertices, scene.held).all():
                 onto = scene.supports.projectors(out.vertices, self.support)
-        out.held = _HeldForces(scene, out.vertices, onto)
+        out.scene, out.onto = scene, onto
+        out.body, out.loads = BodyForces(scene), AppliedLoads(scene, moving=True)
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames, len(self.vertices), 3) if self.per_vertex else (num_frames, 3)
 
     def value(self, frames: Frames) -> np.ndarray:
-        held = taken_from(self.held, frames)
+        of, u, v = (
+            derived(self.scene, frames),
+            frames.displacements.astype(np.float64),
+            frames.velocities.astype(np.float64),
+        )
+        f, held = self.body.at_frames(of, u, v, self.remembered(frames, self.scene)), []
+        for k, step in enumerate(frames.steps):
+            x, p = (
+                frames.positions[k].astype(np.float64),
+                frames.chamber_pressures[k] if self.scene.holds_volumes else None,
+            )
+            both = f[k] + self.loads.forces(of, x, int(step), held=p, v=v[k])
+            held.append(-np.einsum("kij,kj->ki", self.onto, both[self.vertices]))
+        held = np.stack(held)
         return held if self.per_vertex else force_or_moment(held, frames.positions[:, self.vertices], self.about)
-
-
-class _HeldForces(Output):
-    """What holds each of some vertices in the directions `onto` of each, shape (frames, k, 3)."""
-
-    reads_law_state = True
-
-    def __init__(self, scene: Scene, vertices: np.ndarray, onto: np.ndarray):
-        self.scene, self.vertices, self.onto = scene, vertices, onto
-        self.body, self.loads = BodyForces(scene), AppliedLoads(scene, moving=True)
-
-    def shape(self, num_frames: int) -> tuple[int, ...]:
-        return num_frames, len(self.vertices), 3
-
-    def _place(self, frames, k: int) -> tuple[np.ndarray, int, dict]:
-        """Go to the state of frame k: its positions, its step, and what loads are told of it."""
-        u, v = (x[k].astype(np.float64) for x in (frames.displacements, frames.velocities))
-        self.body.place(u, v, self.remembered(frames, self.scene)[k])
-        held = frames.chamber_pressures[k] if self.scene.holds_volumes else None
-        return frames.positions[k].astype(np.float64), int(frames.steps[k]), dict(held=held, v=v)
-
-    def _onto(self, f: np.ndarray) -> np.ndarray:
-        """Of forces on the vertices, shape (..., k, 3), what is held."""
-        return -np.einsum("kij,...kj->...ki", self.onto, f)
-
-    def value(self, frames: Frames) -> np.ndarray:
-        known, out = self.body.load(frames.inputs), []
-        for k in range(len(frames.positions)):
-            x, step, shown = self._place(frames, k)
-            f = self.loads.forces(known, x, step, **shown) + self.body.forces()
-            out.append(self._onto(f[self.vertices]))
-        return np.stack(out)
-
-    def jvp(self, frames: Frames, change: Change) -> np.ndarray:
-        known, moved = self.body.load(frames.inputs), self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
-        tangent, zero, out = self.body.tangent(moved), np.zeros(frames.positions.shape), []
-        dx, dv = (zero if x is None else x for x in (change.positions, change.velocities))
-        z = self.remembered(frames, self.scene)
-        dz = np.zeros(z.shape) if change.law_state is None else change.law_state.reshape(z.shape)
-        for k in range(len(zero)):
-            x, step, shown = self._place(frames, k)
-            df = self.body.jvp(dx[k] - moved.rest, dv[k], tangent, dz[k])
-            df = df + self.loads.jvp(known, moved, x, dx[k], step, dv=dv[k], **shown)
-            if change.chamber_pressures is not None and self.scene.holds_volumes:
-                df = df + self.loads.held_jvp(x, change.chamber_pressures[k])
-            out.append(self._onto(df[self.vertices]))
-        return np.stack(out)
-
-    def vjp(self, frames: Frames, seed: np.ndarray) -> Change:
-        positions, velocities, w = np.zeros((3, *frames.positions.shape))
-        w[:, self.vertices] = self._onto(seed)
-        known, adjoint = self.body.load(frames.inputs), self.body.adjoint()
-        rest, by_loads, by_held, by_states = np.zeros(positions.shape[1:]), known.zeros(), [], []
-        for k in range(len(w)):
-            x, step, shown = self._place(frames, k)
-            by_u, by_v, by_z = self.body.vjp(w[k], adjoint)
-            by_states.append(by_z)
-            by_x, by_speed = self.loads.vjp(known, x, w[k], step, by_loads, **shown)
-            positions[k], velocities[k] = by_u + by_x, by_speed + by_v
-            if shown["held"] is not None:
-                by_held.append(self.loads.held_vjp(x, w[k]))
-            rest -= by_u
-        adj = adjoint.collect()
-        adj.element_masses = None
-        adj.add(by_loads)
-        adj.rest = adj.rest + rest
-        inputs = self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))
-        held = np.stack(by_held) if by_held else None
-        state = None if by_states[0] is None else np.stack(by_states).reshape(frames.law_state.shape)
-        return Change(positions, velocities, inputs, chamber_pressures=held, law_state=state)
 
 
 class SectionForce(Output):

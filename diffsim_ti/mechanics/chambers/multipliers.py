@@ -26,20 +26,10 @@ class HeldPressure(ChamberPressure):
         """dV/du of each."""
         return [enclosure.gradient(self.rest + u) for enclosure in self.enclosures]
 
-    def targets_jvp(self, u: np.ndarray, du: np.ndarray, moved) -> list:
-        """Change of targets for that of the numbers, less that of volumes by du and by the rest shape."""
-        instant, dx = self.instant, du + moved.rest
-        changes = instant.schedule.pressure(moved.follower, instant.j, instant.share)
-        of_targets = [law.target_by_numbers() @ changes[own] for law, own in zip(self.laws, self.rows)]
-        return [x - float((G * dx).sum()) for x, G in zip(of_targets, self.gradients(u))]
-
-    def add_targets(self, nu: np.ndarray, u: np.ndarray, adj) -> np.ndarray:
-        """Add to the adjoints of numbers and of the rest shape what comes by targets; returns that of u by volumes."""
-        for law, rows, own in zip(self.laws, self.rows, nu):
-            self.add_numbers(adj, rows, own * law.target_by_numbers())
-        by_u = -sum(own * G for own, G in zip(nu, self.gradients(u)))
-        adj.rest += by_u
-        return by_u
+    def missing(self, u: np.ndarray) -> np.ndarray:
+        """Targets less volumes."""
+        held = zip(self.enclosures, self.numbers, self.laws)
+        return np.stack([law.goal(numbers) - enclosure.recorded(self.rest + u) for enclosure, numbers, law in held])
 
 
 class Multipliers:
@@ -145,12 +135,13 @@ class Multipliers:
 
     def targets_jvp(self, u: np.ndarray, du: np.ndarray, moved) -> np.ndarray:
         """Change of targets for that of the numbers, less that of volumes by du and by the rest shape."""
-        return np.array([x for force in self.forces for x in force.targets_jvp(u, du, moved)])
+        return np.concatenate([force.jvp(u, du, None, moved, "missing") for force in self.forces if force.laws])
 
     def add_targets(self, nu: np.ndarray, u: np.ndarray, adj) -> np.ndarray:
         """Add to the adjoints of numbers and of the rest shape what comes by targets; returns that of u by volumes."""
         ends = np.cumsum([0, *(len(force.laws) for force in self.forces)])
-        return sum(force.add_targets(nu[a:b], u, adj) for force, a, b in zip(self.forces, ends, ends[1:]))
+        each = (part for part in zip(self.forces, ends, ends[1:]) if part[0].laws)
+        return sum(force.vjp(u, nu[a:b], adj, "missing")[0] for force, a, b in each)
 
     def adjoint(self, u: np.ndarray, y: np.ndarray, by_pressure: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
         """(w, nu) from y = K'^-T p: the adjoint of R, and what comes to that of targets, and less to that of volumes."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import value_of, with_slopes
 from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, Tangent, pressures_at
 from diffsim_ti.terms import Chamber, FilledChamber, Pressure
 from diffsim_ti.terms.chambers import gas_law
@@ -60,8 +61,8 @@ class PrescribedVolume:
 
     def at(self, numbers: np.ndarray, share: float) -> None:
         """Numbers of a pass; share: of the way from V_0 to the target."""
-        target, rest = numbers
-        self.share, self.target = share, share * target + (1 - share) * rest
+        self.share = share
+        self.target = self.goal(numbers)
 
     def pressure(self, V: float) -> float:
         """p [Pa]."""
@@ -71,13 +72,13 @@ class PrescribedVolume:
         """dp/dV [Pa/m^3]."""
         return -self.gamma
 
-    def target_by_numbers(self) -> np.ndarray:
-        """Derivatives of the target."""
-        return np.array([self.share, 1 - self.share])
+    def goal(self, numbers: np.ndarray) -> np.ndarray:
+        """The target; of numbers that record, too."""
+        return self.share * numbers[0] + (1 - self.share) * numbers[1]
 
     def by_numbers(self, V: float) -> np.ndarray:
         """Derivatives of p by the numbers, the target having the slope gamma."""
-        return self.gamma * self.target_by_numbers()
+        return self.gamma * np.array([self.share, 1 - self.share])
 
     def work(self, V: float, change: float) -> float:
         """Integral of p dV from V to V + change [J]; of a volume that vanishes, minus infinity."""
@@ -116,8 +117,9 @@ class ChamberPressure(FollowerPressure):
 
     def at(self, numbers: np.ndarray, share: float = 1.0) -> "ChamberPressure":
         """With a share of what the numbers of all pressures and chambers say."""
-        for law, rows in zip(self.laws, self.rows):
-            law.at(np.asarray(numbers[rows], np.float64), share)
+        self.numbers = [numbers[rows] for rows in self.rows]
+        for law, own in zip(self.laws, self.numbers):
+            law.at(np.asarray(value_of(own), np.float64), share)
         return self
 
     def take(self, values, instant):
@@ -128,41 +130,18 @@ class ChamberPressure(FollowerPressure):
         """V of each chamber [m^3]."""
         return np.array([enclosure.volume(x) for enclosure in self.enclosures])
 
-    def _place(self, u: np.ndarray) -> None:
-        self.pressure = np.array([law.pressure(V) for law, V in zip(self.laws, self.volumes(self.rest + u))])
-
-    def forces(self, u):
-        self._place(u)
-        return super().forces(u)
-
-    def sizes(self, u):
-        self._place(u)
-        return super().sizes(u)
-
-    def jvp(self, u, du, dv=None, moved=None):
-        self._place(u)
-        return super().jvp(u, du, dv, moved)
-
-    def vjp(self, u, w, adj=None):
-        self._place(u)
-        return super().vjp(u, w, adj)
+    def pressures(self, x):
+        out = []
+        for law, enclosure, numbers in zip(self.laws, self.enclosures, self.numbers):
+            volume = enclosure.recorded(x)
+            V = float(value_of(volume))
+            slopes = (volume, lambda law=law, V=V: law.slope(V)), (numbers, lambda law=law, V=V: law.by_numbers(V))
+            out.append(with_slopes(law.pressure(V), *slopes))
+        return np.stack(out)
 
     def unit_forces(self, u: np.ndarray, k: int) -> np.ndarray:
         """Forces of 1 Pa in chamber k [N / Pa]."""
-        self.pressure = np.zeros(len(self.laws))
-        self.pressure[k] = 1
-        return super().forces(u)
-
-    def _pressures_jvp(self, x, dx, moved):
-        dp, instant = np.zeros(len(self.laws)), self.instant
-        if moved is not None:
-            changes = instant.schedule.pressure(moved.follower, instant.j, instant.share)
-        for k, (law, enclosure, rows) in enumerate(zip(self.laws, self.enclosures, self.rows)):
-            V = enclosure.volume(x)
-            dp[k] = law.slope(V) * float((enclosure.gradient(x) * dx).sum())
-            if moved is not None:
-                dp[k] += law.by_numbers(V) @ changes[rows]
-        return dp
+        return self._to_vertices(self._pushed(np.eye(len(self.laws))[k], self.rest + u))
 
     def tangent(self, u, transposed=False):
         x = self.rest + u
@@ -172,18 +151,8 @@ class ChamberPressure(FollowerPressure):
             for k, (slope, enclosure) in enumerate(zip(slopes, self.enclosures))
             if slope
         ]
-        self._place(u)
         out = Tangent(self._tangent(x).K, pairs)
         return out.T if transposed else out
-
-    def _pressures_vjp(self, x, p_adj, adj):
-        by_x = 0.0
-        for law, enclosure, rows, by_p in zip(self.laws, self.enclosures, self.rows, p_adj):
-            V = enclosure.volume(x)
-            by_x = by_x + law.slope(V) * by_p * enclosure.gradient(x)
-            if adj is not None:
-                self.add_numbers(adj, rows, law.by_numbers(V) * by_p)
-        return by_x
 
     def work(self, u, step):
         """Minus infinity where a chamber would vanish."""

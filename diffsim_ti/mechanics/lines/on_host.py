@@ -1,4 +1,4 @@
-"""Springs and cables in float64 on the host: energy, forces, their derivatives both ways.
+"""Springs and cables in float64 on the host: energy, forces, products.
 
 The numbers are those of inputs/lines.py: T = a + k e, e = L - L0 + s, and where a line element pulls only, e is zero
 where it would be less. d = D + C u: segments, D at rest, C from displacements of vertices.
@@ -6,9 +6,10 @@ where it would be less. d = D + C u: segments, D at rest, C from displacements o
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import Node, ratio, summed_at, times, value_of
 from diffsim_ti.inputs.lines import directions
 from diffsim_ti.mechanics.host_force import HostForce
-from diffsim_ti.mechanics.lines.pull import across, tension, tension_jvp
+from diffsim_ti.mechanics.lines.pull import across, tension
 
 
 class LinesOnHost(HostForce):
@@ -54,42 +55,45 @@ class LinesOnHost(HostForce):
 
     def _sums(self, of_segments):
         """Of each path."""
-        return np.bincount(self.paths.path_of, of_segments, len(self.paths))
+        return summed_at(self.paths.path_of, of_segments, len(self.paths))
 
     def _state(self, u):
-        """(t, lengths, L - L0, e as far as it pulls, k as far as e does, T)"""
-        if self._seen is not None and np.array_equal(self._seen[0], u):
+        """(directions, d, lengths, L - L0, k as far as it pulls, T)"""
+        records = isinstance(u, Node)
+        if not records and self._seen is not None and np.array_equal(self._seen[0], u):
             return self._seen[1]
-        moved = self.parted @ u
-        d, length = self.D + moved, np.linalg.norm(self.D + moved, axis=1)
+        moved = times(self.parted, u)
+        d = self.D + moved
+        length = np.linalg.norm(d, axis=1)
         both = length + np.linalg.norm(self.D, axis=1)
-        longer = (moved * (self.D + d)).sum(1)
-        stretch = self._sums(np.divide(longer, both, out=np.zeros_like(both), where=both > 0))
+        stretch = self._sums(ratio((moved * (self.D + d)).sum(1), both))
         e = stretch + self.s
         pulls = ~(self.one_sided & (e <= 0))
-        e, k = e * pulls, self.k * pulls
-        out = directions(d), length, stretch, e, k, tension(self.a, self.k, e)
-        self._seen = np.array(u), out
+        out = ratio(d, length[:, None]), d, length, stretch, self.k * pulls, tension(self.a, self.k, e * pulls)
+        self._seen = None if records else (np.array(u), out)
         return out
 
+    def _per_length(self, length, T):
+        """T/|d| of each segment; of a spring without length k."""
+        T, k = (x[self.paths.path_of] for x in (T, self.k))
+        return np.where(value_of(length) > 0, ratio(T, length), k)
+
     def _across(self, t, length, T, x):
-        """T/|d| of what of x lies across segments; of a spring without length k x."""
-        T, k = T[self.paths.path_of], self.k[self.paths.path_of]
-        q = np.divide(T, length, out=np.array(k), where=length > 0)
-        return across(q[:, None], t, (t * x).sum(1)[:, None], x)
+        """T/|d| of what of x lies across segments."""
+        return across(self._per_length(length, T)[:, None], t, (t * x).sum(1)[:, None], x)
 
     def lengths(self, u: np.ndarray) -> np.ndarray:
         """Length of each path [m]."""
-        return self._sums(self._state(u)[1])
+        return self._sums(self._state(u)[2])
 
     def tensions(self, u: np.ndarray) -> np.ndarray:
         """T of each [N]."""
-        return self._state(u)[5]
+        return self._state(u)[-1]
 
     def energies(self, u: np.ndarray) -> np.ndarray:
         """a (L - L0) + k e^2 / 2 of each [J]."""
-        _, _, stretch, e, k, _ = self._state(u)
-        return self.a * stretch + 0.5 * k * e * e
+        *_, stretch, k, _ = self._state(u)
+        return self.a * stretch + 0.5 * k * (stretch + self.s) ** 2
 
     def stored(self, u: np.ndarray) -> dict[str, float]:
         """Of springs: cables are loads."""
@@ -100,25 +104,21 @@ class LinesOnHost(HostForce):
         return float(self.energies(u)[self.cables].sum())
 
     def forces(self, u):
-        t, *_, T = self._state(u)
-        return self._along(t, T)
+        _, d, length, *_, T = self._state(u)
+        return -times(self.together, self._per_length(length, T)[:, None] * d)
 
     def loads(self, u):
         """Of cables."""
         t, *_, T = self._state(u)
-        return self._along(t, T * self.cables)
-
-    def _along(self, t, T):
-        """Forces of tensions along segments."""
-        return -(self.together @ (T[self.paths.path_of, None] * t))
+        return -(self.together @ ((T * self.cables)[self.paths.path_of, None] * t))
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
-        T = np.abs(self._state(u)[5])[self.paths.path_of]
+        T = np.abs(self._state(u)[-1])[self.paths.path_of]
         return abs(self.together) @ T
 
     def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
         """d2E/du2 w [N]; convex: without what pushes, which has negative curvature."""
-        t, length, _, _, k, T = self._state(u)
+        t, _, length, _, k, T = self._state(u)
         dd = self.parted @ w
         along = (k * self._sums((t * dd).sum(1)))[self.paths.path_of]
         across = self._across(t, length, np.maximum(T, 0) if convex else T, dd)
@@ -126,7 +126,7 @@ class LinesOnHost(HostForce):
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
-        t, length, _, _, k, T = self._state(u)
+        t, _, length, _, k, T = self._state(u)
         g, out = self._along_paths(t), np.zeros((self.num_vertices, 3, 3))
         np.add.at(out, self._pair_vertex, k[self._pair_path, None, None] * g[:, :, None] * g[:, None, :])
         across = self._stiffness_across(t, length, T)
@@ -143,14 +143,14 @@ class LinesOnHost(HostForce):
 
     def turning(self, u: np.ndarray, w: np.ndarray) -> float:
         """The largest |C w| / |d| of segments that have a length."""
-        length, moved = self._state(u)[1], np.linalg.norm(self.parted @ w, axis=1)
+        length, moved = self._state(u)[2], np.linalg.norm(self.parted @ w, axis=1)
         return float(np.divide(moved, length, out=np.zeros_like(moved), where=length > 0).max(initial=0.0))
 
     def matrix(self, u: np.ndarray):
         """d2E/du2 [N/m] as a SciPy sparse matrix, rows 3 i + d: C^T (k t t^T along each path + what lies across) C."""
         from scipy.sparse import block_diag, csr_matrix, diags, identity, kron
 
-        t, length, _, _, k, T = self._state(u)
+        t, _, length, _, k, T = self._state(u)
         across = self._stiffness_across(t, length, T)
         C = kron(self.parted, identity(3), "csr")
         places = np.repeat(self.paths.path_of, 3), np.arange(t.size)
@@ -159,7 +159,7 @@ class LinesOnHost(HostForce):
 
     def row_sums(self, u: np.ndarray) -> np.ndarray:
         """A bound of the sums of |d2E/du2| over the block row of each vertex [N/m]."""
-        t, length, _, _, k, T = self._state(u)
+        t, _, length, _, k, T = self._state(u)
         size = np.linalg.norm(self._along_paths(t), axis=1)
         whole = np.bincount(self._pair_path, size, len(self.paths))
         out = np.bincount(self._pair_vertex, (k * whole)[self._pair_path] * size, self.num_vertices)
@@ -167,58 +167,6 @@ class LinesOnHost(HostForce):
         q = np.abs(np.divide(T, length, out=np.array(k), where=length > 0))
         C = abs(self.parted)
         return out + C.T @ (q * np.asarray(C.sum(1)).ravel())
-
-    def lengths_jvp(self, u, du, segments_dot) -> np.ndarray:
-        """Change of the lengths."""
-        dd = segments_dot[self.paths.starts] + self.parted @ du
-        return self._sums((self._state(u)[0] * dd).sum(1))
-
-    def lengths_vjp(self, u, L_adj) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of u and segments for that of the lengths."""
-        d_adj = L_adj[self.paths.path_of, None] * self._state(u)[0]
-        return self.together @ d_adj, self._of_points(d_adj)
-
-    def tensions_jvp(self, u, du, segments_dot, tension_dot, slack_dot, stiffness_dot) -> np.ndarray:
-        """Change of T for changes of everything."""
-        _, _, _, e, k, _ = self._state(u)
-        dD = segments_dot[self.paths.starts]
-        de = self.lengths_jvp(u, du, segments_dot) - self._sums((directions(self.D) * dD).sum(1)) + slack_dot
-        return tension_jvp(k, e, tension_dot, stiffness_dot, de)
-
-    def tensions_vjp(self, u, T_adj) -> tuple:
-        """Adjoints of (u, segments, (a, s, k)) for that of T."""
-        t, _, _, e, k, _ = self._state(u)
-        e_adj = T_adj * k
-        of_segments = e_adj[self.paths.path_of, None]
-        segments = self._of_points(of_segments * (t - directions(self.D)))
-        return self.together @ (of_segments * t), segments, (T_adj, e_adj, T_adj * e)
-
-    def _of_points(self, of_segments) -> np.ndarray:
-        """As rows of the points where segments begin."""
-        out = np.zeros((self.paths.num_points, 3))
-        out[self.paths.starts] = of_segments
-        return out
-
-    def jvp(self, u, du, dv, moved=None):
-        t, length, _, _, k, T = self._state(u)
-        dd = self.parted @ du
-        if moved is None:
-            dT = k * self._sums((t * dd).sum(1))
-        else:
-            dd = moved.line_segments[self.paths.starts] + dd
-            dT = self.tensions_jvp(u, du, moved.line_segments, *self._numbers(moved.lines))
-        return -(self.together @ (dT[self.paths.path_of, None] * t + self._across(t, length, T, dd)))
-
-    def vjp(self, u, w, adj=None):
-        t, length, *_, T = self._state(u)
-        w = -(self.parted @ w)
-        by_u, segments, (a, s, k) = self.tensions_vjp(u, self._sums((t * w).sum(1)))
-        across = self._across(t, length, T, w)
-        if adj is not None:
-            adj.line_segments += segments + self._of_points(across)
-            a = a * np.where(self.cables, self.instant.load, 1.0)
-            self.instant.schedule.add_lines(adj.lines, self.instant.j, self.instant.share, (a, s, k))
-        return by_u + self.together @ across, 0.0
 
     def resisted(self):
         """Along paths that are elastic and not slack as the run begins, or whose length is given over time."""

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import as_array, summed_at
 from diffsim_ti.mechanics.host_force import HostForce, Instant
 from diffsim_ti.mesh.enclosure import open_edges, spanned_by_edges
 from diffsim_ti.mesh.face_points import face_points
@@ -50,7 +51,7 @@ class FollowerPressure(HostForce):
 
     def at(self, pressures: np.ndarray) -> "FollowerPressure":
         """With pressures of the loads [Pa]."""
-        self.pressure = np.asarray(pressures, np.float64)
+        self.pressure = as_array(pressures)
         return self
 
     def take(self, values, instant):
@@ -58,37 +59,26 @@ class FollowerPressure(HostForce):
         self.rest = values.rest
         return self.at(instant.load * pressures_at(values.follower, instant)[: len(self.pressure)])
 
+    def pressures(self, x: np.ndarray) -> np.ndarray:
+        """Of the loads at places x [Pa]."""
+        return self.pressure
+
     def _to_vertices(self, by_points):
         """Sums at vertices of what the points have."""
-        at, by_nodes = self.points.faces.ravel(), self.points.to_nodes(by_points).reshape(-1, 3)
-        return np.stack([np.bincount(at, by_nodes[:, d], self.num_vertices) for d in range(3)], 1)
+        return summed_at(self.points.faces, self.points.to_nodes(by_points), self.num_vertices)
 
-    def _pushes(self, pressures):
-        """-p of each point."""
-        return -pressures[self.load_of, None]
+    def _pushed(self, pressures, x):
+        """-p n of each point."""
+        return -pressures[self.load_of, None] * self.points.normals(x)
 
     def forces(self, u):
-        return self._to_vertices(self._pushes(self.pressure) * self.points.normals(self.rest + u))
+        x = self.rest + u
+        return self._to_vertices(self._pushed(self.pressures(x), x))
 
     def sizes(self, u):
-        by_nodes = self.points.to_nodes(self._pushes(self.pressure) * self.points.normals(self.rest + u))
-        part = np.linalg.norm(by_nodes, axis=2)
+        x = self.rest + u
+        part = np.linalg.norm(self.points.to_nodes(self._pushed(self.pressures(x), x)), axis=2)
         return np.bincount(self.points.faces.ravel(), part.ravel(), self.num_vertices)
-
-    def jvp(self, u, du, dv=None, moved=None):
-        x, dx = self.rest + u, du if moved is None else du + moved.rest
-        part, dp = self._pushes(self.pressure) * self.points.normals_jvp(x, dx), self._pressures_jvp(x, dx, moved)
-        if dp is not None:
-            part += self._pushes(dp) * self.points.normals(x)
-        return self._to_vertices(part)
-
-    def _pressures_jvp(self, x: np.ndarray, dx: np.ndarray, moved) -> np.ndarray | None:
-        """Change of the pressures of loads; None where there is none."""
-        if moved is None:
-            return None
-        instant = self.instant
-        change = instant.schedule.pressure(moved.follower, instant.j, instant.share)
-        return instant.load * change[: len(self.pressure)]
 
     @cached_property
     def _blocks(self):
@@ -110,7 +100,7 @@ class FollowerPressure(HostForce):
         from scipy.sparse import bsr_matrix
 
         points, (sums, columns, start) = self.points, self._blocks
-        pushes = self._pushes(self.pressure).reshape(len(points.faces), -1)
+        pushes = -self.pressures(x)[self.load_of].reshape(len(points.faces), -1)
         parts = np.einsum("qa,fq,fqbij->fabij", points.shares, pushes, points.normals_by_nodes(x), optimize=True)
         blocks = (sums @ parts.reshape(-1, 9)).reshape(-1, 3, 3)
         return Tangent(bsr_matrix((blocks, columns, start), (3 * self.num_vertices,) * 2), [])
@@ -118,27 +108,6 @@ class FollowerPressure(HostForce):
     def matrix(self, u):
         """Of pressures as they are."""
         return -self.tangent(u).K
-
-    def vjp(self, u, w, adj=None):
-        x, at_points = self.rest + u, self.points.from_nodes(w[self.points.faces])
-        by_points = -(self.points.normals(x) * at_points).sum(1)
-        by_x = self.points.normals_vjp(x, self._pushes(self.pressure) * at_points)
-        by_x = by_x + self._pressures_vjp(x, np.bincount(self.load_of, by_points, len(self.pressure)), adj)
-        if adj is not None:
-            adj.rest += by_x
-        return by_x, 0.0
-
-    def _pressures_vjp(self, x: np.ndarray, p_adj: np.ndarray, adj):
-        """Adjoint of x for that of the pressures of loads; adds those of their numbers."""
-        if adj is not None:
-            self.add_numbers(adj, slice(len(p_adj)), self.instant.load * p_adj)
-        return 0.0
-
-    def add_numbers(self, adj, rows, by_numbers: np.ndarray) -> None:
-        """Add to the adjoints of `Derived.follower`, in some rows."""
-        whole, instant = np.zeros(adj.follower.shape[1]), self.instant
-        whole[rows] = by_numbers
-        instant.schedule.add_pressure(adj.follower, instant.j, instant.share, whole)
 
 
 def pressures_at(rows: np.ndarray, instant: Instant) -> np.ndarray:
