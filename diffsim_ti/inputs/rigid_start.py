@@ -15,7 +15,7 @@ from diffsim_ti.inputs.chain import Link, Recording
 
 def cross_matrix(a: np.ndarray) -> np.ndarray:
     """[a]x"""
-    return np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    return np.cross(np.eye(3), a)
 
 
 def axial(M: np.ndarray) -> np.ndarray:

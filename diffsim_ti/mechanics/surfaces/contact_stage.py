@@ -435,7 +435,9 @@ class PairContact(Stage):
             poses = self.a.poses.jvp(self.a.rows["path"], t.path, moment_of(at))
             at_end, at_begin, _ = self.obstacles.changes(parameters, poses)
             rest, mass = (np.concatenate([x, np.zeros((len(at_end), *x.shape[1:]))]) for x in (rest, mass))
-            radius = np.append(0.0, self.obstacles.corners.radii_jvp(self.a.values.parameters, parameters))
+            radius = np.append(
+                0.0, self.obstacles.corners.jvp("radii", self.a.values.parameters, parameters, 0.0, None)
+            )
         first, last = self._all(before, at_begin), self._all(after, at_end)
         at_nodes = (lambda x: x) if one.near.sets else (lambda x: x[one.nodes])
         dots = SimpleNamespace(
@@ -492,10 +494,9 @@ class PairContact(Stage):
         for part in one.parts[::-1]:
             e_adj, b_adj = one.solver.back(part, of, e_adj, b_adj, adj)
         self.by_rate += now.alpha_by_rate * adj.alpha + now.decay_by_rate * by_decay
-        for near, where, own, by in zip(one.near.sets, places, of.sets, adj.sets):
+        for near, where, by in zip(one.near.sets, places, adj.sets):
             x = self.sets[near.set]
-            by_places, by_mass = x.factors_vjp(near.here, *where, own, by)
-            self._add_of_set(x, by_places, by_places, by_mass, at_begin, p)
+            self._add_of_set(x, *x.factors_vjp(near.here, where, by), at_begin, p)
         own = one.nodes < self.num_own
         at_begin[one.nodes[own]] += (adj.x - adj.motion)[: len(own)][own]
         p[one.nodes[own]] += adj.motion[: len(own)][own]
@@ -516,12 +517,12 @@ class PairContact(Stage):
         for near, at in zip(one.near.sets, places):
             x, numbers = self.sets[near.set], near.at[len(near.here) :]
             by_x, by_v = p[x.at], q[x.at]
-            by = x.settle_vjp(*at[:2], one.v[x.at], e[numbers], b[numbers], decay, at[2], by_x, by_v)
-            e_adj[numbers], b_adj[numbers], q[x.at] = by.e, by.b, by.v
+            given = *at[:2], one.v[x.at], e[numbers], b[numbers], decay, at[2]
+            by_x0, by_x1, q[x.at], e_adj[numbers], b_adj[numbers], of_decay, by_mass = x.settle_vjp(given, by_x, by_v)
             self.by_rest[x.vertices] -= by_x  # displacements are places less these
             p[x.at] = 0
-            self._add_of_set(x, by.x0, by.x1, by.m, at_begin, p)
-            by_decay += by.decay
+            self._add_of_set(x, by_x0, by_x1, by_mass, at_begin, p)
+            by_decay += of_decay
         return by_decay
 
     def _add_of_set(self, x: SetInContact, by_x0, by_x1, by_mass, at_begin, p) -> None:
@@ -541,7 +542,7 @@ class PairContact(Stage):
         obstacles.add_places(by_end, AT_STAGE)
         by_radii = np.zeros(1 + len(obstacles.corners.parts))
         np.add.at(by_radii, one.rest[2].contact, adj.radius)
-        obstacles.corners.add_radii(self.a.values.parameters, by_radii[1:], self.by_numbers)
+        obstacles.corners.vjp("radii", self.a.values.parameters, 0.0, by_radii[1:], self.by_numbers, None)
         by_rows = obstacles.take_rows()
         if self.by_path is not None:
             self.a.poses.vjp(self.a.rows["path"], by_rows, moment_of(at), self.by_path)

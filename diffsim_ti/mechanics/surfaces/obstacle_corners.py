@@ -17,6 +17,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.common import rotations
+from diffsim_ti.differentiation.arrays import Recorded, forward, reverse, value_of
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE, TAU
@@ -41,14 +42,37 @@ class ObstacleCorners:
                 self.parts.append(SimpleNamespace(**part, primitives=primitives))
         self.count = end
 
+    # functions of all parameters and of the rows of poses, of arrays that record, too: changes of rotations are theta
+
+    def jvp(self, what: str, parameters, change, rows, rows_dot, *m: int) -> np.ndarray:
+        """Change of one of them."""
+        p, q = Recorded(parameters), Recorded(rows)
+        return forward(getattr(self, what)(p, q, *m), [(p, change), (q, rows_dot)])
+
+    def vjp(self, what: str, parameters, rows, by, by_parameters, by_rows, *m: int) -> None:
+        """Adds the adjoints of the parameters and of the rows."""
+        p, q = Recorded(parameters), Recorded(rows)
+        for total, more in zip((by_parameters, by_rows), reverse(getattr(self, what)(p, q, *m), by, [p, q])):
+            if more is not None:
+                total += more
+
     def made(self, parameters: np.ndarray) -> np.ndarray:
         """Where corners are as obstacles were made, shape (count, 3) [m]."""
         return np.concatenate([x.primitives.at(parameters[x.shape])[0] for x in self.parts])
 
-    def radii(self, parameters: np.ndarray) -> np.ndarray:
-        return np.array([x.primitives.at(parameters[x.shape])[1] for x in self.parts])
+    def radii(self, parameters: np.ndarray, rows=None) -> np.ndarray:
+        return np.stack([x.primitives.at(parameters[x.shape])[1] for x in self.parts])
 
-    # ---- poses -------------------------------------------------------------------------------------------------------
+    def at(self, parameters: np.ndarray, rows: np.ndarray, m: int = AT_STAGE) -> np.ndarray:
+        """Where corners are at the rows number m of poses."""
+        out = []
+        for x in self.parts:
+            p, _ = x.primitives.at(parameters[x.shape])
+            if self.row_of(x, m) is not None:
+                c, arms = self._arms(x, parameters, rows, m, p)
+                p = c + arms
+            out.append(p + rows[3 * x.k + m])
+        return np.concatenate(out)
 
     def row_of(self, part, m: int) -> int | None:
         """The row of rotations, None of an obstacle that does not turn."""
@@ -59,105 +83,28 @@ class ObstacleCorners:
         at = part.first + part.force.index.about
         return parameters[at : at + 3]
 
-    def _arms(self, part, parameters, rows, m: int, p=None, c=None) -> np.ndarray:
-        """R (p - c) of an obstacle that turns."""
-        p = part.primitives.at(parameters[part.shape])[0] if p is None else p
-        c = self.about(part, parameters) if c is None else c
-        return rotations.turned(rotations.from_rodrigues(rows[self.row_of(part, m)]), p - c)
+    def _arms(self, part, parameters, rows, m: int, p) -> tuple:
+        """(c, R (p - c)) of an obstacle that turns."""
+        c, turn = self.about(part, parameters), rows[self.row_of(part, m)]
+        now = value_of(turn)
+        arms = rotations.turned(rotations.from_rodrigues(now), p - c)
+        return c, arms + np.cross(turn - now, arms)
 
-    def at(self, parameters: np.ndarray, rows: np.ndarray, m: int = AT_STAGE) -> np.ndarray:
-        """Where corners are at the rows number m of poses."""
+    def velocity(self, parameters: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Of corners [m/s], on the chord of a time tau from where the pass begins (mechanics/obstacles/turned.py)."""
         out = []
         for x in self.parts:
             p, _ = x.primitives.at(parameters[x.shape])
-            if self.row_of(x, m) is not None:
-                p = self.about(x, parameters) + self._arms(x, parameters, rows, m, p)
-            out.append(p + rows[3 * x.k + m])
+            v = np.zeros((x.own.stop - x.own.start, 3)) + rows[3 * x.k + RATE]
+            row = self.row_of(x, 0)
+            if row is not None:
+                _, arms = self._arms(x, parameters, rows, AT_BEGIN, p)
+                omega, now, tau = rows[row + RATE], value_of(rows)[row + RATE], value_of(rows)[row + TAU, 0]
+                J, there = rotations.left_jacobian(tau * now), rotations.quaternion(tau * now)
+                turning = np.cross((omega - now) @ J.T, rotations.turned(there, value_of(arms)))
+                v = v + np.cross(now, arms @ J.T) + turning
+            out.append(v)
         return np.concatenate(out)
-
-    def at_jvp(self, parameters, change, rows, rows_dot, m: int = AT_STAGE) -> np.ndarray:
-        """Its change for those of the parameters and of the rows (rotations: theta)."""
-        out = []
-        for x in self.parts:
-            dp, _ = x.primitives.jvp(parameters[x.shape], change[x.shape])
-            row = self.row_of(x, m)
-            if row is not None:
-                dc, arms = self.about(x, change), self._arms(x, parameters, rows, m)
-                dp = dc + np.cross(rows_dot[row], arms) + self._arms(x, parameters, rows, m, dp, dc)
-            out.append(dp + rows_dot[3 * x.k + m])
-        return np.concatenate(out)
-
-    def at_vjp(self, parameters, rows, by_x, by_parameters, by_rows, m: int = AT_STAGE) -> None:
-        """Adds the adjoints of the parameters and of the rows for that of where corners are."""
-        for x in self.parts:
-            by, row = by_x[x.own], self.row_of(x, m)
-            by_rows[3 * x.k + m] += by.sum(0)
-            if row is not None:
-                by_rows[row] += np.cross(self._arms(x, parameters, rows, m), by).sum(0)
-                by = self._unturned(x, by, rows, m, by_parameters, by.sum(0))
-            self._add_shape(x, parameters, by, by_parameters)
-
-    def _unturned(self, part, by, rows, m, by_parameters, by_c) -> np.ndarray:
-        """R^T by, less which by_c is the adjoint of the point c."""
-        by = rotations.turned(rotations.conjugate(rotations.from_rodrigues(rows[self.row_of(part, m)])), by)
-        at = part.first + part.force.index.about
-        by_parameters[at : at + 3] += by_c - by.sum(0)
-        return by
-
-    def _add_shape(self, part, parameters, by, by_parameters, by_radius: float = 0.0) -> None:
-        by_parameters[part.shape] += part.primitives.vjp(parameters[part.shape], by, by_radius)
-
-    def add_radii(self, parameters, by_radii: np.ndarray, by_parameters: np.ndarray) -> None:
-        """Adds the adjoints of the parameters by those of the radii."""
-        for x, by in zip(self.parts, by_radii):
-            self._add_shape(x, parameters, np.zeros((x.own.stop - x.own.start, 3)), by_parameters, float(by))
-
-    def radii_jvp(self, parameters, change) -> np.ndarray:
-        return np.array([x.primitives.jvp(parameters[x.shape], change[x.shape])[1] for x in self.parts])
-
-    # ---- velocities, on the chord of a time tau from where the pass begins (mechanics/obstacles/turned.py) --------------
-
-    def _chord(self, part, rows) -> tuple[np.ndarray, np.ndarray]:
-        """(angular velocity, the turn of the chord)"""
-        row = self.row_of(part, 0)
-        return rows[row + RATE], rows[row + TAU, 0] * rows[row + RATE]
-
-    def velocity(self, parameters, rows) -> np.ndarray:
-        """Of corners [m/s]."""
-        out = np.zeros((self.count, 3))
-        for x in self.parts:
-            out[x.own] = rows[3 * x.k + RATE]
-            if self.row_of(x, 0) is not None:
-                omega, turn = self._chord(x, rows)
-                arms = self._arms(x, parameters, rows, AT_BEGIN)
-                out[x.own] += np.cross(omega, arms @ rotations.left_jacobian(turn).T)
-        return out
-
-    def velocity_jvp(self, parameters, change, rows, rows_dot) -> np.ndarray:
-        out = np.zeros((self.count, 3))
-        for x in self.parts:
-            out[x.own], row = rows_dot[3 * x.k + RATE], self.row_of(x, AT_BEGIN)
-            if row is not None:
-                (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
-                J, dp = (rotations.left_jacobian(turn), x.primitives.jvp(parameters[x.shape], change[x.shape])[0])
-                darms = np.cross(rows_dot[row], arms)
-                darms += self._arms(x, parameters, rows, AT_BEGIN, dp, self.about(x, change))
-                turned = rotations.turned(rotations.quaternion(turn), arms)
-                out[x.own] += np.cross(J @ rows_dot[row - AT_BEGIN + RATE], turned) + np.cross(omega, darms @ J.T)
-        return out
-
-    def velocity_vjp(self, parameters, rows, by_v, by_parameters, by_rows) -> None:
-        for x in self.parts:
-            by, row = by_v[x.own], self.row_of(x, AT_BEGIN)
-            by_rows[3 * x.k + RATE] += by.sum(0)
-            if row is not None:
-                (omega, turn), arms = self._chord(x, rows), self._arms(x, parameters, rows, AT_BEGIN)
-                J, turned = rotations.left_jacobian(turn), rotations.turned(rotations.quaternion(turn), arms)
-                by_rows[row - AT_BEGIN + RATE] += J.T @ np.cross(turned, by).sum(0)
-                by_arms = np.cross(by, omega) @ J
-                by_rows[row] += np.cross(arms, by_arms).sum(0)
-                by_p = self._unturned(x, by_arms, rows, AT_BEGIN, by_parameters, 0.0)
-                self._add_shape(x, parameters, by_p, by_parameters)
 
 
 class SurfaceWithObstacles:
@@ -252,15 +199,15 @@ class ObstacleMotion:
 
     def change(self, parameters_dot: np.ndarray, rows_dot: np.ndarray | None) -> np.ndarray:
         """Changes of the displacements, for those of all parameters and of the rows of poses."""
-        rows_dot = np.zeros_like(self.rows) if rows_dot is None else rows_dot
-        out = self.corners.at_jvp(self.parameters, parameters_dot, self.rows, rows_dot, self.m)
+        out = self.corners.jvp("at", self.parameters, parameters_dot, self.rows, rows_dot, self.m)
         self._fill(self.given_dot, out)
         return out
 
     def changes(self, parameters_dot: np.ndarray, rows_dot: np.ndarray | None) -> tuple[np.ndarray, ...]:
         """Those of where corners are where forces are taken and where the pass begins, and of their velocities."""
-        given = self.parameters, parameters_dot, self.rows, np.zeros_like(self.rows) if rows_dot is None else rows_dot
-        return *(self.corners.at_jvp(*given, m) for m in (AT_STAGE, AT_BEGIN)), self.corners.velocity_jvp(*given)
+        given = self.parameters, parameters_dot, self.rows, rows_dot
+        places = (self.corners.jvp("at", *given, m) for m in (AT_STAGE, AT_BEGIN))
+        return *places, self.corners.jvp("velocity", *given)
 
     def velocities(self) -> np.ndarray:
         return self.corners.velocity(self.parameters, self.rows)
@@ -271,11 +218,13 @@ class ObstacleMotion:
 
     def add_places(self, by_x: np.ndarray, m: int | None = None) -> None:
         """Add the adjoints by that of where corners are."""
-        m = self.m if m is None else m
-        self.corners.at_vjp(self.parameters, self.rows, by_x, self.by_parameters, self.by_rows, m)
+        self._add("at", by_x, self.m if m is None else m)
 
     def add_velocities(self, by_v: np.ndarray) -> None:
-        self.corners.velocity_vjp(self.parameters, self.rows, by_v, self.by_parameters, self.by_rows)
+        self._add("velocity", by_v)
+
+    def _add(self, what: str, by: np.ndarray, *m: int) -> None:
+        self.corners.vjp(what, self.parameters, self.rows, by, self.by_parameters, self.by_rows, *m)
 
     def take_rows(self) -> np.ndarray:
         """The adjoints of the rows of poses that were added in a pass."""
@@ -323,7 +272,7 @@ class ContactNumbers:
         rows = np.zeros((len(self.rows), 3))
         if change is not None:
             rows[:, :2] = change[self.rows[:, :2]]
-            rows[1:, 2] = self.surface.corners.radii_jvp(parameters, change)
+            rows[1:, 2] = self.surface.corners.jvp("radii", parameters, change, 0.0, None)
             if not self.of_bodies.stop > self.of_bodies.start:
                 rows[0] = 0
         runtime.fill(self.numbers_dot, rows)
@@ -334,4 +283,4 @@ class ContactNumbers:
         np.add.at(total, self.surface.owner, sums)
         for c in range(0 if self.of_bodies.stop > self.of_bodies.start else 1, len(total)):
             out[self.rows[c, :2]] += total[c, :2]
-        self.surface.corners.add_radii(parameters, total[1:, 3], out)
+        self.surface.corners.vjp("radii", parameters, 0.0, total[1:, 3], out, None)

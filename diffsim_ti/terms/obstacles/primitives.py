@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
-
 
 @dataclass(frozen=True)
 class Primitives:
@@ -14,7 +12,7 @@ class Primitives:
     points: numbers of the corners that act on faces. edges: two corners of each edge that acts on edges, shape (k, 2).
     Corners lie where the numbers p of the obstacle's shape say, as it was made:
 
-        (corners [m], radius [m]) = at(p),    and derivatives by p
+        (corners [m], radius [m]) = at(p)
 
     radius: how far bodies stay from corners and edges, beside the gap of the barrier.
     """
@@ -28,18 +26,6 @@ class Primitives:
     def at(self, p: np.ndarray) -> tuple[np.ndarray, float]:
         """By functions that record (differentiation/arrays.py)."""
         raise NotImplementedError
-
-    def jvp(self, p: np.ndarray, dp: np.ndarray) -> tuple[np.ndarray, float]:
-        """Their change."""
-        leaf = Recorded(p)
-        corners, radius = (forward(x, [(leaf, dp)]) for x in self.at(leaf))
-        return corners, float(radius)
-
-    def vjp(self, p: np.ndarray, by_corners: np.ndarray, by_radius: float) -> np.ndarray:
-        """Adjoint of p."""
-        leaf = Recorded(p)
-        parts = (reverse(x, seed, [leaf])[0] for x, seed in zip(self.at(leaf), (by_corners, by_radius)))
-        return sum((part for part in parts if part is not None), leaf.zeros())
 
 
 @dataclass(frozen=True)
