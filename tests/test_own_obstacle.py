@@ -175,23 +175,11 @@ class TetherOnHost(HostForce):
         self.rows = rows
 
     def numbers(self, values):
-        k, c, *d = values.parameters[self.rows]
-        return k, c, np.array(d)
+        p = values.parameters[self.rows]
+        return p[0], p[1], p[2:]
 
     def forces(self, u):
         return tether(u, self.velocities(u), *self.numbers(self.values))
-
-    def jvp(self, u, du, dv, moved=None):
-        k, c, d = self.numbers(self.values)
-        if moved is None:
-            return -k * du - c * dv
-        return tether_jvp(u, self.velocities(u), du, dv, k, c, d, *self.numbers(moved))
-
-    def vjp(self, u, w, adj=None):
-        k, c, d = self.numbers(self.values)
-        if adj is not None:
-            adj.parameters[self.rows] += [((d - u) * w).sum(), -(self.velocities(u) * w).sum(), *(k * w.sum(0))]
-        return -k * w, -c * w
 
 
 class Tethers(Interaction):

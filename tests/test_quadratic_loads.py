@@ -7,6 +7,7 @@ from quadratic_meshes import box, crumpled, face_rule, renumbered, ring, six, si
 from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
+from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, is_symmetric
 from diffsim_ti.mechanics.pressure.interaction import Pressures
@@ -59,10 +60,14 @@ def test_normals_of_points_and_their_derivatives(make):
     points, X = face_points(mesh.surface_faces), mesh.vertices
     dX, w = rng.normal(size=X.shape), rng.normal(size=(len(mesh.surface_faces) * points.points, 3))
     difference = (points.normals(X + 1e-6 * dX) - points.normals(X - 1e-6 * dX)) / 2e-6
-    np.testing.assert_allclose(points.normals_jvp(X, dX), difference, atol=1e-8)
-    assert (points.normals_vjp(X, w) * dX).sum() == pytest.approx((w * points.normals_jvp(X, dX)).sum(), rel=1e-12)
-    nodes = rng.normal(size=(*mesh.surface_faces.shape, 3))
-    assert (points.to_nodes(w) * nodes).sum() == pytest.approx((w * points.from_nodes(nodes)).sum(), rel=1e-12)
+    by_nodes = points.normals_by_nodes(X).reshape(-1, mesh.surface_faces.shape[1], 3, 3)
+    at = np.repeat(dX[mesh.surface_faces], points.points, 0)
+    np.testing.assert_allclose(np.einsum("pbij,pbj->pi", by_nodes, at), difference, atol=1e-8)
+    leaf = Recorded(X)
+    normals = points.normals(leaf)
+    np.testing.assert_allclose(forward(normals, [(leaf, dX)]), difference, atol=1e-8)
+    (by_X,) = reverse(normals, w, [leaf])
+    assert (by_X * dX).sum() == pytest.approx((w * forward(normals, [(leaf, dX)])).sum(), rel=1e-12)
 
 
 # Dead loads

@@ -20,7 +20,11 @@ class Node:
 
     def __init__(self, value, parents: Iterable = (), zeros: Callable | None = None):
         self.value, self.parents, self.number = value, tuple(parents), next(_numbers)
-        self.zeros = zeros or (lambda: np.zeros(np.shape(value)))
+        if zeros:
+            self.zeros = zeros
+
+    def zeros(self):
+        return np.zeros(np.shape(self.value))
 
 
 class Recorded(Node, NDArrayOperatorsMixin):
@@ -43,15 +47,13 @@ class Recorded(Node, NDArrayOperatorsMixin):
         raise AttributeError(f"arrays have no derivative by .{name} here: write jvp and vjp beside value")
 
     def __array_ufunc__(self, ufunc, method, *x, **how):
+        if ufunc in PARTIALS and method == "__call__" and not how:
+            return _elementwise(ufunc, *x)
         if "out" in how or method == "at":
             self._refuse()
         if ufunc is np.matmul:
             return _matmul(*x)
-        plain = [value_of(a) for a in x]
-        y = getattr(ufunc, method)(*plain, **how)
-        if ufunc in PARTIALS and method == "__call__" and not how:
-            by = [lambda d, own=own: own(d, y, *plain) for own in PARTIALS[ufunc]]
-            return made(y, *zip(x, by, by))
+        y = getattr(ufunc, method)(*map(value_of, x), **how)
         if np.asarray(y).dtype.kind == "f" and ufunc is not np.sign:
             raise TypeError(f"np.{ufunc.__name__} has no derivative here: write jvp and vjp beside value")
         return y
@@ -198,8 +200,17 @@ def forward(y, changes: Iterable[tuple[Node, object]]):
 
 def reverse(y, seed, leaves: Iterable[Node]) -> list:
     """Adjoints of the leaves for that of y; None where y does not depend on one."""
-    known, own = {id(y): np.asarray(seed, np.float64)}, set()
-    for node in reversed(_before(y)):
+    return reverse_of_all([(y, seed)], leaves)
+
+
+def reverse_of_all(adjoints: Iterable[tuple], leaves: Iterable[Node]) -> list:
+    """The same for (array, its adjoint) of several, which add up."""
+    known, own, ends = {}, set(), []
+    for y, seed in adjoints:
+        if isinstance(y, Node):
+            _add(known, own, y, np.asarray(seed, np.float64))
+            ends.append(y)
+    for node in reversed(_before(*ends)):
         if id(node) in known:
             for parent, _, pull in node.parents:
                 _add(known, own, parent, pull(known[id(node)]))
@@ -233,9 +244,9 @@ def _fitted(x: np.ndarray, shape: tuple) -> np.ndarray:
     return np.broadcast_to(x.sum(axes, keepdims=True) if axes else x, shape)
 
 
-def _before(y) -> list[Node]:
-    """The nodes that y was made of, in their order, itself the last."""
-    found, waiting = {}, [y] if isinstance(y, Node) else []
+def _before(*ends) -> list[Node]:
+    """The nodes that some were made of, in their order, these among them."""
+    found, waiting = {}, [y for y in ends if isinstance(y, Node)]
     while waiting:
         node = waiting.pop()
         if id(node) not in found:
@@ -281,10 +292,16 @@ def _matmul(a, b):
     return made(A @ B, by_a, (b, lambda db: A @ db, lambda seed: np.swapaxes(A, -1, -2) @ seed))
 
 
-def _cross(a, b):
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a x b of vectors of three numbers, with the bits of np.cross in a third of its time; of arrays that record, too."""
     A, B = value_of(a), value_of(b)
-    by_a = (a, lambda da: np.cross(da, B), lambda seed: np.cross(B, seed))
-    return made(np.cross(A, B), by_a, (b, lambda db: np.cross(A, db), lambda seed: np.cross(seed, A)))
+    if a is not A or b is not B:
+        by_a = (a, lambda da: cross(da, B), lambda seed: cross(B, seed))
+        return made(cross(A, B), by_a, (b, lambda db: cross(A, db), lambda seed: cross(seed, A)))
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
+    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        out[..., k] = a[..., i] * b[..., j] - a[..., j] * b[..., i]
+    return out
 
 
 def _einsum(letters: str, *x, optimize=False):
@@ -354,6 +371,16 @@ def _ends(a, n):
     return (a == 0) & (n < 1)
 
 
+def _elementwise(ufunc, *x):
+    plain = [a.value if isinstance(a, Node) else a for a in x]
+    y, parents = ufunc(*plain), []
+    for a, own in zip(x, PARTIALS[ufunc]):
+        if isinstance(a, Node):
+            by = lambda d, own=own: own(d, y, *plain)  # noqa: E731
+            parents.append((a, by, by))
+    return Recorded(y, parents)
+
+
 # changes for that of each argument, which are adjoints, too, of the value and the arguments; that of a root is zero where
 # it is
 PARTIALS = {
@@ -389,7 +416,7 @@ FUNCTIONS = {
     np.concatenate: _concatenate,
     np.stack: lambda parts, axis=0: _concatenate([np.expand_dims(part, axis) for part in parts], axis),
     np.einsum: _einsum,
-    np.cross: _cross,
+    np.cross: cross,
     np.where: _where,
     np.clip: lambda x, low=None, high=None: _at_most(x if low is None else np.maximum(x, low), high),
     np.linalg.norm: _norm,

@@ -9,6 +9,7 @@ from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import rounding_of
 from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
+from diffsim_ti.differentiation.arrays import Recorded, forward, made, reverse, value_of
 from diffsim_ti.rollout import Frames, Rollout
 
 
@@ -76,43 +77,39 @@ class Measurement(metaclass=Public):
         rows = np.nonzero(self.seen)[0]
         return share[rows] if len(share) > 1 else np.zeros(len(rows))
 
-    def _rows(self, times: np.ndarray, offset: float, order: int = 0) -> np.ndarray:
+    def _rows(self, times: np.ndarray, offset) -> np.ndarray:
         """Weights of the frames in each row of values, shape (rows, frames)."""
         from scipy.interpolate import CubicSpline  # half a second to import
 
-        return CubicSpline(times, np.eye(len(times)))(self.times + offset, order)
+        spline, at = CubicSpline(times, np.eye(len(times))), self.times + value_of(offset)
+        return made(spline(at), (offset, lambda d: d * spline(at, 1), lambda seed: (seed * spline(at, 1)).sum()))
 
-    def _taken(self, frames: Frames, y: np.ndarray, offset: float, order: int = 0) -> np.ndarray:
-        y = np.asarray(y, np.float64)
+    def _taken(self, times: np.ndarray, y: np.ndarray, offset) -> np.ndarray:
+        """Of an output; of numbers that record, too."""
         y = y if self.at is None else y[:, self.at]
         if self.times is not None:
-            y = np.tensordot(self._rows(frames.times, offset, order), y, 1)
+            y = (self._rows(times, offset) @ y.reshape(len(y), -1)).reshape(len(self.times), *y.shape[1:])
         return y[self.seen] / self.deviation
 
     def residual(self, frames: Frames, offset: float) -> np.ndarray:
         """(y - d) / noise, of what is not missing."""
-        return self._taken(frames, frames[self.output], offset) - self.values[self.seen] / self.deviation
+        y = np.asarray(frames[self.output], np.float64)
+        return self._taken(frames.times, y, offset) - self.values[self.seen] / self.deviation
+
+    def _recorded(self, frames: Frames, offset: float) -> tuple:
+        y, at = Recorded(np.asarray(frames[self.output], np.float64)), Recorded(offset)
+        return self._taken(frames.times, y, at), y, at
 
     def change(self, frames: Frames, change: np.ndarray | None, offset: float, d_offset: float) -> np.ndarray:
         """Change of the residual for changes of the output and of the offset of time [s]."""
-        out = np.zeros(len(self.deviation)) if change is None else self._taken(frames, change, offset)
-        if d_offset and self.times is not None:
-            out = out + d_offset * self._taken(frames, frames[self.output], offset, 1)
-        return out
+        residual, *leaves = self._recorded(frames, offset)
+        return forward(residual, zip(leaves, (change, d_offset)))
 
     def pulled(self, frames: Frames, seed: np.ndarray, offset: float) -> tuple[np.ndarray, float]:
         """Gradients by the output and by the offset of time, from that by the residual."""
-        by_values = np.zeros(self.values.shape)
-        by_values[self.seen] = seed / self.deviation
-        by_offset = 0.0
-        if self.times is not None:
-            by_offset = float(seed @ self._taken(frames, frames[self.output], offset, 1))
-            by_values = np.tensordot(self._rows(frames.times, offset).T, by_values, 1)
-        if self.at is None:
-            return by_values, by_offset
-        out = np.zeros(frames[self.output].shape)
-        np.add.at(out, (slice(None), self.at), by_values)
-        return out, by_offset
+        residual, *leaves = self._recorded(frames, offset)
+        by_output, by_offset = reverse(residual, seed, leaves)
+        return by_output, float(by_offset or 0.0)
 
 
 def measurements(data, noise) -> list[Measurement]:

@@ -7,7 +7,7 @@ from operator import is_
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
+from diffsim_ti.differentiation.arrays import Recorded, forward, reverse_of_all
 from diffsim_ti.inputs.description import frozen
 
 Arrays = Sequence[np.ndarray]
@@ -37,7 +37,7 @@ class Link(ABC):
 
 
 class Recording:
-    """The part of a link of one array whose value takes arrays that record, from which its derivatives are found
+    """The part of a link whose value takes arrays that record, from which its derivatives are found
     (differentiation/arrays.py)."""
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
@@ -46,8 +46,7 @@ class Recording:
 
     def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
         leaves = [Recorded(part) for part in x]
-        (y,) = self.value(*leaves)
-        found = reverse(y, y_adj[0], leaves)
+        found = reverse_of_all(zip(self.value(*leaves), y_adj), leaves)
         return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
 
 

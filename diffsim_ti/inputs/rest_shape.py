@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from diffsim_ti.inputs.chain import Link
+from diffsim_ti.differentiation.arrays import made, value_of, with_slopes
+from diffsim_ti.inputs.chain import Link, Recording
 from diffsim_ti.mesh.reference_element import QUADRATIC, quadrature
 
 if TYPE_CHECKING:
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from diffsim_ti.mesh import TetrahedralMesh
 
 
-class RestShape(Link):
+class RestShape(Recording, Link):
     """Of rest positions X: X itself and, at each of the points of an element, B = D^-1, D = dX/dxi, whose rows are grad xi,
     and the share V = w det D / 6 of the volume. Of tetrahedra of four nodes, whose edges are the columns of D, these have
     shapes (m, 3, 3) and (m,); of ten nodes, whose edges may be curved, (m, 4, 3, 3) and (m, 4), and there are the elements'
@@ -33,8 +34,18 @@ class RestShape(Link):
         self._last = None  # X and what derivatives need of it
 
     def value(self, X):
-        (B, V), *whole = self._inverse(X)
+        (B, V), *whole = self._recorded(X)
         return X, *self._of_points(B, V), *(W.sum(1) for _, W in whole)
+
+    def _recorded(self, X):
+        """What `_inverse` says; of arrays that record, too."""
+        found = self._inverse(value_of(X))
+        return found if X is value_of(X) else [self._of(X, *rule, *known) for rule, known in zip(self.rules, found)]
+
+    def _of(self, X, by_xi, _, B, V):
+        D, Bt = self._edges(X, by_xi), np.swapaxes(B, 2, 3)
+        inverse = made(B, (D, lambda dD: -B @ dD @ B, lambda by: -Bt @ by @ Bt))
+        return inverse, with_slopes(V, (D, lambda: V[..., None, None] * Bt))
 
     def _of_points(self, *arrays):
         """Without the axis of points where each element has one."""
@@ -61,25 +72,6 @@ class RestShape(Link):
 
     def _edges(self, X, by_xi):
         return np.einsum("eai,qak->eqik", X[self.elements], by_xi, optimize=True)
-
-    def jvp(self, x, dx):
-        changes = []
-        for (B, V), (by_xi, _) in zip(self._inverse(*x), self.rules):
-            dD = self._edges(dx[0], by_xi)
-            changes.append((-B @ dD @ B, V * np.einsum("eqij,eqji->eq", B, dD)))
-        return dx[0], *self._of_points(*changes[0]), *(dW.sum(1) for _, dW in changes[1:])
-
-    def vjp(self, x, y_adj):
-        (B, V), *whole = self._inverse(*x)
-        rest_adj, gradients_adj, volumes_adj, *whole_adj = y_adj
-        Bt = np.swapaxes(B, 2, 3)
-        by_D = [-Bt @ gradients_adj.reshape(B.shape) @ Bt + (V * volumes_adj.reshape(V.shape))[..., None, None] * Bt]
-        for (C, W), adjoint in zip(whole, whole_adj):
-            by_D.append((W * adjoint[:, None])[..., None, None] * np.swapaxes(C, 2, 3))
-        X_adj = np.array(rest_adj)
-        for by, (by_xi, _) in zip(by_D, self.rules):
-            np.add.at(X_adj, self.elements, np.einsum("eqik,qak->eai", by, by_xi, optimize=True))
-        return (X_adj,)
 
 
 def ratios_at_corners(elements: np.ndarray, rest: np.ndarray, u: np.ndarray) -> np.ndarray:

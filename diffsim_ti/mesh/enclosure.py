@@ -5,9 +5,8 @@ from itertools import combinations
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import value_of, with_slopes
+from diffsim_ti.differentiation.arrays import cross, value_of, with_slopes
 from diffsim_ti.mesh import reference_face
-from diffsim_ti.mesh.geometry import cross
 from diffsim_ti.mesh.sets import components
 
 FLAT = 1e-6  # of the size of a surface: how far its rim may lie off the planes that hold it

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from diffsim_ti.common.checked import numbers, shown
+from diffsim_ti.differentiation.arrays import cross
 
 # Corner a's opposite face, seen from outside of a tetrahedron of positive volume.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -70,12 +71,6 @@ def signed_volumes(D: np.ndarray) -> np.ndarray:
 def shape_gradients(inverse_D: np.ndarray) -> np.ndarray:
     """grad N_a [1/m], shape (num_tetrahedra, 4, 3): rows 1..3 are those of D^-1, row 0 is their negative sum."""
     return np.concatenate([-inverse_D.sum(1, keepdims=True), inverse_D], 1)
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b of rows of three, with the bits of np.cross in half of its time."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
 
 
 def triangle_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:

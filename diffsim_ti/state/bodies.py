@@ -12,6 +12,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.differentiation.arrays import Recorded, forward, linear, reverse_of_all
 from diffsim_ti.inputs import Derived
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))  # entries of J in their order
@@ -51,33 +52,31 @@ class BodyArrays:
         self.mass = values.mass[self.vertices].astype(self._rounded).astype(np.float64)
         places = np.where(self.rigid[self.owner, None], values.rest[self.vertices], self._mesh_places) - self.origin
         self.places = places.astype(self._rounded).astype(np.float64)
-        self.total = self._sums(self.mass)
-        self.centre = self._sums(self.mass[:, None] * self.places) / self.total[:, None]
-        self.y = self.places - self.centre[self.owner]
-        self.J = self._sums(self.mass[:, None, None] * self.y[:, :, None] * self.y[:, None, :])
-        inverse = np.linalg.inv(self.J)
-        rows = [np.column_stack([x[:, a, b] for a, b in PAIRS]) for x in (inverse, self.J)]
-        numbers = np.column_stack([self.total, self.centre, *rows])
+        total, centre, self.y, J = self._measured(self.mass, self.places)
+        inverse = np.linalg.inv(J)
+        rows = [np.column_stack([x[:, a, b] for a, b in PAIRS]) for x in (inverse, J)]
+        numbers = np.column_stack([total, centre, *rows])
         reach = np.array(inverse_mass, np.float64)
-        reach[self.vertices] = 1 / self.total[self.owner] + np.einsum(
-            "ni,nij,nj->n", self.y, inverse[self.owner], self.y
-        )
+        reach[self.vertices] = 1 / total[self.owner] + np.einsum("ni,nij,nj->n", self.y, inverse[self.owner], self.y)
         for name, data in dict(place=places, mass=self.mass, numbers=numbers.ravel(), reach=reach).items():
             runtime.fill(self.arrays[f"body_{name}"], data)
 
     def _sums(self, x: np.ndarray) -> np.ndarray:
         """Of each body."""
-        return np.add.reduceat(x, self.first[:-1], axis=0)
+        return linear(x, lambda x: np.add.reduceat(x, self.first[:-1], axis=0), lambda seed: seed[self.owner])
+
+    def _measured(self, mass: np.ndarray, places: np.ndarray) -> tuple:
+        """(M, X_, y, J); of arrays that record, too."""
+        total = self._sums(mass)
+        centre = self._sums(mass[:, None] * places) / total[:, None]
+        y = places - centre[self.owner]
+        return total, centre, y, self._sums(mass[:, None, None] * y[:, :, None] * y[:, None, :])
 
     def tangent(self, change: Derived) -> dict:
         """{name: array} of changes: of places, and of the numbers."""
-        dm = change.mass[self.vertices]
-        dplaces = np.where(self.rigid[self.owner, None], change.rest[self.vertices], 0.0)
-        dtotal = self._sums(dm)
-        dcentre = self._sums(dm[:, None] * self.y + self.mass[:, None] * dplaces) / self.total[:, None]
-        dy = dplaces - dcentre[self.owner]
-        mixed = self.mass[:, None, None] * self.y[:, :, None] * dy[:, None, :]
-        dJ = self._sums(dm[:, None, None] * self.y[:, :, None] * self.y[:, None, :] + mixed + np.swapaxes(mixed, 1, 2))
+        dm, m, X = change.mass[self.vertices], Recorded(self.mass), Recorded(self.places)
+        changes = [(m, dm), (X, np.where(self.rigid[self.owner, None], change.rest[self.vertices], 0.0))]
+        dtotal, dcentre, dy, dJ = (forward(x, changes) for x in self._measured(m, X))
         row = np.column_stack([dJ[:, a, b] for a, b in PAIRS])
         numbers = np.column_stack([dtotal, dcentre, 0 * row, row])
         return dict(
@@ -98,16 +97,13 @@ class BodyArrays:
         """Add what the sums say of masses and rest positions."""
         of_vertices = runtime.fetch(adjoints["body_adjoints"]).reshape(-1, SIZE)
         sums = runtime.fetch(adjoints["body_sums"]).reshape(-1, SUMS)
-        by_y, by_mass = of_vertices[:, :3], of_vertices[:, 3]
-        by_J = np.zeros_like(self.J)
+        by_J = np.zeros((len(sums), 3, 3))
         for k, (a, b) in enumerate(PAIRS):
             by_J[:, a, b] = sums[:, 1 + k]
-        both = (by_J + np.swapaxes(by_J, 1, 2))[self.owner]
-        by_y = by_y + self.mass[:, None] * np.einsum("nij,nj->ni", both, self.y)
-        by_centre = (-self._sums(by_y) / self.total[:, None])[self.owner]
-        by_mass = by_mass + sums[self.owner, 0] + np.einsum("ni,nij,nj->n", self.y, by_J[self.owner], self.y)
-        by_mass = by_mass + (self.y * by_centre).sum(1)
-        by_place = by_y + self.mass[:, None] * by_centre
+        m, X = Recorded(self.mass), Recorded(self.places)
+        total, _, y, J = self._measured(m, X)
+        seeds = (m, of_vertices[:, 3]), (total, sums[:, 0]), (y, of_vertices[:, :3]), (J, by_J)
+        by_mass, by_place = reverse_of_all(seeds, [m, X])
         mass, rest = np.zeros_like(out.mass), np.zeros_like(out.rest)
         mass[self.vertices] = by_mass
         moved = self.rigid[self.owner]

@@ -40,33 +40,31 @@ class JointSweep:
         at = turns[..., :3] + np.cross(turns[..., 3:], t) + np.cross(J.S_n[None, :, 3:], here[:, None])
         return at, turns[..., 3:]
 
-    def rows_jvp(self, dq: np.ndarray, dq_n: np.ndarray, dx: np.ndarray) -> np.ndarray:
-        """Change of the rows for changes of the joints where the pass ends and begins, and where inertia starts from."""
-        J, rate = self.joints, self.joints.rate
-        out, drate = np.zeros((J.a.poses.size, 3)), (dq - dx) / J.h
+    def _slopes(self) -> np.ndarray:
+        """Derivatives of the rows by the joints where the pass ends, where it begins, and where inertia starts from, shape
+        (3, joints, rows, 3)."""
+        J = self.joints
+        out, per_h = np.zeros((3, J.count, J.a.poses.size, 3)), np.array([1.0, 0.0, -1.0])[:, None, None] / J.h
         for row, turn, carried, t, t_n in self._moments():
-            for m, S, at, by in ((AT_STAGE, J.S, t, dq), (AT_BEGIN, J.S_n, t_n, dq_n), (RATE, J.S_n, t_n, drate)):
-                out[row + m] += (by * carried) @ moved(S, at)
-                out[turn + m] += (by * carried) @ S[:, 3:]
-            by_point, by_spin = self._rate_by_place(t_n)
-            own = dq_n * carried, rate * carried
-            out[row + RATE] += np.einsum("bad,b,a->d", by_point, *own)
-            out[turn + RATE] += np.einsum("bad,b,a->d", by_spin, *own)
+            end, begin = (
+                carried[:, None, None] * np.stack([moved(S, x), S[:, 3:]], 1) for S, x in ((J.S, t), (J.S_n, t_n))
+            )
+            bent = np.einsum("sbad,b,a->bsd", self._rate_by_place(t_n), carried, J.rate * carried)
+            both = np.array([row, turn])
+            out[0][:, both + AT_STAGE] += end
+            out[1][:, both + AT_BEGIN] += begin
+            out[1][:, both + RATE] += bent
+            for own, share in zip(out, per_h):
+                own[:, both + RATE] += share * begin
         return out
 
+    def rows_jvp(self, dq: np.ndarray, dq_n: np.ndarray, dx: np.ndarray) -> np.ndarray:
+        """Change of the rows for changes of the joints where the pass ends and begins, and where inertia starts from."""
+        return np.einsum("wj,wjrd->rd", np.stack([dq, dq_n, dx]), self._slopes())
+
     def rows_vjp(self, rows: np.ndarray) -> np.ndarray:
-        """Adjoints of the joints where the pass ends, where it begins and where inertia starts from, shape (3, joints)."""
-        J, rate, out = self.joints, self.joints.rate, np.zeros((3, self.joints.count))
-        for row, turn, carried, t, t_n in self._moments():
-            pulled = [
-                carried * (moved(S, at) @ rows[row + m] + S[:, 3:] @ rows[turn + m])
-                for m, S, at in ((AT_STAGE, J.S, t), (AT_BEGIN, J.S_n, t_n), (RATE, J.S_n, t_n))
-            ]
-            by_point, by_spin = self._rate_by_place(t_n)
-            bent = by_point @ rows[row + RATE] + by_spin @ rows[turn + RATE]
-            pulled[1] = pulled[1] + carried * (bent @ (rate * carried))
-            out += pulled[0] + pulled[2] / J.h, pulled[1], -pulled[2] / J.h
-        return out
+        """Adjoints of the joints there, shape (3, joints)."""
+        return np.einsum("wjrd,rd->wj", self._slopes(), rows)
 
     def _each(self):
         """(robot, its joints)"""

@@ -6,6 +6,7 @@ numbers, too, and is analytic in them between its kinks, so that changes of inpu
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import cross
 from diffsim_ti.mechanics.surfaces.proximity import BY_FIRST, BY_SECOND
 from diffsim_ti.terms.obstacles.barrier import curvature_within, slope_within, value_within
 
@@ -20,14 +21,6 @@ FIRST, SECOND = np.array(BY_FIRST, float), np.array(BY_SECOND, float)
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """A third of the time that NumPy's takes for few pairs."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
-    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        out[..., k] = a[..., i] * b[..., j] - a[..., j] * b[..., i]
-    return out
 
 
 # ---- nearest points ------------------------------------------------------------------------------------------------------

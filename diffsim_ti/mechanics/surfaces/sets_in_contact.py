@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import Recorded, reverse, value_of
+from diffsim_ti.differentiation.arrays import Recorded, reverse_of_all, value_of
 from diffsim_ti.inputs.rigid_start import cross_matrix
 from diffsim_ti.terms.reduced import Together
 
@@ -167,7 +167,6 @@ def _root(square):
     return np.sqrt(np.where(value_of(square).real > TINY**2, square, TINY**2))
 
 
-def _adjoints(leaves: list[Recorded], *pairs: tuple) -> list:
+def _adjoints(leaves: list[Recorded], *adjoints: tuple) -> list:
     """Of leaves for those of several arrays, (array, its adjoint) each."""
-    total = sum((y * by).sum() for y, by in pairs)
-    return [np.zeros(x.shape) if by is None else by for x, by in zip(leaves, reverse(total, 1.0, leaves))]
+    return [np.zeros(x.shape) if by is None else by for x, by in zip(leaves, reverse_of_all(adjoints, leaves))]

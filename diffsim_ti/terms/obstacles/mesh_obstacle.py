@@ -10,10 +10,11 @@ from typing_extensions import Unpack
 
 from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.common.warn import warn
+from diffsim_ti.differentiation.arrays import cross
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
 from diffsim_ti.materials.calculus.tensor import sum_of
-from diffsim_ti.mesh.geometry import cross, surface_edges
+from diffsim_ti.mesh.geometry import surface_edges
 from diffsim_ti.runtime import assign, at, let, traced, variable
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge

@@ -6,7 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.common.checked import numbers, shown, wholes
-from diffsim_ti.mesh.geometry import cross, surface_edges
+from diffsim_ti.differentiation.arrays import cross
+from diffsim_ti.mesh.geometry import surface_edges
 from diffsim_ti.mesh.sets import components
 
 CORNERS = dict(triangles=3, segments=2, points=1)

@@ -14,7 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.mesh.geometry import cross, curve_order
+from diffsim_ti.differentiation.arrays import cross
+from diffsim_ti.mesh.geometry import curve_order
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 
 GROUP, NODE = (
