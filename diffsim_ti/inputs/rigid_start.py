@@ -5,17 +5,11 @@ nearest to A = sum y D^T = R S (polar decomposition), which is that of the least
 doi:10.1107/S0567739476001873). Of velocities v: v' = mean v + omega x R D, I omega = sum R D x v, likewise.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from diffsim_ti.common.rotations import skew
 from diffsim_ti.differentiation.arrays import linear, made, replaced, value_of
 from diffsim_ti.inputs.chain import Link, Recording
-
-
-def cross_matrix(a: np.ndarray) -> np.ndarray:
-    """[a]x"""
-    return np.cross(np.eye(3), a)
 
 
 def axial(M: np.ndarray) -> np.ndarray:
@@ -28,29 +22,20 @@ def inertia(y: np.ndarray) -> np.ndarray:
     return (y * y).sum() * np.eye(3) - y.T @ y
 
 
-@dataclass
-class Nearest:
-    """The rotation R nearest to sum y D^T, and its derivatives."""
+def nearest_rotation(A: np.ndarray) -> np.ndarray:
+    """The rotation R nearest to A = sum y D^T; of arrays that record, too."""
+    given = value_of(A)
+    U, s, Vt = np.linalg.svd(given)
+    s[-1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt)) or 1.0
+    R = U @ np.diag([1, 1, np.sign(s[-1]) or 1.0]) @ Vt
+    S = R.T @ given
+    lever = np.trace(S) * np.eye(3) - 0.5 * (S + S.T)
 
-    y: np.ndarray
-    D: np.ndarray
+    def turn(change):
+        """R changes by R [delta]x, where lever delta is the axial vector of R^T dA; its own transpose."""
+        return R @ skew(np.linalg.solve(lever, axial(R.T @ change)))
 
-    def __post_init__(self):
-        U, s, Vt = np.linalg.svd(self.y.T @ self.D)
-        s[-1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt)) or 1.0
-        self.R = U @ np.diag([1, 1, np.sign(s[-1]) or 1.0]) @ Vt
-        S = self.R.T @ (self.y.T @ self.D)
-        # R changes by R [delta]x, where (tr S - S) delta is the axial vector of R^T dA
-        self._lever = np.trace(S) * np.eye(3) - 0.5 * (S + S.T)
-
-    def jvp(self, dy: np.ndarray, dD: np.ndarray) -> np.ndarray:
-        dA = dy.T @ self.D + self.y.T @ dD
-        return self.R @ cross_matrix(np.linalg.solve(self._lever, axial(self.R.T @ dA)))
-
-    def vjp(self, R_adj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of y and D."""
-        A_adj = self.R @ cross_matrix(np.linalg.solve(self._lever, axial(self.R.T @ R_adj)))
-        return self.D @ A_adj.T, self.y @ A_adj
+    return made(R, (A, turn, turn))
 
 
 class Displacement(Recording, Link):
@@ -66,10 +51,7 @@ class Displacement(Recording, Link):
         out = linear(x - X, self.of, self.of)
         for body in self.bodies:
             at, y, D = body.vertices, body.apart(x), body.apart(X)
-            near = Nearest(value_of(y), value_of(D))
-            by_y = y, lambda dy, near=near: near.jvp(dy, 0 * dy), lambda seed, near=near: near.vjp(seed)[0]
-            by_D = D, lambda dD, near=near: near.jvp(0 * dD, dD), lambda seed, near=near: near.vjp(seed)[1]
-            moved = x[at].mean(0) - X[at].mean(0) + D @ (made(near.R, by_y, by_D).T - np.eye(3))
+            moved = x[at].mean(0) - X[at].mean(0) + D @ (nearest_rotation(y.T @ D).T - np.eye(3))
             out = replaced(out, at, moved)
         return (out,)
 

@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import cross, value_of, with_slopes
+from diffsim_ti.differentiation.arrays import cross, summed_at, value_of, with_slopes
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.sets import components
 
@@ -112,9 +112,7 @@ class Enclosure:
 
     def _summed(self, by: np.ndarray, num_vertices: int) -> np.ndarray:
         """What triangles' corners have, weighted, at the vertices."""
-        by = (self.weights[:, None, None] * by).reshape(-1, 3) / -6
-        at = self.triangles.ravel()
-        return np.stack([np.bincount(at, by[:, d], num_vertices) for d in range(3)], 1)
+        return summed_at(self.triangles, self.weights[:, None, None] * by / -6, num_vertices)
 
     def gradient_jvp(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:
         """Change of `gradient` for that of x; as a function of dx symmetric, so its own adjoint."""

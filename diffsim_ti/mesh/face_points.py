@@ -4,19 +4,12 @@ from functools import lru_cache
 
 import numpy as np
 
+from diffsim_ti.common.rotations import skew
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.ten_nodes import QUARTERS
 
 STRAIGHT = 1e-5  # of its length: what an edge may be off that is straight, in files of single precision too
-
-
-def _crossing(v: np.ndarray) -> np.ndarray:
-    """The matrices of w -> v x w, shape (..., 3, 3)."""
-    out = np.zeros((*v.shape, 3))
-    for k in range(3):
-        out[..., (k + 2) % 3, (k + 1) % 3], out[..., (k + 1) % 3, (k + 2) % 3] = v[..., k], -v[..., k]
-    return out
 
 
 class LinearFaces:
@@ -34,7 +27,7 @@ class LinearFaces:
     def normals_by_nodes(self, x: np.ndarray) -> np.ndarray:
         """Derivative of each normal by the nodes of its face, shape (faces, points, nodes, 3, 3)."""
         corners = x[self.faces]
-        return _crossing(np.roll(corners, -2, 1) - np.roll(corners, -1, 1))[:, None] / 2
+        return skew(np.roll(corners, -2, 1) - np.roll(corners, -1, 1))[:, None] / 2
 
     def to_nodes(self, of_points: np.ndarray) -> np.ndarray:
         """Integrals of the shape functions times what points have (times their areas), shape (faces, nodes, ...)."""
@@ -63,7 +56,7 @@ class QuadraticFaces:
         return self._half(np.cross(*self._tangents(x)))
 
     def normals_by_nodes(self, x):
-        e, f = (_crossing(t * (reference_face.WEIGHTS / 2)[:, None])[:, :, None] for t in self._tangents(x))
+        e, f = (skew(t * (reference_face.WEIGHTS / 2)[:, None])[:, :, None] for t in self._tangents(x))
         by_s, by_t = self._by[None, ..., 0, None, None], self._by[None, ..., 1, None, None]
         return e * by_t - f * by_s
 

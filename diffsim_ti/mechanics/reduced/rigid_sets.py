@@ -19,7 +19,8 @@ their resultant, of directions the motion t + omega x y'.
 
 import numpy as np
 
-from diffsim_ti.inputs.rigid_start import Nearest, axial, cross_matrix, inertia
+from diffsim_ti.common.rotations import skew
+from diffsim_ti.inputs.rigid_start import axial, inertia, nearest_rotation
 from diffsim_ti.terms.reduced import Reduced, Together
 
 
@@ -30,7 +31,7 @@ def torque(y: np.ndarray, F: np.ndarray) -> np.ndarray:
 
 def crossed(omega: np.ndarray, y: np.ndarray) -> np.ndarray:
     """omega x y of each row."""
-    return y @ cross_matrix(omega).T
+    return y @ skew(omega).T
 
 
 class RigidSet:
@@ -45,7 +46,7 @@ class RigidSet:
         """The rigid displacement nearest to u, both of the set's vertices; what is only shifted stays to the bit."""
         if not np.ptp(u, 0).any():
             return u
-        R = Nearest(self._apart(u), self.D).R
+        R = nearest_rotation(self._apart(u).T @ self.D)
         return u.mean(0) + self.D @ (R.T - np.eye(3))
 
     def place(self, u: np.ndarray, end: np.ndarray) -> None:
@@ -82,9 +83,9 @@ class RigidSet:
         """What turning changes of resultants, less, for those turns, shape (3, 3)."""
         return 0.5 * (self.C + self.C.T) / self._size**2
 
-    def rotation(self) -> Nearest:
+    def rotation(self) -> np.ndarray:
         """From rest to the end of the pass."""
-        return Nearest(self.y_end, self.D)
+        return nearest_rotation(self.y_end.T @ self.D)
 
     def _apart(self, u: np.ndarray) -> np.ndarray:
         return self.D + (u - u.mean(0))
@@ -194,7 +195,7 @@ class RigidSets:
         def change(own, _):
             at = own.vertices
             dD = dX[at] - dX[at].mean(0)
-            return (1 - 1 / self.c0) * du[at] + dD @ (own.rotation().R.T - np.eye(3)) / self.c0
+            return (1 - 1 / self.c0) * du[at] + dD @ (own.rotation().T - np.eye(3)) / self.c0
 
         return self._each(held, change)
 
@@ -203,5 +204,5 @@ class RigidSets:
         for own in self.sets:
             at = own.vertices
             u_adj[at] += (1 - 1 / self.c0) * star_adj[at]
-            by_D = star_adj[at] @ (own.rotation().R - np.eye(3)) / self.c0
+            by_D = star_adj[at] @ (own.rotation() - np.eye(3)) / self.c0
             rest_adj[at] += by_D - by_D.mean(0)

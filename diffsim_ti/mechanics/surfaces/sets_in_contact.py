@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.differentiation.arrays import Recorded, reverse_of_all, value_of
-from diffsim_ti.inputs.rigid_start import cross_matrix
 from diffsim_ti.terms.reduced import Together
 
 TINY = 1e-150
@@ -148,8 +147,8 @@ class RigidInContact(SetInContact):
         M, (_, J) = m.sum(), self._arms(x0, x1, m)
         c1, p1 = m @ x1 / M, m @ v
         y, P, phi = x1 - c1, M * s, 0.5 * theta
-        S = cross_matrix(phi)
-        z = y @ (np.eye(3) + 2 / (1 + phi @ phi) * (S + S @ S)).T
+        turned = np.cross(phi, y)
+        z = y + 2 / (1 + phi @ phi) * (turned + np.cross(phi, turned))
         d = 0.5 * (m @ (x0 - x1)) / M - t  # from where it is to where P acts
         given = J @ sigma + twist + np.cross(d, P)
         spin = (m[:, None] * np.cross(y, v)).sum(0) + decay * given - np.cross(t, p1)

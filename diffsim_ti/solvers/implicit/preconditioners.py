@@ -155,7 +155,7 @@ class BodyBlocks(BlockJacobi):
 
     def _inverse_of(self, own, G: np.ndarray, contact: np.ndarray | None) -> np.ndarray:
         """Of a set that does not deform."""
-        R = own.rotation().R
+        R = own.rotation()
         G = np.einsum("ia,jakb,lb->jikl", R, G.reshape(2, 3, 2, 3), R).reshape(6, 6)
         G[3:, 3:] += own.stiffness_of_turns()
         return self._inverse_with(G, own.vertices, own.fields(), contact)
