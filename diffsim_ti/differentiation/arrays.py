@@ -6,6 +6,7 @@ Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.
 """
 
 from collections.abc import Callable, Iterable
+from heapq import heappop, heappush
 from itertools import count
 
 import numpy as np
@@ -164,6 +165,8 @@ def summed_at(places: np.ndarray, x, count: int):
 
     def add(x):
         shape = x.shape[places.ndim :]
+        if not shape:
+            return np.bincount(places.ravel(), x.ravel(), count)
         each = int(np.prod(shape))
         at = places.reshape(-1, 1) * each + np.arange(each)
         return np.bincount(at.ravel(), x.ravel(), count * each).reshape(count, *shape)
@@ -205,15 +208,22 @@ def reverse(y, seed, leaves: Iterable[Node]) -> list:
 
 def reverse_of_all(adjoints: Iterable[tuple], leaves: Iterable[Node]) -> list:
     """The same for (array, its adjoint) of several, which add up."""
-    known, own, ends = {}, set(), []
+    known, own, waiting = {}, set(), []
+
+    def take(node, more):
+        fresh = id(node) not in known
+        _add(known, own, node, more)
+        if fresh and id(node) in known:
+            heappush(waiting, (-node.number, node))
+
     for y, seed in adjoints:
         if isinstance(y, Node):
-            _add(known, own, y, np.asarray(seed, np.float64))
-            ends.append(y)
-    for node in reversed(_before(*ends)):
-        if id(node) in known:
-            for parent, _, pull in node.parents:
-                _add(known, own, parent, pull(known[id(node)]))
+            take(y, np.asarray(seed, np.float64))
+    while waiting:  # the last one first, which nothing that waits depends on
+        _, node = heappop(waiting)
+        seed = known[id(node)]
+        for parent, _, pull in node.parents:
+            take(parent, pull(seed))
     found = [(id(leaf) in own, known.get(id(leaf))) for leaf in leaves]
     return [x if x is None or fresh else np.array(x) for fresh, x in found]
 
@@ -244,9 +254,9 @@ def _fitted(x: np.ndarray, shape: tuple) -> np.ndarray:
     return np.broadcast_to(x.sum(axes, keepdims=True) if axes else x, shape)
 
 
-def _before(*ends) -> list[Node]:
-    """The nodes that some were made of, in their order, these among them."""
-    found, waiting = {}, [y for y in ends if isinstance(y, Node)]
+def _before(y) -> list[Node]:
+    """The nodes that y was made of, in their order, itself the last."""
+    found, waiting = {}, [y] if isinstance(y, Node) else []
     while waiting:
         node = waiting.pop()
         if id(node) not in found:

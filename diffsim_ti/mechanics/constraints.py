@@ -71,17 +71,19 @@ class ConstraintForce(HostForce):
     def _along(self, u) -> list:
         return [(c * u[at]).sum() for c, at in zip(self.c, self.vertices)]
 
-    def _spread(self, amounts, count: int) -> np.ndarray:
-        """Sums at vertices of amounts of the coefficients."""
-        parts = zip(amounts, self.c, self.vertices)
-        return sum((summed_at(at, amount * c, count) for amount, c, at in parts), np.zeros((count, 3)))
+    def _spread(self, amounts, shape) -> np.ndarray:
+        out = np.zeros(shape)
+        for amount, c, at in zip(amounts, self.c, self.vertices):
+            np.add.at(out, at, amount * c)
+        return out
 
     def forces(self, u):
         along = self._along(u)
         pushes = [-k * (x - value) for k, x, value in zip(self.given, along, self.value)]
         for law, k in zip(self.laws, self.held):  # in derivatives the target has the slope gamma
             pushes[k] = law.pressure(along[k]) + law.gamma * (self.value[k] - law.target)
-        return self._spread(pushes, len(u))
+        parts = np.concatenate([p * c for p, c in zip(pushes, self.c)])
+        return summed_at(np.concatenate(self.vertices), parts, len(u))
 
     def energies(self, u):
         along = self._along(u)
@@ -92,7 +94,7 @@ class ConstraintForce(HostForce):
         return out
 
     def product(self, u, w, convex=False):
-        return self._spread([k * x for k, x in zip(self.k, self._along(w))], len(u))
+        return self._spread([k * x for k, x in zip(self.k, self._along(w))], u.shape)
 
     def blocks(self, u):
         out = np.zeros((len(u), 3, 3))
@@ -118,7 +120,7 @@ class ConstraintForce(HostForce):
         return [along[k] for k in self.held]
 
     def gradients(self, u):
-        return [self._spread(np.arange(len(self.c)) == k, len(u)) for k in self.held]
+        return [self._spread(np.arange(len(self.c)) == k, u.shape) for k in self.held]
 
     def missing(self, u):
         along = self._along(u)

@@ -153,13 +153,6 @@ class Schedule(metaclass=Public):
         """Adjoint of `growth`."""
         add_between(*rows_adj[self.load_row(rows_adj, j)], share, adjoint)
 
-    def add_lines(self, rows_adj: np.ndarray, j: int, share: float, adjoint: tuple) -> None:
-        """Adjoint of `lines`."""
-        row, (tension, slack, stiffness) = rows_adj[self.load_row(rows_adj, j)], adjoint
-        for part, by in ((row[0::2], tension), (row[1::2], slack)):
-            add_between(part[:, 0], part[:, 1], share, by)
-        row[0::2, 2] += stiffness
-
     def _rows(self, rows, j):
         r = min(self.row(j), len(rows) - 1)
         return r, min(r + 1, len(rows) - 1)

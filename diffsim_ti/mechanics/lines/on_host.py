@@ -58,7 +58,7 @@ class LinesOnHost(HostForce):
         return summed_at(self.paths.path_of, of_segments, len(self.paths))
 
     def _state(self, u):
-        """(directions, d, lengths, L - L0, k as far as it pulls, T)"""
+        """(directions, d, T/|d|, of a spring without length k, lengths, L - L0, k as far as it pulls, T)"""
         records = isinstance(u, Node)
         if not records and self._seen is not None and np.array_equal(self._seen[0], u):
             return self._seen[1]
@@ -69,22 +69,20 @@ class LinesOnHost(HostForce):
         stretch = self._sums(ratio((moved * (self.D + d)).sum(1), both))
         e = stretch + self.s
         pulls = ~(self.one_sided & (e <= 0))
-        out = ratio(d, length[:, None]), d, length, stretch, self.k * pulls, tension(self.a, self.k, e * pulls)
+        T = tension(self.a, self.k, e * pulls)
+        q = np.where(value_of(length) > 0, ratio(T[self.paths.path_of], length), self.k[self.paths.path_of])
+        out = ratio(d, length[:, None]), d, q, length, stretch, self.k * pulls, T
         self._seen = None if records else (np.array(u), out)
         return out
 
-    def _per_length(self, length, T):
-        """T/|d| of each segment; of a spring without length k."""
-        T, k = (x[self.paths.path_of] for x in (T, self.k))
-        return np.where(value_of(length) > 0, ratio(T, length), k)
-
-    def _across(self, t, length, T, x):
-        """T/|d| of what of x lies across segments."""
-        return across(self._per_length(length, T)[:, None], t, (t * x).sum(1)[:, None], x)
+    @staticmethod
+    def _across(t, q, x):
+        """q = T/|d| of what of x lies across segments."""
+        return across(q[:, None], t, (t * x).sum(1)[:, None], x)
 
     def lengths(self, u: np.ndarray) -> np.ndarray:
         """Length of each path [m]."""
-        return self._sums(self._state(u)[2])
+        return self._sums(self._state(u)[3])
 
     def tensions(self, u: np.ndarray) -> np.ndarray:
         """T of each [N]."""
@@ -104,8 +102,8 @@ class LinesOnHost(HostForce):
         return float(self.energies(u)[self.cables].sum())
 
     def forces(self, u):
-        _, d, length, *_, T = self._state(u)
-        return -times(self.together, self._per_length(length, T)[:, None] * d)
+        _, d, q, *_ = self._state(u)
+        return -times(self.together, q[:, None] * d)
 
     def loads(self, u):
         """Of cables."""
@@ -118,18 +116,18 @@ class LinesOnHost(HostForce):
 
     def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
         """d2E/du2 w [N]; convex: without what pushes, which has negative curvature."""
-        t, _, length, _, k, T = self._state(u)
+        t, _, q, *_, k, _ = self._state(u)
         dd = self.parted @ w
         along = (k * self._sums((t * dd).sum(1)))[self.paths.path_of]
-        across = self._across(t, length, np.maximum(T, 0) if convex else T, dd)
+        across = self._across(t, np.maximum(q, 0) if convex else q, dd)
         return self.together @ (along[:, None] * t + across)
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
-        t, _, length, _, k, T = self._state(u)
+        t, _, q, *_, k, _ = self._state(u)
         g, out = self._along_paths(t), np.zeros((self.num_vertices, 3, 3))
         np.add.at(out, self._pair_vertex, k[self._pair_path, None, None] * g[:, :, None] * g[:, None, :])
-        across = self._stiffness_across(t, length, T)
+        across = self._stiffness_across(t, q)
         return out + (self._squared @ across.reshape(-1, 9)).reshape(-1, 3, 3)
 
     def _along_paths(self, t) -> np.ndarray:
@@ -137,21 +135,21 @@ class LinesOnHost(HostForce):
         row, data = self._entries
         return np.stack([np.bincount(self._pair, data * t[row, d], len(self._pair_path)) for d in range(3)], 1)
 
-    def _stiffness_across(self, t, length, T) -> np.ndarray:
+    def _stiffness_across(self, t, q) -> np.ndarray:
         """`_across` as a matrix of each segment, shape (segments, 3, 3)."""
-        return np.stack([self._across(t, length, T, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
+        return np.stack([self._across(t, q, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
 
     def turning(self, u: np.ndarray, w: np.ndarray) -> float:
         """The largest |C w| / |d| of segments that have a length."""
-        length, moved = self._state(u)[2], np.linalg.norm(self.parted @ w, axis=1)
+        length, moved = self._state(u)[3], np.linalg.norm(self.parted @ w, axis=1)
         return float(np.divide(moved, length, out=np.zeros_like(moved), where=length > 0).max(initial=0.0))
 
     def matrix(self, u: np.ndarray):
         """d2E/du2 [N/m] as a SciPy sparse matrix, rows 3 i + d: C^T (k t t^T along each path + what lies across) C."""
         from scipy.sparse import block_diag, csr_matrix, diags, identity, kron
 
-        t, _, length, _, k, T = self._state(u)
-        across = self._stiffness_across(t, length, T)
+        t, _, q, *_, k, _ = self._state(u)
+        across = self._stiffness_across(t, q)
         C = kron(self.parted, identity(3), "csr")
         places = np.repeat(self.paths.path_of, 3), np.arange(t.size)
         g = csr_matrix((t.ravel(), places), shape=(len(self.paths), t.size)) @ C  # dL/du of each path
@@ -159,14 +157,12 @@ class LinesOnHost(HostForce):
 
     def row_sums(self, u: np.ndarray) -> np.ndarray:
         """A bound of the sums of |d2E/du2| over the block row of each vertex [N/m]."""
-        t, _, length, _, k, T = self._state(u)
+        t, _, q, *_, k, _ = self._state(u)
         size = np.linalg.norm(self._along_paths(t), axis=1)
         whole = np.bincount(self._pair_path, size, len(self.paths))
         out = np.bincount(self._pair_vertex, (k * whole)[self._pair_path] * size, self.num_vertices)
-        T, k = T[self.paths.path_of], self.k[self.paths.path_of]
-        q = np.abs(np.divide(T, length, out=np.array(k), where=length > 0))
         C = abs(self.parted)
-        return out + C.T @ (q * np.asarray(C.sum(1)).ravel())
+        return out + C.T @ (np.abs(q) * np.asarray(C.sum(1)).ravel())
 
     def resisted(self):
         """Along paths that are elastic and not slack as the run begins, or whose length is given over time."""
