@@ -13,7 +13,7 @@ import numpy as np
 
 from diffsim_ti.common import rotations
 from diffsim_ti.common.checked import shown
-from diffsim_ti.differentiation.arrays import made, summed_at, value_of
+from diffsim_ti.differentiation.arrays import summed_at, value_of
 from diffsim_ti.inputs.chain import Link, Recording
 
 COLUMNS = 3  # of a pose: translation, R as modified Rodrigues parameters, phi
@@ -63,21 +63,13 @@ def between(name: str, rows: np.ndarray) -> np.ndarray:
     return out + FULL_TURN * turns[:, None] * n
 
 
-def theta_of(rows: np.ndarray, drows: np.ndarray) -> np.ndarray:
-    """Changes theta of the rotations for changes of the rows."""
+def theta_of(rows: np.ndarray) -> np.ndarray:
+    """Zero, whose change is theta of the rotations for a change of the rows, which record."""
+    given = value_of(rows)[:, 3:]
+    change = rows[:, 3:] - given
     if rows.shape[1] == 6:
-        return np.einsum("kij,kj->ki", rotations.left_jacobian(rows[:, 3:]), drows[:, 3:])
-    q = rows[:, 3:]
-    return 2 * rotations.product(drows[:, 3:], rotations.conjugate(q))[:, 1:] / (q**2).sum(1, keepdims=True)
-
-
-def theta_vjp(rows: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Adjoints of the rows' rotations for those of theta."""
-    if rows.shape[1] == 6:
-        return np.einsum("kji,kj->ki", rotations.left_jacobian(rows[:, 3:]), theta)
-    q = rows[:, 3:]
-    pure = np.concatenate([np.zeros((len(q), 1)), theta], 1)
-    return 2 * rotations.product(pure, q) / (q**2).sum(1, keepdims=True)
+        return np.einsum("kij,kj->ki", rotations.left_jacobian(given), change)
+    return 2 * rotations.product(change, rotations.conjugate(given))[:, 1:] / (given**2).sum(1, keepdims=True)
 
 
 class PoseColumns(Recording, Link):
@@ -113,21 +105,11 @@ class PoseColumns(Recording, Link):
             raise ValueError(
                 f"{name}: turns by {most:.4g} rad in one step, which must be less than a full turn; take shorter steps"
             )
-
-        def push(drows):
-            theta, dphi = theta_of(given, drows), np.zeros_like(phi)
-            change = theta[1:] - rotations.turned(rotations.quaternion(phi[:-1]), theta[:-1])
-            dphi[:-1] = np.einsum("kij,kj->ki", rotations.inverse_jacobian(phi[:-1]), change)
-            return np.stack([drows[:, :3], theta, dphi], 1)
-
-        def pull(own):
-            theta = own[:, 1].copy()
-            change = np.einsum("kji,kj->ki", rotations.inverse_jacobian(phi[:-1]), own[:-1, 2])
-            theta[1:] += change
-            theta[:-1] -= rotations.turned(rotations.conjugate(rotations.quaternion(phi[:-1])), change)
-            return np.concatenate([own[:, 0], theta_vjp(given, theta)], 1)
-
-        return made(np.stack([given[:, :3], rotations.rodrigues(quaternions(given)), phi], 1), (rows, push, pull))
+        theta = theta_of(rows)
+        change = theta[1:] - rotations.turned(rotations.quaternion(phi[:-1]), theta[:-1])
+        dphi = np.einsum("kij,kj->ki", rotations.inverse_jacobian(phi[:-1]), change)
+        phi = phi + np.concatenate([dphi, np.zeros((1, 3))])
+        return np.stack([rows[:, :3], rotations.rodrigues(quaternions(given)) + theta, phi], 1)
 
 
 @dataclass(frozen=True)
@@ -166,16 +148,5 @@ class PosedMotion(Recording, Link):
 
 def _turned(rows: np.ndarray, arm: np.ndarray) -> np.ndarray:
     """R arm by the rotation of each row, shape (rows, k, 3)."""
-    given, q = value_of(rows), quaternions(value_of(rows))[:, None]
-    out = rotations.turned(q, value_of(arm))
-
-    def pull(seed):
-        return np.concatenate([np.zeros((len(given), 3)), theta_vjp(given, np.cross(out, seed).sum(1))], 1)
-
-    by_rows = rows, lambda drows: np.cross(theta_of(given, drows)[:, None], out), pull
-    by_arm = (
-        arm,
-        lambda change: rotations.turned(q, change),
-        lambda seed: rotations.turned(rotations.conjugate(q), seed),
-    )
-    return made(out, by_rows, by_arm)
+    out = rotations.turned(quaternions(value_of(rows))[:, None], arm)
+    return out + np.cross(theta_of(rows)[:, None], value_of(out))

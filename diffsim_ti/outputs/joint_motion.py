@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from diffsim_ti.common import rotations
-from diffsim_ti.differentiation.arrays import made, value_of, with_slopes
+from diffsim_ti.differentiation.arrays import value_of, with_slopes
 from diffsim_ti.mechanics.joints.twists import moved
 from diffsim_ti.mechanics.robots import Robots
 from diffsim_ti.outputs.output import Frames, Output, derived
@@ -92,8 +92,8 @@ class LinkMotion(JointPositions):
         return num_frames, 13
 
     def _stand(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
-        """(quaternion, position of the origin, velocities of origin and spin by joints, joint velocities, changes of these
-        velocities by joint positions)"""
+        """(quaternion, position of the origin, velocities of origin and spin by joints, how these change by joint
+        positions)"""
         frames, S = self.model.kinematics(q)
         joint, place = self.model.links[self.link]
         turn, t = joined(frames[joint], place) if joint >= 0 else place
@@ -102,24 +102,17 @@ class LinkMotion(JointPositions):
         turns = bracket(S[:, None], S[None]) * self.model.above[..., None]
         way = turns[..., :3] + np.cross(turns[..., 3:], t) + np.cross(S[None, :, 3:], J[:, None, :3])
         bent = np.einsum("bad,a->bd", np.concatenate([way, turns[..., 3:]], 2), v)
-        return turn if turn[0] >= 0 else -turn, t, J, v, bent
+        return turn if turn[0] >= 0 else -turn, t, J, bent
 
     def value(self, frames: Frames) -> np.ndarray:
         return np.stack([self._motion(states[self.own, :2]) for states in frames.joint_states])
 
     def _motion(self, states: np.ndarray) -> np.ndarray:
-        turn, t, J, v, bent = self._stand(*value_of(states).T)
-
-        def push(change):
-            dq, dv = change.T
-            dturn = 0.5 * rotations.product(np.append(0.0, dq @ J[:, 3:]), turn)
-            return np.concatenate([dq @ J[:, :3], dturn, dv @ J + dq @ bent])
-
-        def pull(w):
-            by_turn = 0.5 * rotations.product(w[3:7], rotations.conjugate(turn))[1:]
-            return np.stack([J @ np.append(w[:3], by_turn) + bent @ w[7:], J @ w[7:]], 1)
-
-        return made(np.concatenate([t, turn, v @ J]), (states, push, pull))
+        turn, t, J, bent = self._stand(*value_of(states).T)
+        q, v = states[:, 0], states[:, 1]
+        dq = q - value_of(q)  # zero, whose change is that of q
+        spin = np.concatenate([np.zeros(1), dq @ J[:, 3:]])
+        return np.concatenate([t + dq @ J[:, :3], turn + 0.5 * rotations.product(spin, turn), v @ J + dq @ bent])
 
 
 class LinkEnergy(JointPositions):
