@@ -78,11 +78,12 @@ class HostForce:
     def recorded(self, u: np.ndarray, numbers: bool, what: str = "forces") -> tuple:
         """(its forces, or another function of displacements; displacements, velocities and, where its numbers are to record,
         what kernels read), all of which record."""
-        at, v, of, own = Recorded(u), Recorded(self.velocities(u)), DerivedNode(self.values), copy(self)
-        if numbers:
-            own.take(of, self.instant)
+        at, v, own = Recorded(u), Recorded(self.velocities(u)), copy(self)
+        of = [DerivedNode(self.values)] if numbers else []
+        for values in of:
+            own.take(values, self.instant)
         own.velocities = lambda _: v
-        return getattr(own, what)(at), at, v, *([of] if numbers else [])
+        return getattr(own, what)(at), at, v, *of
 
     def jvp(self, u: np.ndarray, du: np.ndarray, dv: np.ndarray | None = None, moved=None, what="forces") -> np.ndarray:
         """Change of the forces, or of another function, for changes of displacements, velocities and, if `moved` tells

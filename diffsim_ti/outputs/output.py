@@ -141,10 +141,12 @@ class _Recording:
         self.numbers = Node(frames.inputs, (), dict)
 
     def __getattr__(self, name: str):
-        x = getattr(self.frames, name)
-        if name not in STATES or x is None:
-            return x
-        return self.leaves.setdefault(name, Recorded(np.asarray(x, np.float64)))
+        x = self.leaves.get(name)
+        if x is None:
+            x = getattr(self.frames, name)
+            if name in STATES and x is not None:
+                x = self.leaves[name] = Recorded(np.asarray(x, np.float64))
+        return x
 
     def __getitem__(self, name: str):
         return getattr(self, name) if name in ("positions", "velocities", "displacements") else self.outputs
