@@ -6,16 +6,6 @@ from diffsim_ti.inputs.description import NOT_NEGATIVE, POSITIVE, Input, InputVa
 from diffsim_ti.inputs.inputs import Derived, DerivedNode, Inputs
 from diffsim_ti.inputs.rest_shape import StressPoints, ratios_at_corners
 
-__all__ = [
-    "Chain",
-    "ConsistentMass",
-    "Derived",
-    "DerivedNode",
-    "RunSize",
-    "Input",
-    "InputValue",
-    "Inputs",
-    "Link",
-    "Mass",
-]
+__all__ = ["Chain", "ConsistentMass", "Derived", "RunSize", "Input", "InputValue", "Inputs", "Link", "Mass"]
 __all__ += ["NOT_NEGATIVE", "POSITIVE", "Range", "StressPoints", "diagonal_of", "kinetic_energy", "ratios_at_corners"]
+__all__ += ["DerivedNode"]
