@@ -208,6 +208,7 @@ def test_adjoints_of_joints_are_cut_clipped_and_reported(wheel, kind):
 @pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.BDF2Solver])
 def test_links_stand_where_they_are_when_a_run_goes_on(kind):
     """A body falls to where a link, and a ball on a path, were when it began."""
+    from diffsim_ti.writers import Frame
     from diffsim_ti.writers.adaptive_run import ForwardRun
 
     text = urdf(
@@ -228,6 +229,10 @@ def test_links_stand_where_they_are_when_a_run_goes_on(kind):
     for one in (first, second):
         one.step()
     np.testing.assert_array_equal(first.positions, second.positions)
+    drawn = Frame.of(first).obstacles[0]  # the link, as pictures and files have it
+    assert np.ptp(drawn, 0).max() < 0.05 and drawn.mean(0)[0] == pytest.approx(
+        0.03 + first.joint_states[0, 0], abs=1e-4
+    )
     with pytest.raises(ValueError, match=r"joint_states: expected finite numbers, float64 of shape \(1, 5\)"):
         second.resume(kept | dict(joint_states=np.zeros((3, 3))))
     run = ForwardRun(scene, kind, 0.04, dt=1e-2)
@@ -556,6 +561,15 @@ def test_a_cart_and_the_body_that_it_holds_keep_their_momentum():
     momentum = frames.velocities[:, :, 0] @ m + 0.2 * frames["joint_velocities"][:, 0]
     assert frames["joint_velocities"][-1, 0] > 0.1
     np.testing.assert_allclose(momentum, 500 * 0.06**3, rtol=1e-13)
+
+
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_an_arm_at_rest_stays(kind):
+    """Only rounding of the places of the vertices that it holds is left to balance."""
+    arm = ds.Robot.from_urdf(ARM, attached=dict(tip="xmin"), links=())
+    simulator = ds.Simulator(kind(scene_of(arm), dt=5e-3))
+    simulator.run(3)
+    assert np.abs(simulator.velocities).max() < 1e-12
 
 
 def test_equilibria_of_joints_are_those_of_their_springs_weights_and_limits():
