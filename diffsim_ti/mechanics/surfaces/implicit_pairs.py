@@ -109,16 +109,18 @@ class ImplicitPairs(SurfacePairs):
             return most
         runtime.fill(self.step, step[None])
         share, self.blocked, holds = 0.0, None, self._holds(u + most * step)
-        placed, holds = placed and holds, holds and (placed or self._holds(u))
-        self._holds_on_way = holds
-        if placed:
-            runtime.fill(self.next, u[None])
+        here = self._holds(u)
+        self._holds_on_way = holds = holds and here
+        placed = placed and here
         for _ in range(self.longest_march):
             unlisted = np.inf
             if not holds:
-                runtime.fill(self.next, (u + share * step)[None])
-                self.build(self.next, 0, wanted=(most - share) * travel)
+                if not here:
+                    runtime.fill(self.next, (u + share * step)[None])
+                    self.build(self.next, 0, wanted=(most - share) * travel)
+                gone = runtime.fetch_row(self.next, 0)[self.mesh.surface_vertices] - runtime.fetch(self.built)
                 reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
+                reach, here = reach - self.travel(gone), False
                 unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
             if not placed:
                 self.forces(self.next, 0, self.a.corner, exact=True)
