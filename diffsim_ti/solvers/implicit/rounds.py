@@ -301,8 +301,8 @@ class Rounds:
         if self.several:
             return self.newton.leave(self, odd)
         newton, state = self.newton, self.state[0]
-        # between surfaces the Hessian is taken for indefinite again where the step before was cut short
-        newton.indefinite &= bool(self.potential.pairs) and bool(state[nk.FRACTION] < 1)
+        # taken for indefinite again where surfaces have cut the step before short
+        newton.indefinite &= bool(self.potential.pairs) and bool(state[nk.LONGEST] < 1)
         R, forcing = runtime.fetch(self.R).astype(np.float64), float(np.sqrt(state[LEAST]))
         direction, R = newton.step(self._here(), R, forcing)
         early = len(newton.report.residuals) + state[nk.ROUND] <= newton.by_work
