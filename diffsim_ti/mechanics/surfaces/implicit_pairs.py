@@ -126,7 +126,7 @@ class ImplicitPairs(SurfacePairs):
                 self.forces(self.next, 0, self.a.corner, exact=True)
             shares, placed, here = self._shares(most - share), False, False
             listed = shares.min(initial=np.inf)
-            if old and not listed < unlisted:  # then a new one may reach farther
+            if old and not listed < unlisted:  # else a new one, whose slacks are no shorter, would say the same
                 continue
             share += min(listed, unlisted)
             if share >= most:
