@@ -11,6 +11,7 @@ from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
+from diffsim_ti.diff_simulator import TorchSimulator
 from diffsim_ti.mechanics.surfaces import curved_pairs
 from diffsim_ti.mechanics.surfaces.curved_pairs import CurvedPairs
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs
@@ -73,27 +74,53 @@ def test_what_acts_at_nodes_alone_is_said():
         scene_of(ball(2), ds.Sphere((0, -1, 0), 0.5, stiffness=1.0, width=1e-4))
 
 
+def bar_under_a_plate(height=0.06, width=2e-3, **options) -> ds.Scene:
+    """A bar that is straight in the mesh is bent to an arch; without a height its weight, which is upwards, bends it."""
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (0.4, 0.02, 0.1)).quadratic()
+    x = mesh.vertices.copy()
+    x[:, 1] += height * np.sin(np.pi * x[:, 0] / 0.4)
+    plate = ds.HalfSpace((0, x[:, 1].max() + 0.5 * width, 0), (0, -1, 0), width=width, stiffness_per_area=1e7)
+    terms = [plate]
+    if not height:
+        terms = [ds.HalfSpace((0, 0.04, 0), (0, -1, 0), width=width, stiffness_per_area=1e5), ds.Gravity((0, 40, 0))]
+    return scene_of(mesh, *terms, initial_positions=x, fixed=["xmin", "xmax"])
+
+
+BENT = r"faces .* have bent by .* m towards HalfSpace.*acts at their nodes alone: .* a width of (\S+) m"
+
+
+def solved_by(solver, scene):
+    return solver(scene, dt=2e-5 if solver.explicit else 1e-3)
+
+
 @pytest.mark.parametrize("solver", [EXPLICIT, IMPLICIT])
 def test_a_run_says_where_faces_bend_farther_than_nodes_tell(solver):
-    """A bar that is straight in the mesh is bent to an arch under a plate: once, and not where it is as wide as it advises,
-    or where faces bend away from it."""
+    """Once, and not where it is as wide as it advises, or where faces bend away from it."""
 
     def run(height, width):
-        mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (0.4, 0.02, 0.1)).quadratic()
-        x = mesh.vertices.copy()
-        x[:, 1] += height * np.sin(np.pi * x[:, 0] / 0.4)
-        plate = ds.HalfSpace((0, x[:, 1].max() + 0.5 * width, 0), (0, -1, 0), width=width, stiffness_per_area=1e7)
-        scene = scene_of(mesh, plate, initial_positions=x, fixed=["xmin", "xmax"])
-        ds.Simulator(solver(scene, dt=2e-5 if solver.explicit else 1e-3)).run(3)
+        ds.Simulator(solved_by(solver, bar_under_a_plate(height, width))).run(3)
 
-    match = r"faces .* have bent by .* m towards HalfSpace.*acts at their nodes alone: .* a width of (\S+) m"
-    with pytest.warns(UserWarning, match=match) as said:
+    with pytest.warns(UserWarning, match=BENT) as said:
         run(0.06, 2e-3)
     assert len(said) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run(0.06, float(re.search(match, str(said[0].message))[1]))
+        run(0.06, float(re.search(BENT, str(said[0].message))[1]))
         run(-0.06, 2e-3)
+
+
+def test_rollouts_equilibria_batches_and_torch_say_it_too():
+    for solver in (EXPLICIT, ds.SemiImplicitSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver):
+        rollout = ds.Rollout(solved_by(solver, bar_under_a_plate()), 3, gradients=[])
+        with pytest.warns(UserWarning, match=BENT):
+            rollout.forward()
+    with pytest.warns(UserWarning, match=BENT):
+        ds.rollout_frames(ds.Rollout(ds.StaticSolver(bar_under_a_plate(0)), 1, gradients=[]))
+    with pytest.warns(UserWarning, match=BENT):
+        TorchSimulator(solved_by(EXPLICIT, bar_under_a_plate())).step()
+    batch = ds.Batch(solved_by(EXPLICIT, bar_under_a_plate()), 3, 2, gradients=[])
+    with pytest.warns(UserWarning, match="have bent by .* m where obstacles act at their nodes alone: .* a width of"):
+        batch.forward()
 
 
 # ---- surfaces that meet each other -----------------------------------------------------------------------------------

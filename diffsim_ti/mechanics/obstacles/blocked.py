@@ -35,7 +35,8 @@ class Blocked(NotConverged):
         if met is None or met.obstacle >= len(ws.collisions.detection.terms):
             return error
         term, gap = ws.collisions.detection.terms[met.obstacle], ws.collisions.gap_of(met, u)
-        width, stiffness = ws.collisions.width_of(met.obstacle), ws.arrays.stiffness_of(met.obstacle, met.vertices)
+        width = ws.collisions.detection.widths[met.obstacle]
+        stiffness = ws.arrays.stiffness_of(met.obstacle, met.vertices)
         if gap > cls.near * width:
             return error
         R = ws.newton.residual_at(u)[list(met.vertices)]

@@ -139,7 +139,3 @@ class ObstacleCollisions:
         """Distance [m] of what stands before an obstacle."""
         near = self.detection.nearest(u, self.rows[::3], self.detection.widest)
         return near.value if near is not None else self.detection.widest
-
-    def width_of(self, obstacle: int) -> float:
-        """The width [m] of an obstacle's barrier, as loaded."""
-        return self.detection.widths[obstacle]

@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from diffsim_ti import runtime
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 
@@ -54,7 +55,8 @@ class CurvedLaggedFriction:
         C, obstacles = self.C, self.pairs.obstacles
         changes = [C @ du, C @ dx, C @ du_begin]
         if obstacles:
-            given = obstacles.changes(self.pairs.parameters_of(numbers), poses_dot)
+            change = runtime.fetch(numbers.parameters)[: len(obstacles.parameters)].astype(np.float64)
+            given = obstacles.changes(change, poses_dot)
             for change, corners in zip(changes, (given[0], given[0] - given[2] / self.inner.per_gamma, given[1])):
                 change[self.pairs.finer.mesh.first :] = corners
         return C.T @ self.inner.jvp(self._fine(u), *changes, self.pairs.fine_numbers(numbers), only=only)

@@ -222,10 +222,6 @@ class CurvedPairs:
         runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(numbers.rest).astype(np.float64))
         return SimpleNamespace(rest=self._rest_dot, parameters=numbers.parameters)
 
-    def parameters_of(self, numbers) -> np.ndarray:
-        """Changes of all parameters, of a Tangent."""
-        return runtime.fetch(numbers.parameters)[: len(self.a.values.parameters)].astype(np.float64)
-
     def _gathering(self, out) -> tuple:
         records = dict(rows=self.to_corners, at=SimpleNamespace(source=self.finer.corner, target=out))
         return self.kernels.gather, records, dict(count=self.num_corners, first=self.a.first_contact_corner)

@@ -103,27 +103,31 @@ class ImplicitPairs(SurfacePairs):
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, placed: bool = False) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
         largest such share only where they are about to meet. Marches along the step, with a new list at each halt,
-        unless the present one holds on all of it. placed: `place` was last at u."""
+        unless the present one holds on all of it, or up to where two of it meet. placed: `place` was last at u."""
         travel = self.travel(step[self.mesh.surface_vertices])
         if not travel.any():
             return most
         runtime.fill(self.step, step[None])
         share, self.blocked, holds = 0.0, None, self._holds(u + most * step)
-        placed, holds = placed and holds, holds and (placed or self._holds(u))
-        self._holds_on_way = holds
-        if placed:
-            runtime.fill(self.next, u[None])
+        here = self._holds(u)
+        self._holds_on_way = holds = holds and here
+        placed = placed and holds
         for _ in range(self.longest_march):
-            unlisted = np.inf
+            unlisted, old = np.inf, here and not holds
             if not holds:
-                runtime.fill(self.next, (u + share * step)[None])
-                self.build(self.next, 0, wanted=(most - share) * travel)
+                if not old:
+                    runtime.fill(self.next, (u + share * step)[None])
+                    self.build(self.next, 0, wanted=(most - share) * travel)
+                gone = runtime.fetch_row(self.next, 0)[self.mesh.surface_vertices] - runtime.fetch(self.built)
                 reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.least_width
+                reach -= self.travel(gone)
                 unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
             if not placed:
                 self.forces(self.next, 0, self.a.corner, exact=True)
-            shares, placed = self._shares(most - share), False
+            shares, placed, here = self._shares(most - share), False, False
             listed = shares.min(initial=np.inf)
+            if old and not listed < unlisted:  # else a new one, whose slacks are no shorter, would say the same
+                continue
             share += min(listed, unlisted)
             if share >= most:
                 return most

@@ -44,10 +44,6 @@ class LaggedFriction:
         self._product, self._is_put = FrictionProduct(pairs), False
         self._bounded = False  # of each pair whether its stiffness is that of `bounded`
 
-    def make_room(self) -> None:
-        """Arrays of a new list."""
-        self.take("weights", "pressing")
-
     def take(self, *names: str, scalar: bool = False) -> None:
         """Arrays of all pairs of the list, by name."""
         for name in names:

@@ -96,13 +96,9 @@ class MotionKernels(ListedPair):
         return most
 
     @ti.func
-    def clear_flags(self, scene: A):
+    def hold_all(self, scene: A, at: A, plan: A):
         for k in ti.static(range(3)):
             scene.flags[k] = 0
-
-    @ti.func
-    def hold_all(self, scene: A, at: A, plan: A):
-        self.clear_flags(scene)
         self.follow_frames(scene, at, plan)
         self.compare_slacks(scene, at, plan)
 

@@ -195,7 +195,7 @@ class SurfacePairs:
         self.energy, self.numbers = take("energies", fp, count), take("numbers", vector, count)
         self.rest_plane, self.rest_weights = take("planes at rest", vector, count), take("weights", vector, count)
         if self.friction:
-            self.friction.make_room()
+            self.friction.take("weights", "pressing")
         self.run(self.motion.begin, dict(u=u), slot=slot)
         self.fresh, self.age = True, 0
         self.builds += 1

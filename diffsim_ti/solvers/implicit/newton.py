@@ -115,7 +115,7 @@ class Newton:
         """
         self.report = report = NewtonReport()
         self.reports.append(report)
-        self.turning = False  # pairs whose friction a direction has turned round
+        self.turning = self.indefinite = False  # pairs whose friction a direction has turned round
         self.pose((mass, inertial, loads))
         u = self.potential.place(start)
         if self.volumes:
@@ -265,9 +265,11 @@ class Newton:
             d, *_ = gmres(A, R, self.preconditioner, forcing, limit)
             self.report.products += A.products
             return self.rigid.motion(d)
-        d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
-        self.indefinite = negative is not None
-        if negative is not None:
+        count, negative = 0, self.indefinite
+        if not self.indefinite:
+            d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+            self.indefinite = negative is not None
+        if self.indefinite:
             self.report.indefinite += 1
             if count <= self.trusted and not A.saddle_is_known:
                 for slight in self.slight:

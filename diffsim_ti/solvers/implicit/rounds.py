@@ -204,7 +204,8 @@ class Rounds:
         """Products of a linear solve on the device; none where the host solves."""
         own, static = self.preconditioner, not diagonal_of(self.newton.mass).any()
         slow = own.given_up or static and own.spent > 2 * own.patience
-        return 0 if self.solves_on_host or slow else min(10 * self.cg.nodes // self.cg.systems, own.patience)
+        by_host = self.solves_on_host or slow or (self.newton.indefinite and self.potential.pairs)
+        return 0 if by_host else min(10 * self.cg.nodes // self.cg.systems, own.patience)
 
     def _send(self) -> None:
         runtime.fill(self.cg.state, self.state)
@@ -300,6 +301,8 @@ class Rounds:
         if self.several:
             return self.newton.leave(self, odd)
         newton, state = self.newton, self.state[0]
+        # taken for indefinite again where surfaces have cut the step before short
+        newton.indefinite &= bool(self.potential.pairs) and bool(state[nk.LONGEST] < 1)
         R, forcing = runtime.fetch(self.R).astype(np.float64), float(np.sqrt(state[LEAST]))
         direction, R = newton.step(self._here(), R, forcing)
         early = len(newton.report.residuals) + state[nk.ROUND] <= newton.by_work
