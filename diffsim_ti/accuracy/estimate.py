@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 CANCELS = 2.5  # times the estimate: where as much would be there if nothing cancelled, it is small by chance
 COARSE = 0.25  # of the number's change: errors are mostly estimated too small where they are larger
 SMALL = 1e-6  # of the number's change: what is less is left over by solvers
-# what estimates miss, as shares of them and of what would be there if nothing cancelled: bars then held the error in 95 % of
-# random problems (examples/benchmarks/random_error_bars.py)
+# what estimates miss, as shares of them and of what would be there if nothing cancelled, as random problems say
+# (examples/benchmarks/random_error_bars.py)
 MISSED, CANCELLED = 1 / 2, 1 / 6
 FEW, MOST = 0.05, 0.5  # where so few elements have so much of the error, something is singular there
 PER_VERTEX = ("positions", "velocities", "displacements")  # outputs that count vertices, of which a finer mesh has more
@@ -73,7 +73,7 @@ class Accuracy(metaclass=Public):
     def bar(self) -> float:
         """How far the truth may be from the value: 1.5 (|mesh| + |step|) + |solver| + |rounding|, and a sixth of the sum of
         `uncancelled`. Where nothing cancels that is (|mesh| + |step|) / 0.6. It is no bound: of random problems on coarse
-        meshes it held the error in 95 % (examples/benchmarks/random_error_bars.py)."""
+        meshes it held the error in 93 % (examples/benchmarks/random_error_bars.py)."""
         apart, rest = abs(self.mesh) + abs(self.step), abs(self.solver) + abs(self.rounding)
         return (1 + MISSED) * apart + CANCELLED * sum(self.uncancelled.values()) + rest
 
