@@ -129,7 +129,7 @@ def free_directions(scene: Scene):
     if any(term.is_exact for term in scene.terms_of(MultiPointConstraint)):
         raise ValueError(
             "modes and load_path do not support a MultiPointConstraint that is held exactly: give it a stiffness= of a "
-            "million times E times the body's size"
+            "thousand times E times the body's size"
         )
     held = np.zeros((scene.mesh.num_vertices, 3, 3))
     held[scene.held] = scene.supports.held

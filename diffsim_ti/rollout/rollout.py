@@ -341,9 +341,9 @@ class Rollout(metaclass=Public):
 
         Implicit passes of the finer mesh are solved from the run's states on, explicit steps are run anew. Forces that are
         out of balance where these are put on it, times the adjoint of the number, are the error to first order, and say the
-        share of each tetrahedron. Where shares cancel the bar is wider; `Accuracy.notes` say so, and what else makes the
-        estimate unsure. Shares of explicit steps, of robots and of what is held exactly are by volume alone. Steps of half
-        the length say what steps cost.
+        share of each tetrahedron. Shares of explicit steps, of robots and of what is held exactly are by volume alone.
+        Where the error is small beside those of other components and frames the bar is wider; `Accuracy.doubts` say so, and
+        what else makes the estimate unsure. Steps of half the length say what steps cost.
         Raises ValueError for what a finer mesh cannot have, FloatingPointError where it finds no state.
         Becker, Rannacher 2001, doi:10.1017/S0962492901000010.
 

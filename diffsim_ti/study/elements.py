@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.accuracy.estimate import CANCEL
+from diffsim_ti.accuracy.estimate import COARSE
 from diffsim_ti.accuracy.finer import HELD, is_named, on_finer, on_ten_nodes
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.grid import PATTERNS, box
@@ -190,9 +190,9 @@ class ElementTrials:
                     while not abs(bar.step) <= STEP * bar.size and substeps < MOST_SUBSTEPS:
                         substeps *= 2
                         bar = self.quantity.accuracy(self._implicit(made, substeps))
-                    error, counted = abs(bar.mesh) / bar.size, CANCEL.format("mesh")  # by the finer mesh itself
-                    doubts = [note for note in bar.notes if not note.startswith(counted)]
-                    doubts = doubts if error < 0.5 else ()  # others are out of the question anyway
+                    error = abs(bar.mesh) / bar.size  # by the finer mesh itself, whatever cancels
+                    doubts = [bar.doubts[name] for name in bar.doubts if name != "mesh cancels"]
+                    doubts = doubts if error < COARSE else ()  # others are out of the question anyway
                 except (ValueError, FloatingPointError) as problem:
                     doubts = (str(problem),)
             if doubts:

@@ -32,7 +32,8 @@ class MultiPointConstraint(GivenOverTime, Term):
         indices, of sets and masks in that of ascending indices.
     value [m], over time as the amount of `Pressure`; static load steps apply it in parts.
     stiffness [N/m], or None: exactly. g is the force over it; a hundred to a million times E times the body's size costs
-        little, for solvers know the relation's matrix. Explicit steps do not read it.
+        little, for solvers know the relation's matrix; `load_path` finds no equilibria beyond ten thousand times. Explicit
+        steps do not read it.
     `MultiPointConstraint.mean` makes the relation of a face's mean motion.
     Inputs with gradient: "constraint_value", "constraint_coefficients", "constraint_stiffness", or "<name>.value", ...
     Raises ValueError for other shapes, unknown sets, coefficients that are all zero, and stiffness not above zero.
