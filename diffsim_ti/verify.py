@@ -144,15 +144,16 @@ class GradientReport:
         return all(row.passed for row in self.rows)
 
     def __str__(self) -> str:
+        wide = max([22, *(len(r.input) for r in self.rows)])
         lines = [
-            f"{'input':22s} {'analytic':>16s} {'differences':>16s} {'rel. error':>11s} {'resolution':>11s} "
+            f"{'input':{wide}s} {'analytic':>16s} {'differences':>16s} {'rel. error':>11s} {'resolution':>11s} "
             f"{'Taylor rate':>12s}  verdict"
         ]
         for r in self.rows:
             rate = "linear" if np.isinf(r.taylor_rate) else "-" if np.isnan(r.taylor_rate) else f"{r.taylor_rate:.3f}"
             resolution = f"{r.resolution:.1e}" if r.resolution else "exact"
             lines.append(
-                f"{r.input:22s} {r.analytic: 16.8e} {r.differences: 16.8e} {r.relative_error:11.1e} {resolution:>11s} "
+                f"{r.input:{wide}s} {r.analytic: 16.8e} {r.differences: 16.8e} {r.relative_error:11.1e} {resolution:>11s} "
                 f"{rate:>12s}  {r.verdict}"
             )
         lines += [f"{r.input}: {r.advice}" for r in self.rows if r.advice]

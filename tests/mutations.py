@@ -41,7 +41,9 @@ TESTS = """
     test_open_laws.py test_viscous_stages.py test_unequal_steps.py test_quadratic.py test_quadratic_loads.py
     test_quadratic_outputs.py test_curved_contact.py test_mass_scaling.py
     test_designs.py test_identify.py test_identify_experiments.py test_surface_drag.py test_reduced.py
-    test_reduced_explicit.py test_reduced_rigid.py
+    test_reduced_explicit.py test_reduced_rigid.py test_robots.py test_obstacle_pairs.py test_rotating_frame.py
+    test_couplings.py test_tie.py test_plasticity.py test_contact_area.py test_mesh_obstacle.py test_growth_over_time.py
+    test_quadratic_solvers.py test_work.py test_self_contact_near.py
 """.split()
 
 WRONG_NUMBERS = ("AssertionError", "assert ", "Failed: ", "FloatingPointError")

@@ -459,7 +459,7 @@ def test_implicit_scenes_are_solved_together(kind, monkeypatch):
     """As one by one, to the tolerance of the solver; of a scene that fails, its error, and nothing in the others."""
     if kind == "as on a card":
         monkeypatch.setattr(JoinedArrays, "by_scene", False)
-    found, seeds = [], np.random.default_rng(0).normal(size=(3, 3, 2, len(MESH.vertices), 3))
+    found, seeds = [], np.random.default_rng(0).normal(size=(4, 3, 2, len(MESH.vertices), 3))
     for lanes in (True, False):
         batch, own = implicit(kind, lanes=lanes)
         frames = batch.forward(**own)

@@ -9,7 +9,7 @@
 try:
     import gymnasium
 except ImportError:
-    raise ImportError("diffsim_ti.envs: Gymnasium is missing; pip install gymnasium") from None
+    raise ImportError('diffsim_ti.envs: Gymnasium is missing; pip install "diffsim-ti[envs]"') from None
 
 TASKS = {"Jumper": "jumper:SoftJumper", "Crawler": "crawler:SoftCrawler", "Grasp": "grasp:SoftGrasp"}
 for _name, _place in TASKS.items():

@@ -16,7 +16,7 @@ class UsdWriter(SurfacesWriter):
     Units are metres and kilograms; a frame at t [s] is time code t * view.fps, of view.fps codes a second. The up axis
     is z where the scene's gravity acts along z, else y. Points are float32 [m], of what is far from the origin less a
     translation. The body's triangles have one colour, or where `view.colour` names a field one for each vertex and frame.
-    Raises ImportError without usd-core (`pip install diffsim_ti[usd]`).
+    Raises ImportError without usd-core (`pip install "diffsim-ti[usd]"`).
     Pixar, OpenUSD: UsdGeomMesh, UsdGeomPrimvarsAPI.
     """
 
@@ -26,7 +26,7 @@ class UsdWriter(SurfacesWriter):
         try:
             import pxr  # noqa: F401
         except ImportError:
-            raise ImportError("usd: usd-core is missing; pip install diffsim_ti[usd]") from None
+            raise ImportError('usd: usd-core is missing; pip install "diffsim-ti[usd]"') from None
         super().__init__(path, view)
 
     def close(self) -> None:
