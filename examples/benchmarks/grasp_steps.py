@@ -4,10 +4,10 @@ As Newton's are measured (github.com/newton-physics/newton/issues/4141): number 
 `step`, with random actions, after some that are not counted. Environments are those of `gymnasium.make_vec`, and restart
 where an episode ends. A step is 10 ms in 40 substeps of a cube of 27 vertices between two pads.
 
-    python examples/benchmarks/grasp_steps.py [environments ...]
+    python examples/benchmarks/grasp_steps.py [--arch cuda|vulkan|cpu] [environments ...]
 """
 
-import sys
+import argparse
 import time
 
 import gymnasium
@@ -47,5 +47,9 @@ def main(counts=(1, 64, 1024), seconds: float = SECONDS) -> dict[int, float]:
 
 
 if __name__ == "__main__":
-    ds.init()
-    main([int(x) for x in sys.argv[1:]] or (1, 64, 1024))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("environments", nargs="*", type=int, default=[1, 64, 1024])
+    parser.add_argument("--arch", choices=("cuda", "vulkan", "cpu"), default="cpu")
+    given = parser.parse_args()
+    ds.init(given.arch)
+    main(given.environments)
