@@ -558,6 +558,15 @@ def test_a_cart_and_the_body_that_it_holds_keep_their_momentum():
     np.testing.assert_allclose(momentum, 500 * 0.06**3, rtol=1e-13)
 
 
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_an_arm_at_rest_stays(kind):
+    """Only rounding of the places of the vertices that it holds is left to balance."""
+    arm = ds.Robot.from_urdf(ARM, attached=dict(tip="xmin"), links=())
+    simulator = ds.Simulator(kind(scene_of(arm), dt=5e-3))
+    simulator.run(3)
+    assert np.abs(simulator.velocities).max() < 1e-12
+
+
 def test_equilibria_of_joints_are_those_of_their_springs_weights_and_limits():
     from scipy.optimize import brentq
 

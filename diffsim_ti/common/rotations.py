@@ -11,6 +11,11 @@ def _times(scalars: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return scalars[..., None] * vectors
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a x b; of few vectors several times as fast as NumPy's."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+
+
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """(cos(a / 2), sin(a / 2) n) of a rotation vector a n."""
     half = 0.5 * np.linalg.norm(rotation, axis=-1)
@@ -20,7 +25,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 def product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Of quaternions: the rotation q, then p."""
     a, b, x, y = p[..., 0], q[..., 0], p[..., 1:], q[..., 1:]
-    return np.concatenate([(a * b - (x * y).sum(-1))[..., None], _times(a, y) + _times(b, x) + np.cross(x, y)], -1)
+    return np.concatenate([(a * b - (x * y).sum(-1))[..., None], _times(a, y) + _times(b, x) + cross(x, y)], -1)
 
 
 def conjugate(q: np.ndarray) -> np.ndarray:
@@ -55,8 +60,8 @@ def from_rodrigues(s: np.ndarray) -> np.ndarray:
 
 def turned(q: np.ndarray, x: np.ndarray) -> np.ndarray:
     """R x"""
-    across = 2 * np.cross(q[..., 1:], x)
-    return x + q[..., :1] * across + np.cross(q[..., 1:], across)
+    across = 2 * cross(q[..., 1:], x)
+    return x + q[..., :1] * across + cross(q[..., 1:], across)
 
 
 def skew(a: np.ndarray) -> np.ndarray:

@@ -40,27 +40,43 @@ def add_slot(source, s: int, target, t: int) -> None:
         host[t] += runtime.view(source)[s]
 
 
+@runtime.untaped
+@runtime.kernel
+def _take(source: ti.types.ndarray(ndim=2), s: ti.i32, nodes: ti.types.ndarray(ndim=1), to: ti.types.ndarray(ndim=2)):
+    for k in range(nodes.shape[0]):
+        to[0, k] = source[s, nodes[k]]
+
+
+@runtime.untaped
+@runtime.kernel
+def _put(target: ti.types.ndarray(ndim=2), t: ti.i32, nodes: ti.types.ndarray(ndim=1), of: ti.types.ndarray(ndim=2)):
+    for k in range(nodes.shape[0]):
+        target[t, nodes[k]] = of[0, k]
+
+
 class VertexRows:
     """Of the vertices `nodes`, in arrays of shape (slots, num_vertices)."""
 
     def __init__(self, arrays, nodes: np.ndarray):
-        self.nodes, self._row = nodes, runtime.array(arrays.vector, 1, arrays.num_vertices)
+        self.nodes, self._at = nodes, runtime.upload(nodes, ti.i32)
+        self._part = runtime.array(arrays.vector, 1, len(nodes))
 
     def get(self, source, slot: int) -> np.ndarray:
         """Theirs in a slot, float64."""
         host = runtime.view(source)
-        return (runtime.fetch(source, slot) if host is None else host[slot])[self.nodes, :3].astype(np.float64)
+        if host is not None:
+            return host[slot][self.nodes, :3].astype(np.float64)
+        _take(source, slot, self._at, self._part)
+        return runtime.fetch_row(self._part, 0)[: len(self.nodes)]
 
     def put(self, target, slot: int, data: np.ndarray) -> None:
         """Others in their place."""
         host = runtime.view(target)
         if host is not None:
             host[slot, self.nodes, :3] = data
-            return
-        whole = runtime.fetch(target, slot)
-        whole[self.nodes] = data
-        runtime.fill(self._row, whole[None])
-        copy_slot(self._row, 0, target, slot)
+        elif len(self.nodes):
+            runtime.fill(self._part, data)
+            _put(target, slot, self._at, self._part)
 
     @contextmanager
     def replaced(self, history, slot: int, u: np.ndarray, v: np.ndarray):

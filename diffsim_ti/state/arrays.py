@@ -154,8 +154,7 @@ class SceneArrays:
         return out
 
     def gravity_of(self, values: Derived) -> np.ndarray:
-        """Gravity [m/s^2] among numbers that kernels read, or their changes or adjoints, as a view; zero where there is
-        none."""
+        """Gravity [m/s^2] among numbers that kernels read, or their changes; zero where there is none."""
         at = self._features["gravity"]
         return values.parameters[at : at + 3] if at >= 0 else np.zeros(3)
 

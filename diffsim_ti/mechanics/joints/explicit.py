@@ -25,7 +25,7 @@ from diffsim_ti.mechanics.joints.joints import Joints, balanced
 from diffsim_ti.mechanics.joints.sweeps import JointAdjoint, JointSweep, JointTangent
 from diffsim_ti.mechanics.joints.twists import by_turns, moved, moved_jvp, on_joints
 from diffsim_ti.mechanics.stage import Passes, Stage
-from diffsim_ti.runtime.slots import copy_slot
+from diffsim_ti.runtime.slots import VertexRows, copy_slot
 from diffsim_ti.state.history import History
 from diffsim_ti.state.numbers import Tangent
 from diffsim_ti.state.stage import Stage as Pass
@@ -58,6 +58,7 @@ class JointStage(Stage):
         self.own = np.ravel([[2 * k, 2 * k + 1] for k in links]).astype(int)  # their rows of impulses
         self.carried = np.array([carried for _, carried in self.joints.links], float).reshape(-1, self.joints.count)
         ws.state.f = runtime.array(a.vector, 1, a.num_vertices)
+        self.held = VertexRows(a, self.joints.at)
         self.pair = History(a, 2, record=True)  # the states that a pass leads from and to
         self.change, self.none = History(a, 1, record=False), None
         self.change.offsets = runtime.array(a.vector, a.poses.size)
@@ -68,7 +69,7 @@ class JointStage(Stage):
     def begin(self, at: Passes) -> None:
         """Joints stand where the pass begins."""
         J, self.at = self.joints, at
-        J.now, J.u_n = at.history.joints[at.slot], runtime.fetch_row(at.history.u, at.slot)
+        J.now = at.history.joints[at.slot]
         J.begin(at.j, Pass(at.now.h), self.rows)
         self.inertia = J.M + np.diag(J.h * J.c + J.h**2 * J.k)
         self.m, self.y_n, self.v_star = self.ws.mass[J.at], J.carried(J.q_n), np.zeros((len(J.at), 3))
@@ -104,11 +105,8 @@ class JointStage(Stage):
                 copy_slot(target, at.end, source, 1)
             self.find(meets=touches)
             for (source, target), row in zip(states, (J.carried(J.q) - ws.arrays.values.rest[J.at], self.chord)):
-                if len(J.at):
-                    x = runtime.fetch(source)
-                    x[1, J.at] = row
-                    runtime.fill(source, x)
                 copy_slot(source, 1, target, at.end)
+                self.held.put(target, at.end, row)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
         history.joints[at.end] = J.q, J.w - self.rebound(), sum(J.efforts()), J.q_n, J.v_n
@@ -133,8 +131,8 @@ class JointStage(Stage):
 
     def _note(self, near: np.ndarray, given: np.ndarray) -> None:
         """near: vertices that links touch, at x where the pass begins; given: what all obstacles give them."""
-        J, self.near, self.given = self.joints, near, given
-        self.x = J.a.values.rest[near] + J.u_n[near]
+        self.near, self.given, values = near, given, self.joints.a.values
+        self.x = values.rest[near] + (runtime.fetch_row(self.pair.u, 0)[near] if near.size else 0.0)
         self.wrenches = self.wrenches_of(given)
 
     def launch(self, name: str, **numbers) -> None:
@@ -182,7 +180,7 @@ class JointStage(Stage):
         met = np.einsum("la,ad,lkd->a", self.carried, np.abs(J.S_n), sizes)
         pull, J_n = self.pull, self.J_n
         R = J.h * own - self.weighed(self.on_joints(self.wrenches)) - on_joints(J_n, pull)
-        speeds = np.abs(self.chord) + np.abs(self.v_star), 1e-15 * np.abs(self.y_n) / J.h
+        speeds = np.abs(self.chord) + np.abs(self.v_star), J.digits / J.h
         held, rounding = (on_joints(np.abs(J_n), self.m * x) for x in speeds)
         return R, J.h * size + met + held, J.h * J.rounding() + rounding
 
@@ -192,7 +190,7 @@ class JointStage(Stage):
 
         def kicked():
             if len(J.at):
-                self.v_star = runtime.fetch_row(self.pair.v, 1)[J.at]
+                self.v_star = self.held.get(self.pair.v, 1)
 
         def stand(w):
             self.go(w)
@@ -439,8 +437,8 @@ class JointStageAdjoint(JointAdjoint):
     def collect(self, out) -> None:
         """Add what was summed up."""
         super().collect(out)
-        gravity_adj = self.ws.arrays.gravity_of(out)
-        gravity_adj += self.by_gravity
+        if (first := self.ws.arrays.features().gravity) >= 0:
+            out.parameters[first:][:3] += self.by_gravity
         out.joints += self.by_steps.joints
         if out.mass is not None:
             out.mass = out.mass + self.by_mass

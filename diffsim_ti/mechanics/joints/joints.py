@@ -128,6 +128,7 @@ class Joints:
             robot.check_limits(q[own])
         x = (values.rest + values.displacement)[self.at]
         self.local = self._each_held(q, lambda turn, t, rows: rotations.turned(rotations.conjugate(turn), x[rows] - t))
+        self.digits = 1e-15 * sum(np.linalg.norm(y, axis=1, keepdims=True) for y in (x, self.local))  # of their places [m]
         return q.copy(), v.copy(), np.zeros(self.count), q.copy(), v.copy()
 
     # ---- kinematics --------------------------------------------------------------------------------------------------
@@ -214,7 +215,7 @@ class Joints:
         self.stiff = STIFF * self.robots.typical / (self.h if self.moves else AT_REST) ** 2
         self.k = np.where(self.robots.prescribed, self.stiff, self.k)
         self.c = self.moves * (self.c + self.robots.damping)
-        self.q, self._held, self._placed, self._anchor, self.held_sizes = self.q_n.copy(), None, None, None, 0.0
+        self.q, self._held, self._placed, self._anchor, self.held_noise = self.q_n.copy(), None, None, None, 0.0
         self._back = None
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
         self.put_rates(rows, np.zeros(self.count))
@@ -359,7 +360,7 @@ class Joints:
         """Of each joint's own forces, by the digits of their positions."""
         reach = np.abs(self.q) + np.abs(self.q_n) + self.h * np.abs(self.v_n)
         own = 1e-15 * (np.abs(self.M) @ reach / self.h**2 + self.yielding * reach) + 1e-300
-        return own + self.eps * self.held_sizes
+        return own + self.held_noise
 
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
@@ -498,8 +499,9 @@ class Joints:
             w = np.zeros((n, 3))
             w[self.at] = J[:, a]
             own[..., a] = self.of_places(w)
-        self.held_sizes = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
-        turns, y = self.turns(self.S), self.places(self.p.held_at)[0][self.at]
+        turns, y, noise = self.turns(self.S), self.places(self.p.held_at)[0][self.at], self.eps * np.abs(self.p.held_at)
+        noise[self.at] += self.digits
+        self.held_noise = np.einsum("ida,id->a", np.abs(own), noise)
         for rows, _, carried in self.grips:
             K = K - by_turns(turns, carried, y[rows], self.pull[rows]).T
         pulled = np.cross(self.holding * self.S[:, 3:], self.pull[:, None])

@@ -115,7 +115,8 @@ class PairContact(Stage):
 
     @contextmanager
     def do(self, at: Passes):
-        self.prepare(at, at.history.u, at.slot, anew=at.launch is None)
+        self.follow(at, AT_BEGIN)
+        self.prepare(at.history.u, at.slot, anew=at.launch is None)
         if not at.stride:
             copy_slot(at.history.u, at.slot, self.begin, 0)  # which the drift replaces
         yield
@@ -125,9 +126,8 @@ class PairContact(Stage):
         """Whether the list holds at u[slot]."""
         return self.inner.holds(*self._fine(u, slot))
 
-    def prepare(self, at: Passes, u, slot: int, anew: bool) -> None:
-        """A pass begins at u[slot]; anew: what was before says nothing of the list."""
-        self.follow(at, AT_BEGIN)
+    def prepare(self, u, slot: int, anew: bool) -> None:
+        """A pass begins at u[slot], obstacles being where it does; anew: what was before says nothing of the list."""
         fine = self._fine(u, slot)
         if anew:
             self.inner.ensure(*fine)

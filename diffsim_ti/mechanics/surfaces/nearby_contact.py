@@ -49,7 +49,7 @@ class NearbyContact(Stage):
         anew = at.launch is None and not stage.holds(u, slot)
         if anew or self.turning:
             stage = self._cover(u, slot)
-        stage.prepare(at, u, slot, anew or not stage.inner.fresh)
+        stage.prepare(u, slot, anew or not stage.inner.fresh)
         if not at.stride:
             copy_slot(u, slot, stage.begin, 0)
         yield
@@ -61,7 +61,7 @@ class NearbyContact(Stage):
                 begin = stage.begin_of(at)
                 stage.follow(at, AT_BEGIN)
                 stage = self._cover(*begin, far.more)
-                stage.prepare(at, *begin, anew=True)
+                stage.prepare(*begin, anew=True)
         if at.stride:
             self.by_end = self.by_end if at.slot else {}  # a record begins in slot 0
             self.by_end[at.end] = stage

@@ -283,7 +283,8 @@ class ImplicitAdjoint(RecordedPasses):
         a, features, out = self.ws.arrays, self.features, self.numbers.collect()
         out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
         out.element_masses = self.element_masses
-        a.gravity_of(out)[:] = self.gravity
+        if features.gravity >= 0:
+            out.parameters[features.gravity :][:3] = self.gravity
         if features.drag >= 0:
             out.parameters[features.drag] = self.rate
         rest = self.frames[0].sum(0)

@@ -366,8 +366,9 @@ class Rounds:
             u = potential.place(there)
         else:
             u = potential.arrive(on_way=True) if moved else potential.held_at
-        if newton.rigid and phase == nk.START:
-            runtime.fill(self.far, runtime.fetch(self.far) + newton.rigid.rounding.ravel() / newton.eps)
+        if (newton.rigid or potential.joints) and phase == nk.START:
+            places = newton.rigid.rounding.ravel() if newton.rigid else potential.joints.digits.max(initial=0.0)
+            runtime.fill(self.far, runtime.fetch(self.far) + places / newton.eps)
         rows = lambda x: x.reshape(self.cg.systems, -1)  # noqa: E731
         energies, change, step, mass = rows(potential.energies_beside()), 0.0, u - base, newton.mass
         if isinstance(mass, ConsistentMass):
