@@ -25,11 +25,11 @@ from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.energy_balance import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
-from diffsim_ti.outputs import CenterOfMass, ChamberPressure, ContactForce, ContactSlip, ContactTraction, Dissipation
-from diffsim_ti.outputs import ElasticEnergy, EnclosedVolume, JointEfforts, JointPositions, JointVelocities
-from diffsim_ti.outputs import KineticEnergy, Length, LinkEnergy, LinkMotion
-from diffsim_ti.outputs import MaterialPoints, PixelTracks, PlasticStrain, Reaction, SectionForce, SelfContactForce
-from diffsim_ti.outputs import SmoothMaximum, Strain, Stress, TactilePad, Tension, WorkOfLoads
+from diffsim_ti.outputs import CenterOfMass, CenterOfPressure, ChamberPressure, ContactForce, ContactSlip
+from diffsim_ti.outputs import ContactTraction, Dissipation, ElasticEnergy, EnclosedVolume, JointEfforts, JointPositions
+from diffsim_ti.outputs import JointVelocities, KineticEnergy, Length, LinkEnergy, LinkMotion, MaterialPoints
+from diffsim_ti.outputs import PixelTracks, PlasticStrain, Reaction, SectionForce, SelfContactForce, SmoothMaximum
+from diffsim_ti.outputs import Strain, Stress, TactilePad, Tension, WorkOfLoads
 from diffsim_ti.outputs.load_path import CriticalPoint, LoadPath, load_path
 from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.rollout import Frames, Rollout
@@ -63,7 +63,7 @@ __all__ += ["Tunnelling", "NotConverged", "EnergyGained", "Buckled", "MaterialPo
 __all__ += ["CenterOfMass", "EnergyLaw", "Material"]
 __all__ += ["ContactSlip", "ContactTraction", "Reaction", "SelfContactForce", "Stress", "Strain", "Length", "Tension"]
 __all__ += ["JointPositions", "JointVelocities", "JointEfforts", "LinkMotion", "LinkEnergy"]
-__all__ += ["PixelTracks", "TactilePad"]
+__all__ += ["PixelTracks", "TactilePad", "CenterOfPressure"]
 __all__ += ["EnclosedVolume", "ChamberPressure", "ElasticEnergy", "KineticEnergy", "WorkOfLoads", "modes", "Modes"]
 __all__ += ["load_path", "LoadPath", "CriticalPoint", "SectionForce", "SmoothMaximum"]
 __all__ += ["RemoteLoad", "MultiPointConstraint"]

@@ -90,7 +90,7 @@ def rollout_of(case: str) -> ds.Rollout:
         "verlet": lambda: ds.VelocityVerletSolver(scene, dt=2e-3, substeps=2),
     }[kind]()
     named = outputs() if len(scene.obstacles) > 1 else outputs()[:2]
-    named += [ds.ContactSlip("floor"), ds.ContactSlip("floor", "share", name="share")]
+    named += [ds.ContactSlip("floor"), ds.ContactSlip("floor", "share", name="share"), ds.CenterOfPressure("floor")]
     sole = scene.mesh.surface_where(lambda X, n: X[:, 1] < 0.01)
     named.append(ds.TactilePad("floor", sole, size=(2, 3)))
     if kind == "static":  # which depends on the floor, too

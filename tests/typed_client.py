@@ -121,6 +121,7 @@ def parts() -> int:
         ds.CenterOfMass("xmax"),
         ds.ContactForce("ball", part="friction", on="xmin"),
         ds.ContactTraction(ball),
+        ds.CenterOfPressure(ball),
         ds.ContactSlip(ball, "share"),
         ds.PixelTracks(Camera.framing(mesh.vertices), [[0.0, 0.0, 0.0]]),
         ds.TactilePad(ball, "palm", size=(8, 8)),

@@ -56,8 +56,8 @@ REFERENCE = {
 }
 # guides in the order in which they are read; others follow
 GUIDES = "first_steps meshes materials which_material loads_and_supports limit_loads contact_and_friction "
-GUIDES += "solvers_and_steps gradients identify design batches_and_cards results_and_pictures accuracy robots extend "
-GUIDES += "units_and_limits coming_from_others"
+GUIDES += "solvers_and_steps gradients identify design batches_and_cards results_and_pictures accuracy "
+GUIDES += "force_and_touch robots extend units_and_limits coming_from_others"
 BOOST = {"examples": 3, "README": 2, "tests": 0.5, "CHANGELOG": 0.3}  # how much of it the search counts; else 1
 PAGES = {
     "Examples": ["examples/README.md", "examples/benchmarks/README.md"],

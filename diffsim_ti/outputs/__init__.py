@@ -1,7 +1,7 @@
 """Outputs, which losses use like positions: functions of a run's frames, and their interface for others."""
 
 from diffsim_ti.outputs.chambers import ChamberPressure, EnclosedVolume
-from diffsim_ti.outputs.contact_force import ContactForce
+from diffsim_ti.outputs.contact_force import CenterOfPressure, ContactForce
 from diffsim_ti.outputs.contact_slip import ContactSlip
 from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.energies import Dissipation, ElasticEnergy, KineticEnergy, WorkOfLoads
@@ -15,8 +15,9 @@ from diffsim_ti.outputs.smooth_maximum import SmoothMaximum
 from diffsim_ti.outputs.tactile_pad import TactilePad
 from diffsim_ti.outputs.tensors import PlasticStrain, Strain, Stress
 
-__all__ = ["CenterOfMass", "ChamberPressure", "Change", "ContactForce", "ContactSlip", "ContactTraction"]
-__all__ += ["Displacements", "Dissipation", "ElasticEnergy", "EnclosedVolume", "JointEfforts", "JointPositions"]
-__all__ += ["JointVelocities", "KineticEnergy", "Length", "LinkEnergy", "LinkMotion", "MaterialPoints", "Output"]
-__all__ += ["PixelTracks", "PlasticStrain", "Positions", "Reaction", "SectionForce", "SelfContactForce"]
-__all__ += ["SmoothMaximum", "Strain", "Stress", "TactilePad", "Tension", "Velocities", "WorkOfLoads"]
+__all__ = ["CenterOfMass", "CenterOfPressure", "ChamberPressure", "Change", "ContactForce", "ContactSlip"]
+__all__ += ["ContactTraction", "Displacements", "Dissipation", "ElasticEnergy", "EnclosedVolume", "JointEfforts"]
+__all__ += ["JointPositions", "JointVelocities", "KineticEnergy", "Length", "LinkEnergy", "LinkMotion"]
+__all__ += ["MaterialPoints", "Output", "PixelTracks", "PlasticStrain", "Positions", "Reaction", "SectionForce"]
+__all__ += ["SelfContactForce", "SmoothMaximum", "Strain", "Stress", "TactilePad", "Tension", "Velocities"]
+__all__ += ["WorkOfLoads"]

@@ -128,7 +128,8 @@ class Joints:
             robot.check_limits(q[own])
         x = (values.rest + values.displacement)[self.at]
         self.local = self._each_held(q, lambda turn, t, rows: rotations.turned(rotations.conjugate(turn), x[rows] - t))
-        self.digits = 1e-15 * sum(np.linalg.norm(y, axis=1, keepdims=True) for y in (x, self.local))  # of their places [m]
+        # what rounding leaves of their places [m], shape (k, 1)
+        self.digits = 1e-15 * np.linalg.norm([x, self.local], axis=2).sum(0)[:, None]
         return q.copy(), v.copy(), np.zeros(self.count), q.copy(), v.copy()
 
     # ---- kinematics --------------------------------------------------------------------------------------------------
