@@ -47,10 +47,11 @@ HELD = "hold the joint by drive_stiffness, prescribe it, or take a solver with i
 FALLS = 0.8  # how steeply Phi may rise along a step where it ends, against how it fell
 
 
-def balanced(at: tuple, direction, eps: float, loose: float, most: int) -> tuple:
+def balanced(at: tuple, direction, eps: float, loose: float, most: int, by_places=lambda: 0.0) -> tuple:
     """(R, sizes of what it adds up, what digits leave) where Newton's method, from `at`, finds that R is zero to `eps` of
     these, or, once it gains no more, to `loose`.
 
+    by_places(): what rounding of places may leave of R, below which neither a share nor a round gains anything.
     direction(R): (step, share of it that is tried first, t -> (R, ...) at that share). A share is good where R along the
     step has not turned round to more than FALLS of what it was.
     """
@@ -58,14 +59,14 @@ def balanced(at: tuple, direction, eps: float, loose: float, most: int) -> tuple
     for _ in range(most):
         left = float(np.max(np.abs(R) / (eps * size + noise)))
         stalled = 0 if left < 0.5 * best else stalled + 1
-        if not left > 1 or (stalled > 3 and np.all(np.abs(R) <= loose * size + noise)) or stalled > 20:
+        if not left > 1 or (stalled > 3 and np.all(np.abs(R) <= loose * size + noise + by_places())) or stalled > 20:
             break
         best = min(best, left)
         step, t, go = direction(R)
         slope = float(R @ step)
         while True:
             R, size, noise = go(t)
-            if float(R @ step) >= -FALLS * slope or t < 1e-12:
+            if float(R @ step) >= -FALLS * slope or t < 1e-12 or np.all(np.abs(R) <= noise + by_places()):
                 break
             t *= 0.5
     return R, size, noise
@@ -216,8 +217,8 @@ class Joints:
         self.stiff = STIFF * self.robots.typical / (self.h if self.moves else AT_REST) ** 2
         self.k = np.where(self.robots.prescribed, self.stiff, self.k)
         self.c = self.moves * (self.c + self.robots.damping)
-        self.q, self._held, self._placed, self._anchor, self.held_noise = self.q_n.copy(), None, None, None, 0.0
-        self._back = None
+        self.q, self._held, self._placed, self._anchor, self.held_sizes = self.q_n.copy(), None, None, None, 0.0
+        self._back, self.by_places = None, 0.0
         self.put(rows, self.q_n, (AT_STAGE, AT_BEGIN))
         self.put_rates(rows, np.zeros(self.count))
 
@@ -361,7 +362,7 @@ class Joints:
         """Of each joint's own forces, by the digits of their positions."""
         reach = np.abs(self.q) + np.abs(self.q_n) + self.h * np.abs(self.v_n)
         own = 1e-15 * (np.abs(self.M) @ reach / self.h**2 + self.yielding * reach) + 1e-300
-        return own + self.held_noise
+        return own + self.eps * self.held_sizes
 
     def energies(self) -> np.ndarray:
         """What the joints add to Phi [J]."""
@@ -450,8 +451,10 @@ class Joints:
                 step = step * min(1.0, 1 / np.max(np.abs(step) / most))
             return step, self._free_share(u, q, step), lambda t: self._stand(q + t * step, u)
 
-        R, size, noise = balanced(at, direction, max(1e-13, 4 * self.eps), self.loose, self.most)
-        self.left = float(np.max(np.abs(R) / (size + 1e6 * noise)))
+        R, size, noise = balanced(
+            at, direction, max(1e-13, 4 * self.eps), self.loose, self.most, lambda: self.by_places
+        )
+        self.left = float(np.max(np.abs(R) / (size + 1e6 * (noise + self.by_places))))
 
     def _free_share(self, u, q: np.ndarray, step: np.ndarray) -> float:
         """How far links may go along a step of the joints."""
@@ -500,9 +503,9 @@ class Joints:
             w = np.zeros((n, 3))
             w[self.at] = J[:, a]
             own[..., a] = self.of_places(w)
-        turns, y, noise = self.turns(self.S), self.places(self.p.held_at)[0][self.at], self.eps * np.abs(self.p.held_at)
-        noise[self.at] += self.digits
-        self.held_noise = np.einsum("ida,id->a", np.abs(own), noise)
+        self.held_sizes = np.einsum("ida,id->a", np.abs(own), np.abs(self.p.held_at))
+        self.by_places = np.einsum("ida,id->a", np.abs(own[self.at]), self.digits)
+        turns, y = self.turns(self.S), self.places(self.p.held_at)[0][self.at]
         for rows, _, carried in self.grips:
             K = K - by_turns(turns, carried, y[rows], self.pull[rows]).T
         pulled = np.cross(self.holding * self.S[:, 3:], self.pull[:, None])

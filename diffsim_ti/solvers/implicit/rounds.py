@@ -367,7 +367,7 @@ class Rounds:
         else:
             u = potential.arrive(on_way=True) if moved else potential.held_at
         if (newton.rigid or potential.joints) and phase == nk.START:
-            places = newton.rigid.rounding.ravel() if newton.rigid else potential.joints.digits.max(initial=0.0)
+            places = newton.rigid.rounding.ravel() if newton.rigid else 0.01 * potential.joints.digits.max(initial=0.0)
             runtime.fill(self.far, runtime.fetch(self.far) + places / newton.eps)
         rows = lambda x: x.reshape(self.cg.systems, -1)  # noqa: E731
         energies, change, step, mass = rows(potential.energies_beside()), 0.0, u - base, newton.mass
