@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from example_files import example
 
 import diffsim_ti as ds
 from diffsim_ti import verify
@@ -104,30 +105,19 @@ def test_segments_tell_bodies_apart():
     np.testing.assert_array_equal(of_pixel, (image.points[:, 0] > 0.125).astype(int))
 
 
-def pushed(E=2e4, friction=0.3):
-    """A cube that slides over a floor and comes to rest."""
-    floor = ds.Ground(0.0, width=2e-3, friction=friction, stiffness_per_area=1e7, friction_speed=0.02, name="floor")
-    mesh = CUBE.translated((0, -0.048, 0))
-    return ds.Scene(mesh, ds.StableNeoHookean(E, 0.3), 1e3, [ds.Gravity(), floor],
-                    initial_velocities=(0.5, 0, 0.1), precision="f64")  # fmt: skip
-
-
 def markers(mesh):
     """All points of the surface, half of which a camera does not see."""
     return mesh.vertices[mesh.surface_vertices]
 
 
+@pytest.fixture(scope="module")
 def cameras():
-    box = np.array([[-0.15, 0, -0.15], [0.3, 0.25, 0.2]])
-    return [Camera.framing(box, (640, 480), azimuth, 20.0) for azimuth in (20.0, 70.0)]
+    return example("identify/two_cameras")
 
 
 @pytest.fixture(scope="module")
-def filmed():
-    scene = pushed()
-    tracks = [ds.PixelTracks(camera, markers(scene.mesh), name=f"camera_{k}") for k, camera in enumerate(cameras())]
-    solver = ds.ImplicitEulerSolver(scene, dt=0.01, tolerance=1e-12)
-    return ds.Rollout(solver, 20, save_every=2, outputs=tracks, gradients="all")
+def filmed(cameras):
+    return cameras.filmed()
 
 
 def test_tracks_have_gradients(filmed):
@@ -158,25 +148,20 @@ def test_hidden_points_are_known(filmed):
         ds.PixelTracks(inside, x, SIZE).settled(filmed.scene).value(frames)
 
 
-def test_two_cameras_tell_stiffness_and_friction(filmed):
+def test_two_cameras_tell_stiffness_and_friction(cameras, filmed):
     """With noise of half a pixel, and no sample where the body hides a point: truth within the 95 % interval."""
-    frames, rng, data = filmed.forward(), np.random.default_rng(2), {}
-    for name, track in frames.computed.items():
-        seen = track.visible(frames)
-        data[name] = np.where(seen[..., None], frames[name] + rng.normal(scale=0.5, size=frames[name].shape), np.nan)
-        assert 0.3 < seen.mean() < 0.8
-    start = {"youngs_modulus": 4e4, "floor.friction": 0.2}
-    found = ds.identify(filmed, data, start, noise=0.5, check_mesh=False)
-    for name, truth in (("youngs_modulus", 2e4), ("floor.friction", 0.3)):
+    frames = filmed.forward()
+    assert all(0.3 < track.visible(frames).mean() < 0.8 for track in frames.computed.values())
+    found = cameras.identified(filmed, frames, seed=2)
+    for name, truth in cameras.TRUTH.items():
         low, high = found.intervals[name]
         assert low < truth < high and high - low < 0.02 * truth, str(found)
 
 
-def test_the_mesh_is_checked_beside_a_floor():
+def test_the_mesh_is_checked_beside_a_floor(filmed):
     """What identify tells of ten nodes, in a scene with an obstacle."""
-    scene = pushed()
-    camera = ds.PixelTracks(cameras()[0], markers(scene.mesh)[:3], name="film")
-    rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=0.01), 2, outputs=[camera])
+    camera = ds.PixelTracks(filmed.outputs["camera_0"].camera, markers(filmed.scene.mesh)[:3], name="film")
+    rollout = ds.Rollout(ds.ImplicitEulerSolver(filmed.scene, dt=0.01), 2, outputs=[camera])
     data = {"film": rollout.forward(youngs_modulus=1.9e4)["film"]}
     found = ds.identify(rollout, data, {"youngs_modulus": 2e4}, noise=0.5, check_mesh=True)
     assert found.mesh is not None and not found.mesh.reason
