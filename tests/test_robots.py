@@ -208,6 +208,7 @@ def test_adjoints_of_joints_are_cut_clipped_and_reported(wheel, kind):
 @pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.BDF2Solver])
 def test_links_stand_where_they_are_when_a_run_goes_on(kind):
     """A body falls to where a link, and a ball on a path, were when it began."""
+    from diffsim_ti.writers import Frame
     from diffsim_ti.writers.adaptive_run import ForwardRun
 
     text = urdf(
@@ -228,6 +229,10 @@ def test_links_stand_where_they_are_when_a_run_goes_on(kind):
     for one in (first, second):
         one.step()
     np.testing.assert_array_equal(first.positions, second.positions)
+    drawn = Frame.of(first).obstacles[0]  # the link, as pictures and files have it
+    assert np.ptp(drawn, 0).max() < 0.05 and drawn.mean(0)[0] == pytest.approx(
+        0.03 + first.joint_states[0, 0], abs=1e-4
+    )
     with pytest.raises(ValueError, match=r"joint_states: expected finite numbers, float64 of shape \(1, 5\)"):
         second.resume(kept | dict(joint_states=np.zeros((3, 3))))
     run = ForwardRun(scene, kind, 0.04, dt=1e-2)

@@ -83,31 +83,20 @@ class ContactForce(Output):
         return forces if self.per_vertex else force_or_moment(forces, frames.positions[:, self.vertices], self.about)
 
 
-class CenterOfPressure(Output):
+class CenterOfPressure(ContactForce):
     """Where an obstacle presses on the body [m], shape (frames, 3): sum |p_i| x_i / sum |p_i|, zero where it does not.
 
     p_i: what `ContactForce(obstacle, "normal", per_vertex=True)` gives, x_i: the frame's positions. On a plane the force
-    there has the moment of all p_i. obstacle, name: as of `ContactForce`. The gradient is exact by all inputs.
+    there has the moment of all p_i. obstacle, name: as there. The gradient is exact by all inputs.
     Raises ValueError as `ContactForce` does.
     Sardain, Bessonnet 2004, Forces acting on a biped robot, doi:10.1109/TSMCA.2004.832811.
     """
 
-    reads_contact_forces, unit = True, "m"
+    unit, _shown = "m", ("obstacle",)
 
     def __init__(self, obstacle: Term | str, name: str = "center_of_pressure"):
-        self._force, self.name = ContactForce(obstacle, "normal", per_vertex=True), name
-
-    def __repr__(self) -> str:
-        return f"CenterOfPressure({self._force.obstacle!r}, name={self.name!r})"
-
-    def settled(self, scene: Scene) -> "CenterOfPressure":
-        out = copy(self)
-        out._force = self._force.settled(scene)
-        return out
-
-    def shape(self, num_frames: int) -> tuple[int, ...]:
-        return num_frames, 3
+        super().__init__(obstacle, "normal", name)
 
     def value(self, frames: Frames) -> np.ndarray:
-        p = np.linalg.norm(self._force.value(frames), axis=-1, keepdims=True)
+        p = np.linalg.norm(frames.contact_forces[:, self.place, 0], axis=-1, keepdims=True)
         return ratio((p * frames.positions.astype(np.float64)).sum(1), p.sum(1))
