@@ -226,7 +226,7 @@ class BodyForces:
             adj.element_masses = None
             return lambda into: into.add(adj)
 
-        parents = [(x, lambda _, k=k: np.stack(found[k])) for k, x in enumerate((u, v, z))]
+        parents = [(x, lambda _, k=k: np.stack(found[k]).reshape(states[k].shape)) for k, x in enumerate((u, v, z))]
         return jointly(np.stack([self.forces() for _ in each()]), push, (derived, by_numbers), *parents)
 
     def _run(self, name: str, **records) -> np.ndarray:
