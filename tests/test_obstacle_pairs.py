@@ -9,8 +9,8 @@ from contact_scenes import box_surface
 from impact_judge import Judge
 
 import diffsim_ti as ds
-from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
 from diffsim_ti import verify
+from diffsim_ti.differentiation.arrays import Recorded, forward, reverse
 from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.terms.obstacles import mesh_obstacle
