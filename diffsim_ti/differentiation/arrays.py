@@ -426,7 +426,7 @@ FUNCTIONS = {
     np.concatenate: _concatenate,
     np.stack: lambda parts, axis=0: _concatenate([np.expand_dims(part, axis) for part in parts], axis),
     np.einsum: _einsum,
-    np.cross: cross,
+    np.cross: lambda a, b: cross(as_array(a), as_array(b)),
     np.where: _where,
     np.clip: lambda x, low=None, high=None: _at_most(x if low is None else np.maximum(x, low), high),
     np.linalg.norm: _norm,
