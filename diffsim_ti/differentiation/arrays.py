@@ -39,13 +39,13 @@ class Recorded(Node, NDArrayOperatorsMixin):
     def _refuse(self, *_, **__):
         raise TypeError(
             "an array whose derivatives are asked for is not made a plain one, nor changed in place: take np.stack, "
-            "np.concatenate or np.where, and y = y + x for y += x, or write jvp and vjp beside value"
+            "np.concatenate or np.where, and y = y + x for y += x, or write jvp and vjp of your own"
         )
 
     __array__ = __float__ = __int__ = __index__ = __bool__ = __setitem__ = _refuse
 
     def __getattr__(self, name: str):
-        raise AttributeError(f"arrays have no derivative by .{name} here: write jvp and vjp beside value")
+        raise AttributeError(f"arrays have no derivative by .{name} here: write jvp and vjp of your own")
 
     def __array_ufunc__(self, ufunc, method, *x, **how):
         if ufunc in PARTIALS and method == "__call__" and not how:
@@ -56,7 +56,7 @@ class Recorded(Node, NDArrayOperatorsMixin):
             return _matmul(*x)
         y = getattr(ufunc, method)(*map(value_of, x), **how)
         if np.asarray(y).dtype.kind == "f" and ufunc is not np.sign:
-            raise TypeError(f"np.{ufunc.__name__} has no derivative here: write jvp and vjp beside value")
+            raise TypeError(f"np.{ufunc.__name__} has no derivative here: write jvp and vjp of your own")
         return y
 
     def __array_function__(self, function, _, x, how):
@@ -66,7 +66,7 @@ class Recorded(Node, NDArrayOperatorsMixin):
             return _moved(function, *x, **how)
         if function in WITHOUT:
             return function(*map(value_of, x), **how)
-        raise TypeError(f"np.{function.__name__} has no derivative here: write jvp and vjp beside value")
+        raise TypeError(f"np.{function.__name__} has no derivative here: write jvp and vjp of your own")
 
     def __len__(self) -> int:
         return len(self.value)
@@ -320,7 +320,7 @@ def _einsum(letters: str, *x, optimize=False):
     if "->" not in letters or any(len(set(word)) < len(word) for word in given):
         raise TypeError(
             f"np.einsum({letters!r}) has no derivative here: write its -> out, take np.diagonal for a letter that stands "
-            "twice in one array, or write jvp and vjp beside value"
+            "twice in one array, or write jvp and vjp of your own"
         )
     further = [np.ndim(a) - len(word) + 3 for a, word in zip(plain, letters.split("->")[0].split(",")) if "..." in word]
     words, out = letters.replace("...", "ABCDEF"[: max(further, default=0)]).split("->")
@@ -372,7 +372,7 @@ def _eigvalsh(A):
 
 def _norm(x, ord=None, axis=None, keepdims=False):
     if ord is not None:
-        raise TypeError(f"np.linalg.norm of ord {ord!r} has no derivative here: write jvp and vjp beside value")
+        raise TypeError(f"np.linalg.norm of ord {ord!r} has no derivative here: write jvp and vjp of your own")
     return np.sqrt((x * x).sum(axis, keepdims))
 
 
@@ -426,7 +426,7 @@ FUNCTIONS = {
     np.concatenate: _concatenate,
     np.stack: lambda parts, axis=0: _concatenate([np.expand_dims(part, axis) for part in parts], axis),
     np.einsum: _einsum,
-    np.cross: cross,
+    np.cross: lambda a, b: cross(as_array(a), as_array(b)),
     np.where: _where,
     np.clip: lambda x, low=None, high=None: _at_most(x if low is None else np.maximum(x, low), high),
     np.linalg.norm: _norm,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -77,13 +78,17 @@ class DerivedNode(Node):
 
     def __init__(self, value: Derived, *parents: tuple):
         super().__init__(value, parents, value.zeros)
+        self._arrays = WeakValueDictionary()  # those that are in use: adjoints of rows of one add up in one array
 
     def __getattr__(self, name: str):
         def pull(seed):
             return lambda into: setattr(into, name, seed if getattr(into, name) is None else getattr(into, name) + seed)
 
-        value = getattr(self.value, name)
-        return None if value is None else made(value, (self, lambda change: getattr(change, name), pull))
+        value, known = getattr(self.value, name), self._arrays.get(name)
+        if value is None or known is not None:
+            return known
+        out = self._arrays[name] = made(value, (self, lambda change: getattr(change, name), pull))
+        return out
 
 
 # the names of the arrays of every scene

@@ -36,9 +36,10 @@ class HostForce:
     """Forces of one kind at displacements u [m], with all derivatives; vectors of vertices have the shape (num_vertices, 3).
 
     A new force writes `forces`, whose derivatives are found by arrays that record (differentiation/arrays.py) unless `jvp`
-    and `vjp` stand beside it; `take` must then not convert what it takes. One that has an energy E, so that f = -dE/du, also
-    writes `energies` and, where E is stored in the body, `stored`, which balances of energy read. All else has defaults that
-    are right for every force, and may be written where it can be had faster or helps linear solvers.
+    and `vjp` stand beside it. It must then read numbers and the rest shape from `values`, which `take` does not convert, and
+    velocities by `velocities(u)`. One that has an energy E, so that f = -dE/du, also writes `energies` and, where E is stored
+    in the body, `stored`, which balances of energy read. All else has defaults that are right for every force, and may be
+    written where it can be had faster or helps linear solvers.
 
     has_energy: whether it has an energy, which line searches and preconditioners then know. Without one, line searches ask
         for `work`. symmetric: whether df/du is in what may move; else linear systems are solved by GMRES.

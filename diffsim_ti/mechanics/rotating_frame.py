@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.differentiation.arrays import cross
 from diffsim_ti.inputs.consistent_mass import consistent
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction, VertexwiseForce
@@ -104,7 +105,7 @@ class InertialForceOnHost(HostForce):
 
     def forces(self, u):
         W, r = self.spin, self.values.rest + u - self.center
-        a = -2 * np.cross(W, self.velocities(u)) - np.cross(W, np.cross(W, r))
+        a = -2 * cross(W, self.velocities(u)) - cross(W, cross(W, r))
         if self.values.element_masses is None:
             return self.values.mass[:, None] * a
         return consistent(self.mesh.elements, self.values.element_masses, a)

@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from diffsim_ti.common.rotations import skew
+from diffsim_ti.differentiation.arrays import cross
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.ten_nodes import QUARTERS
@@ -53,7 +54,7 @@ class QuadraticFaces:
         return (products * (reference_face.WEIGHTS / 2)[:, None]).reshape(-1, 3)
 
     def normals(self, x):
-        return self._half(np.cross(*self._tangents(x)))
+        return self._half(cross(*self._tangents(x)))
 
     def normals_by_nodes(self, x):
         e, f = (skew(t * (reference_face.WEIGHTS / 2)[:, None])[:, :, None] for t in self._tangents(x))
