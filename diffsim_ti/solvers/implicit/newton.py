@@ -66,7 +66,7 @@ class Newton:
     steady = 10  # rounds that halve the residual while more than asked for are taken; 0: none are
     by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
-    indefinite = False  # whether the host's last direction was of an indefinite Hessian, or one that is taken for it again
+    indefinite = False  # whether the Hessian of the host's last direction was, or is taken for it again
     going = True  # which bodies are looked at
 
     def __init__(
