@@ -149,13 +149,15 @@ def test_a_cycle_is_symmetric_and_positive_definite(static):
         assert (a * Ma).sum() > 0 and not Ma[static.free[:, 0] == 0].any()
 
 
-def test_threads_that_share_rows_of_a_cycle_find_what_one_thread_does(static, monkeypatch):
+@pytest.mark.parametrize("levels", [1, 2])
+def test_threads_that_share_rows_of_a_cycle_find_what_one_thread_does(static, monkeypatch, levels):
     """As on a card, up to rounding in single precision."""
+    monkeypatch.setattr(Multigrid, "direct", 500 if levels == 1 else 200)
     r, found = np.random.default_rng(1).standard_normal(static.potential.held_at.shape) * static.free, {}
     for threads in (1, 8):
         monkeypatch.setattr(cycle, "threads_of", lambda M, threads=threads: threads)
         own = Multigrid(static.potential, np.zeros((len(r), 1)), static.free)
-        assert len(own.cycle.levels) == 2
+        assert len(own.cycle.levels) == levels
         found[threads] = own(r)
     assert np.abs(found[8] - found[1]).max() <= 1e-5 * np.abs(found[1]).max()
 

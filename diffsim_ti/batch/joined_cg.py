@@ -5,7 +5,8 @@ from diffsim_ti.runtime import Piecewise, kernels_of
 from diffsim_ti.solvers.implicit.cg_kernels import STOPPED, CGKernels
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 
-COUNTS = "nodes", "below", "chunks", "systems", "num_items", "num_tetrahedra", "num_vertices"  # of all scenes
+COUNTS = "nodes", "below", "shares", "shares_below", "chunks", "systems"  # of all scenes
+COUNTS += "num_items", "num_tetrahedra", "num_vertices"
 
 # what scenes share, or is found by what `start` says, in kernels of one scene
 WHOLE = {(m, a) for m in ("level", "down", "up", "inverse") for a in ("column", "values")}

@@ -160,19 +160,22 @@ class Cycle:
         self._down, self._up = [], []  # (kernel, records, numbers)
         downs = [P.T.tobsr(P.blocksize[::-1]) for P in ways]
         last, inverse = self.levels[-1], inverse_matrix(matrices[-1])
-        own = [level.threads for level in self.levels[:-1]] + [threads_of(inverse)]
-        for level, threads, above in zip(self.levels, own, [1, *map(threads_of, downs)]):
+        within = [level.threads for level in self.levels[:-1]] + [threads_of(inverse)]
+        for level, threads, above in zip(self.levels, within, [1, *map(threads_of, downs)]):
             if max(threads, above) > 1:
                 level.part = runtime.array(ROWS[level.numbers], level.nodes * max(threads, above))
         for level, below, P, down in zip(self.levels, self.levels[1:], ways, downs):
             threads = level.threads, threads_of(down)
             kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel), *threads)
             between = dict(level=level, down=block_matrix(down), up=block_matrix(P), below=below)
-            self._down.append((kernels.down, between, dict(nodes=level.nodes, below=below.nodes)))
-            self._up.insert(0, (kernels.up, between, dict(nodes=level.nodes)))
+            own = dict(nodes=level.nodes, shares=threads[0] * level.nodes)
+            more = dict(below=below.nodes, shares_below=threads[1] * below.nodes)
+            self._down.append((kernels.down, between, own | more))
+            self._up.insert(0, (kernels.up, between, own))
         self._inverse = block_matrix(inverse)
-        kernels = kernels_of(LevelKernels, last.numbers, "f32", last.parallel, own[-1])
-        self._solve = kernels.solve, dict(level=last, inverse=self._inverse), dict(nodes=last.nodes)
+        kernels = kernels_of(LevelKernels, last.numbers, "f32", last.parallel, within[-1])
+        numbers = dict(nodes=last.nodes, shares=within[-1] * last.nodes)
+        self._solve = kernels.solve, dict(level=last, inverse=self._inverse), numbers
         vectors = "f32" if runtime.arch_name() == "vulkan" else "f64"
         self._ends = kernels_of(LevelKernels, 3, vectors, self._wide(matrices[0], parallel))
         self._bound = {}

@@ -62,11 +62,12 @@ class CycleKernels:
         return y
 
     @ti.func
-    def share(self, rows, matrix: A, x: A, of: A, numbers: A, columns: A, threads: A):
-        """of.part: what each of several threads makes of its share of a row's entries, for `row`."""
+    def share(self, shares, matrix: A, x: A, of: A, numbers: A, columns: A, threads: A):
+        """of.part: what each of several threads makes of its share of a row's entries, for `row`; shares: of all rows, a
+        number of the launch, for a GPU takes one task more for a bound that is computed."""
         if ti.static(threads > 1):
             ti.loop_config(serialize=not self.parallel)
-            for t in range(rows * threads):
+            for t in range(shares):
                 i, y = t // threads, self.zero(numbers)
                 k, end = matrix.start[i] + t % threads, matrix.start[i + 1]
                 while k < end:
@@ -90,7 +91,7 @@ class CycleKernels:
 
     @ti.func
     def share_level(self, level: A, x: A, plan: A):
-        self.share(plan.nodes, level, x, level, self.fine, self.fine, self.threads)
+        self.share(plan.shares, level, x, level, self.fine, self.fine, self.threads)
 
     @ti.func
     def left(self, i, level: A, x: A):
@@ -134,7 +135,7 @@ class CycleKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             level.y[i] = self.left(i, level, level.x)
-        self.share(plan.below, down, level.y, below, self.coarse, self.fine, self.threads_down)
+        self.share(plan.shares_below, down, level.y, below, self.coarse, self.fine, self.threads_down)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.below):
             b = self.row(i, down, level.y, below, self.zero(self.coarse), self.fine, self.threads_down)
@@ -146,7 +147,9 @@ class CycleKernels:
         """From the first x of a level to b and the first x of the next."""
         level, below = level_arrays(self.fine, self.threads), level_arrays(self.coarse, self.threads_down)
         arrays = dict(level=level, down=matrix_arrays(self.coarse), below=below)
-        return Kernel("down", self.restrict, "f32", arrays, dict(nodes="int", below="int"))
+        return Kernel(
+            "down", self.restrict, "f32", arrays, dict.fromkeys(("nodes", "below", "shares", "shares_below"), "int")
+        )
 
     @ti.func
     def correct(self, level: A, up: A, below: A, plan: A):
@@ -164,7 +167,7 @@ class CycleKernels:
         """From the last x of the next level to the last of this."""
         level = level_arrays(self.fine, self.threads)
         arrays = dict(level=level, up=matrix_arrays(self.fine), below=level_arrays(self.coarse))
-        return Kernel("up", self.correct, "f32", arrays, dict(nodes="int"))
+        return Kernel("up", self.correct, "f32", arrays, dict(nodes="int", shares="int"))
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,7 @@ class LevelKernels:
 
     @ti.func
     def multiply(self, level: A, inverse: A, plan: A):
-        self.between.share(plan.nodes, inverse, level.b, level, self.numbers, self.numbers, self.threads)
+        self.between.share(plan.shares, inverse, level.b, level, self.numbers, self.numbers, self.threads)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             zero = self.between.zero(self.numbers)
@@ -193,7 +196,7 @@ class LevelKernels:
     def solve(self) -> Kernel:
         """x = A^-1 b by the inverse, a matrix of blocks."""
         arrays = dict(level=level_arrays(self.numbers, self.threads), inverse=matrix_arrays(self.numbers))
-        return Kernel("solve", self.multiply, "f32", arrays, dict(nodes="int"))
+        return Kernel("solve", self.multiply, "f32", arrays, dict(nodes="int", shares="int"))
 
     @ti.func
     def turn_back(self, at: A, level: A, frames: A, plan: A):

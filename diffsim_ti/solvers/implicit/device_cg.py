@@ -31,11 +31,9 @@ class DeviceCG:
         self.potential, self.cycle, self.nodes, self.parallel = potential, cycle, n, parallel
         self.precision = "f64" if arch_name() != "vulkan" else "f32"
         self._vector, fp = array_types(self.precision)["vectors"].dtype, PRECISIONS[self.precision]
-        self.length = max(32, -(-n // max(256, self.systems)))
-        if (
-            not runs_on_cpu()
-        ):  # a thread waits for each entry of its chunk in turn, then one for chunks, eight at a time
-            self.length = max(8, isqrt(n // self.systems) // 6)
+        # on a card a thread waits for each entry of its chunk in turn, then one for chunks, eight at a time
+        on_card = max(8, isqrt(n // self.systems) // 6)
+        self.length = max(32, -(-n // max(256, self.systems))) if runs_on_cpu() else on_card
         self.chunks = self.systems * -(-n // (self.systems * self.length))
         self.x, self.r, self.z, self.p, self.q = (runtime.array(self._vector, 1, n) for _ in range(5))
         self.part, self.state = runtime.array(fp, 6, self.chunks), runtime.array(fp, self.systems, ROOM)

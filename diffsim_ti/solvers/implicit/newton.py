@@ -66,7 +66,7 @@ class Newton:
     steady = 10  # rounds that halve the residual while more than asked for are taken; 0: none are
     by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
-    indefinite = False  # whether the last direction that the host found is one of negative curvature
+    indefinite = False  # whether the Hessian of the host's last direction was, or is taken for it again
     going = True  # which bodies are looked at
 
     def __init__(
@@ -115,7 +115,7 @@ class Newton:
         """
         self.report = report = NewtonReport()
         self.reports.append(report)
-        self.turning = self.indefinite = False  # pairs whose friction a direction has turned round
+        self.indefinite = self.turning = False  # the latter: pairs whose friction a direction has turned round
         self.pose((mass, inertial, loads))
         u = self.potential.place(start)
         if self.volumes:
