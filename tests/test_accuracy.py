@@ -124,6 +124,19 @@ def test_what_cancels_is_of_the_frames_that_the_number_is_of():
         assert number.largest(off, {"end": 0 * off["end"]}) == most
 
 
+def test_doubts_have_names():
+    """Of a mesh that locks, with an error that is large, in one tetrahedron, beside contact; and of a smaller, even one."""
+    scene = block().scene
+    stiff = scene.replace(material=ds.StableNeoHookean(1e6, 0.49))
+    for of, mesh, shares, contact, names in (
+        (stiff, 0.3, np.eye(60)[0], True, ["singular", "contact", "locking", "coarse"]),
+        (scene, 0.2, np.full(60, 1 / 60), False, []),
+    ):
+        errors = dict(mesh=mesh, step=0.0, solver=0.0, rounding=0.0, uncancelled=dict(mesh=mesh, step=0.0))
+        found = estimate.Accuracy("end", 1.0, 1.0, **errors, shares=mesh * shares, cost={})
+        assert list(estimate._doubts(of, found, dict(unplaced="", contact=contact))) == names
+
+
 def test_components_of_a_vector_count_together():
     rollout = block().on(block().solver, outputs=ds.CenterOfMass())
     off = np.array([[0.0, 0, 0], [3, 4, 0]])
