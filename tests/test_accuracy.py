@@ -124,6 +124,26 @@ def test_what_cancels_is_of_the_frames_that_the_number_is_of():
         assert number.largest(off, {"end": 0 * off["end"]}) == most
 
 
+def test_doubts_have_names():
+    """Of a mesh that locks, with an error that is large, in one tetrahedron, beside contact; and of a smaller, even one."""
+    scene = block().scene
+    stiff = scene.replace(material=ds.StableNeoHookean(1e6, 0.49))
+    for of, mesh, shares, contact, names in (
+        (stiff, 0.3, np.eye(60)[0], True, ["singular", "contact", "locking", "coarse"]),
+        (scene, 0.2, np.full(60, 1 / 60), False, []),
+    ):
+        errors = dict(mesh=mesh, step=0.0, solver=0.0, rounding=0.0, uncancelled=dict(mesh=mesh, step=0.0))
+        found = estimate.Accuracy("end", 1.0, 1.0, **errors, shares=mesh * shares, cost={})
+        assert list(estimate._doubts(of, found, dict(unplaced="", contact=contact))) == names
+
+
+def test_components_of_a_vector_count_together():
+    rollout = block().on(block().solver, outputs=ds.CenterOfMass())
+    off = np.array([[0.0, 0, 0], [3, 4, 0]])
+    number = estimate.Number(rollout, "center_of_mass", (0, 0, 1))
+    assert number.largest({"center_of_mass": off}, {"center_of_mass": 0 * off}) == 5
+
+
 @pytest.fixture
 def first_order(monkeypatch):
     """Sums of the shares by residuals and adjoints, as they come, before they are made to add up to what was solved."""
@@ -294,6 +314,8 @@ def test_what_cannot_be_estimated_is_refused():
     stress = rollout.on(rollout.solver, outputs=ds.Stress(at="vertices"))
     with pytest.raises(ValueError, match="Stress at points"):
         stress.accuracy("stress", np.ones(stress.outputs["stress"].shape(2)[1:]))
+    with pytest.raises(ValueError, match="Stress at points"):
+        stress.accuracy("stress", lambda y: (y.sum(), np.ones_like(y)))
     greatest = ds.SmoothMaximum(ds.Stress(von_mises=True, of=[0, 1]))
     with pytest.raises(ValueError, match="name them as a set"):
         rollout.on(rollout.solver, outputs=greatest).accuracy("smooth_maximum", finer=ds.TetrahedralMesh.refined)

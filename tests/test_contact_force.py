@@ -133,6 +133,15 @@ def test_seeds_are_the_transpose_of_tangents(case):
             assert abs(pushed - pulled) <= gate * max(abs(pushed), np.linalg.norm(terms), 1e-12), (key, name)
 
 
+def test_the_centre_of_pressure_has_the_moment_of_what_a_plane_pushes_with():
+    rollout = rollout_of("semi")
+    frames = rollout.forward()
+    p, c = frames.contact_forces[:, rollout.scene.place_of("floor"), 0], frames["center_of_pressure"]
+    assert not c[0].any() and p[-1, :, 1].sum() > 0
+    moment = np.cross(frames.positions, p).sum(1)
+    np.testing.assert_allclose(np.cross(c, p.sum(1)), moment, atol=1e-12 * np.abs(p).sum())
+
+
 def test_a_pad_reads_the_same_however_it_is_turned():
     """An even pressure on a slope, from a block that leans on it: turned with slope and gravity, its readings stay."""
     turn, read = rotations.quaternion(np.array([0.4, 0.3, -0.8])), []

@@ -110,7 +110,7 @@ class Number:
         if output not in rollout.outputs:
             raise ValueError(no_such("output", output, rollout.outputs, "this rollout"))
         self.output, self.loss = output, None
-        shape = tuple(rollout.outputs[output].shape(rollout.num_frames))
+        self.shape = shape = tuple(rollout.outputs[output].shape(rollout.num_frames))
         self.count = rollout.scene.mesh.num_vertices if output in PER_VERTEX else None
         if callable(weights):
             self.loss = weights
@@ -145,15 +145,12 @@ class Number:
         y = np.asarray(frames[self.output], np.float64)
         seed = np.zeros_like(y)
         own = self._own(y)
-        if self.loss is not None:
-            value, slope = self.loss(own)
-        else:
-            if own.shape != self.weights.shape:
-                raise ValueError(
-                    f"{self.output} has shape {own.shape} on a finer mesh: take an output of places or sets, such as "
-                    "MaterialPoints, or Stress at points"
-                )
-            value, slope = (self.weights * own).sum(), self.weights
+        if own.shape != self.shape:
+            raise ValueError(
+                f"{self.output} has shape {own.shape} on a finer mesh: take an output of places or sets, such as "
+                "MaterialPoints, or Stress at points"
+            )
+        value, slope = self.loss(own) if self.loss else ((self.weights * own).sum(), self.weights)
         self._own(seed)[...] = slope
         return float(value), seed
 
@@ -163,8 +160,8 @@ class Number:
         that has some."""
         slope, *both = self.of(frames)[1], *(np.asarray(x[self.output], np.float64) for x in (frames, others))
         slope, y, z = (self._own(x) for x in (slope, *both))
-        places = *slope.shape, 1
-        slope, apart = (np.linalg.norm(x.reshape(*places[:2], -1), axis=2) for x in (slope, y - z))
+        places = 1 if slope.shape[1:] == (3,) else (*slope.shape, 1)[1]  # a vector, or what is at places
+        slope, apart = (np.linalg.norm(x.reshape(len(x), places, -1), axis=2) for x in (slope, y - z))
         last = slope.any(1).nonzero()[0].max(initial=0)
         return float(max((slope * apart).sum(), (apart[: last + 1] @ slope[last]).max()))
 
@@ -294,7 +291,7 @@ def _by_element(mesh: TetrahedralMesh, nodal: np.ndarray, parents: np.ndarray, c
 
 
 def _of_steps(own: Replay, frames: "Frames", number: Number, values: dict) -> tuple[float, float]:
-    """Error of the steps, and that before it cancels: by steps of half the length, and the order of the solver."""
+    """Error of the steps, and that if nothing of it cancelled: by steps of half the length, and the order of the solver."""
     rollout, solver = own.rollout, own.rollout.solver
     if not solver.order:
         return 0.0, 0.0

@@ -87,7 +87,8 @@ class CenterOfPressure(ContactForce):
     """Where an obstacle presses on the body [m], shape (frames, 3): sum |p_i| x_i / sum |p_i|, zero where it does not.
 
     p_i: what `ContactForce(obstacle, "normal", per_vertex=True)` gives, x_i: the frame's positions. On a plane the force
-    there has the moment of all p_i. obstacle, name: as there. The gradient is exact by all inputs.
+    there has the moment of all p_i. Where the obstacle acts by pairs on curved faces of ten nodes, some p_i point the other
+    way, and the place is off. obstacle, name: as there. The gradient is exact by all inputs.
     Raises ValueError as `ContactForce` does.
     Sardain, Bessonnet 2004, Forces acting on a biped robot, doi:10.1109/TSMCA.2004.832811.
     """

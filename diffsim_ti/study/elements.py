@@ -190,7 +190,7 @@ class ElementTrials:
                     while not abs(bar.step) <= STEP * bar.size and substeps < MOST_SUBSTEPS:
                         substeps *= 2
                         bar = self.quantity.accuracy(self._implicit(made, substeps))
-                    error = abs(bar.mesh) / bar.size  # by the finer mesh itself, whatever cancels
+                    error = abs(bar.mesh) / max(bar.size, np.finfo(float).tiny)  # by the finer mesh, whatever cancels
                     doubts = [bar.doubts[name] for name in bar.doubts if name != "mesh cancels"]
                     doubts = doubts if error < COARSE else ()  # others are out of the question anyway
                 except (ValueError, FloatingPointError) as problem:
