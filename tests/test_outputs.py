@@ -109,7 +109,11 @@ RECORDED = [
     ),
     (lambda a: a[1:, [0, 2]].sum(1) + a[0, 0] + a[2].mean() + sum(k * row[0] for k, row in enumerate(a)), (4, 3)),
     (lambda a, b, c: a @ b @ c + c @ c, (5, 4, 3), (3, 2), (2,)),
-    (lambda a, b: np.cross(a[None], b) + b.T.sum() + np.moveaxis(b, 0, 1)[0], (5, 3), (5, 5, 3)),
+    (
+        lambda a, b: np.cross(a[None], b) + np.cross(b, [0, 0, 1]) + b.T.sum() + np.moveaxis(b, 0, 1)[0],
+        (5, 3),
+        (5, 5, 3),
+    ),
     (lambda a, b: np.einsum("ij,kj->k", a, b), (2, 3), (4, 3)),
     (lambda a: np.linalg.inv(a) + np.linalg.det(a)[:, None, None] + a.swapaxes(-1, -2), (4, 3, 3)),
     (lambda a: np.linalg.eigvalsh(a @ a.swapaxes(-1, -2)), (4, 3, 3)),

@@ -37,9 +37,9 @@ class HostForce:
 
     A new force writes `forces`, whose derivatives are found by arrays that record (differentiation/arrays.py) unless `jvp`
     and `vjp` stand beside it. It must then read numbers and the rest shape from `values`, which `take` does not convert, and
-    velocities by `velocities(u)`. One that has an energy E, so that f = -dE/du, also writes `energies` and, where E is stored
-    in the body, `stored`, which balances of energy read. All else has defaults that are right for every force, and may be
-    written where it can be had faster or helps linear solvers.
+    velocities by `velocities(u)`. One that has an energy E, so that f = -dE/du, also writes `energies` and, where E is
+    stored in the body, `stored`, which balances of energy read. All else has defaults that are right for every force, and
+    may be written where it can be had faster or helps linear solvers.
 
     has_energy: whether it has an energy, which line searches and preconditioners then know. Without one, line searches ask
         for `work`. symmetric: whether df/du is in what may move; else linear systems are solved by GMRES.
