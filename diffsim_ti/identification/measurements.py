@@ -84,21 +84,21 @@ class Measurement(metaclass=Public):
         spline, at = CubicSpline(times, np.eye(len(times))), self.times + value_of(offset)
         return made(spline(at), (offset, lambda d: d * spline(at, 1), lambda seed: (seed * spline(at, 1)).sum()))
 
-    def _taken(self, times: np.ndarray, y: np.ndarray, offset) -> np.ndarray:
+    def _taken(self, frames: Frames, y: np.ndarray, offset) -> np.ndarray:
         """Of an output; of numbers that record, too."""
         y = y if self.at is None else y[:, self.at]
         if self.times is not None:
-            y = (self._rows(times, offset) @ y.reshape(len(y), -1)).reshape(len(self.times), *y.shape[1:])
+            y = (self._rows(frames.times, offset) @ y.reshape(len(y), -1)).reshape(len(self.times), *y.shape[1:])
         return y[self.seen] / self.deviation
 
     def residual(self, frames: Frames, offset: float) -> np.ndarray:
         """(y - d) / noise, of what is not missing."""
         y = np.asarray(frames[self.output], np.float64)
-        return self._taken(frames.times, y, offset) - self.values[self.seen] / self.deviation
+        return self._taken(frames, y, offset) - self.values[self.seen] / self.deviation
 
     def _recorded(self, frames: Frames, offset: float) -> tuple:
         y, at = Recorded(np.asarray(frames[self.output], np.float64)), Recorded(offset)
-        return self._taken(frames.times, y, at), y, at
+        return self._taken(frames, y, at), y, at
 
     def change(self, frames: Frames, change: np.ndarray | None, offset: float, d_offset: float) -> np.ndarray:
         """Change of the residual for changes of the output and of the offset of time [s]."""
