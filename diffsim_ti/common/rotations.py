@@ -12,8 +12,8 @@ def _times(scalars: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b; of few vectors several times as fast as NumPy's."""
-    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+    """a x b of vectors of three numbers, with the bits of np.cross in half of its time."""
+    return np.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in ((1, 2), (2, 0), (0, 1))], -1)
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:

@@ -12,6 +12,8 @@ from itertools import count
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
+from diffsim_ti.common import rotations
+
 _numbers = count()
 
 
@@ -303,15 +305,12 @@ def _matmul(a, b):
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b of vectors of three numbers, with the bits of np.cross in a third of its time; of arrays that record, too."""
+    """a x b of vectors of three numbers, or of arrays of them that record."""
     A, B = value_of(a), value_of(b)
     if a is not A or b is not B:
         by_a = (a, lambda da: cross(da, B), lambda seed: cross(B, seed))
         return made(cross(A, B), by_a, (b, lambda db: cross(A, db), lambda seed: cross(seed, A)))
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
-    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        out[..., k] = a[..., i] * b[..., j] - a[..., j] * b[..., i]
-    return out
+    return rotations.cross(a, b)
 
 
 def _einsum(letters: str, *x, optimize=False):
