@@ -436,6 +436,20 @@ def test_refusals(swing):
     ):
         with pytest.raises(ValueError, match=expected):
             identify(swing, *arguments)
+    modes, three = ds.ModalTest(swing.scene, 3), np.zeros((3, 2, 3))
+    for rollout, measurement, expected in (
+        (modes, ds.Measurement("frequencies", np.ones(2), 1.0, at=[0, 2]), "one axis, of which `at` chooses nothing"),
+        (modes, ds.Measurement("frequencies", np.ones(1), 1.0, times=[0.0]), "one instant, which has no times"),
+        (
+            swing,
+            ds.Measurement("positions", np.zeros((11, 2, 3)), 1.0, [0, 999]),
+            "at must be a list of indices in 0..",
+        ),
+        (swing, ds.Measurement("positions", three, 1.0, [0, 1], [0.0, np.nan, 0.1]), "times must lie within"),
+        (swing, ds.Measurement("positions", three, 1.0, [0, 1], [0.0, 0.1, 9.0]), "times must lie within"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            ds.identify(rollout, measurement, {"density": 1.0})
     inside, priors = ds.Unknown(1e5, range=(1e4, 1e6)), (ds.Normal(2e6, 0.1), ds.Normal(1e6, 0.1), ds.Normal(1e5, 0.0))
     for prior in priors:
         with pytest.raises(ValueError, match="lies where the unknown cannot be, or its deviation is 0"):

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.brief import brief
-from diffsim_ti.common.checked import numbers, wholes
+from diffsim_ti.common.checked import numbers, shown, wholes
 from diffsim_ti.common.names import no_such
 from diffsim_ti.common.origin import rounding_of
 from diffsim_ti.common.public import Public
@@ -61,10 +61,18 @@ class Measurement(metaclass=Public):
             raise ValueError("data: " + no_such("output", self.output, rollout.outputs, "this rollout"))
         shape = list(rollout.outputs[self.output].shape(rollout.num_frames))
         if self.at is not None:
+            if len(shape) < 2:
+                raise ValueError(f"{self.output}: values have one axis, of which `at` chooses nothing: leave it out")
+            if self.at.ndim != 1 or np.any((self.at < -shape[1]) | (self.at >= shape[1])):
+                raise ValueError(
+                    f"{self.output}: at must be a list of indices in 0..{shape[1] - 1}, got {shown(self.at)}"
+                )
             shape[1] = len(self.at)
         if self.times is not None:
+            if rollout.num_frames < 2:
+                raise ValueError(f"{self.output}: values are of one instant, which has no times: leave `times` out")
             first, last = rollout.times[0], rollout.times[-1]
-            if self.times.ndim != 1 or self.times.min() < first or self.times.max() > last:
+            if self.times.ndim != 1 or not np.all((self.times >= first) & (self.times <= last)):
                 raise ValueError(f"{self.output}: times must lie within those of the run, {first:g} to {last:g} s")
             shape[0] = len(self.times)
         if self.values.shape != tuple(shape):
