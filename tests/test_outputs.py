@@ -181,6 +181,19 @@ def test_functions_without_a_derivative_say_so(function):
         function(arrays.Recorded(np.ones(3)))
 
 
+def test_a_function_without_a_derivative_is_given_one_as_its_error_says():
+    x, dx = arrays.Recorded(np.array([0.5, 2.0])), np.array([1.0, -3.0])
+    with pytest.raises(TypeError, match="np.log1p has no derivative here: give it one by made or with_slopes"):
+        np.log1p(x)
+    slope = 1 / (1 + x.value)
+    for y in (
+        arrays.with_slopes(np.log1p(x.value), (x, lambda: slope)),
+        arrays.made(np.log1p(x.value), (x, lambda d: d * slope, lambda seed: seed * slope)),
+    ):
+        np.testing.assert_array_equal(arrays.forward(y, [(x, dx)]), dx * slope)
+        np.testing.assert_array_equal(arrays.reverse(y, dx, [x])[0], dx * slope)
+
+
 def test_another_output_within_an_output_is_refused_in_derivatives():
     class Twice(Output):
         name = "twice"

@@ -14,6 +14,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from diffsim_ti.common import rotations
 
+REMEDY = "give it one by made or with_slopes of diffsim_ti.differentiation.arrays"
 _numbers = count()
 
 
@@ -41,13 +42,13 @@ class Recorded(Node, NDArrayOperatorsMixin):
     def _refuse(self, *_, **__):
         raise TypeError(
             "an array whose derivatives are asked for is not made a plain one, nor changed in place: take np.stack, "
-            "np.concatenate or np.where, and y = y + x for y += x, or write jvp and vjp of your own"
+            f"np.concatenate or np.where, and y = y + x for y += x, or {REMEDY}"
         )
 
     __array__ = __float__ = __int__ = __index__ = __bool__ = __setitem__ = _refuse
 
     def __getattr__(self, name: str):
-        raise AttributeError(f"arrays have no derivative by .{name} here: write jvp and vjp of your own")
+        raise AttributeError(f"arrays have no derivative by .{name} here: {REMEDY}")
 
     def __array_ufunc__(self, ufunc, method, *x, **how):
         if ufunc in PARTIALS and method == "__call__" and not how:
@@ -58,7 +59,7 @@ class Recorded(Node, NDArrayOperatorsMixin):
             return _matmul(*x)
         y = getattr(ufunc, method)(*map(value_of, x), **how)
         if np.asarray(y).dtype.kind == "f" and ufunc is not np.sign:
-            raise TypeError(f"np.{ufunc.__name__} has no derivative here: write jvp and vjp of your own")
+            raise TypeError(f"np.{ufunc.__name__} has no derivative here: {REMEDY}")
         return y
 
     def __array_function__(self, function, _, x, how):
@@ -68,7 +69,7 @@ class Recorded(Node, NDArrayOperatorsMixin):
             return _moved(function, *x, **how)
         if function in WITHOUT:
             return function(*map(value_of, x), **how)
-        raise TypeError(f"np.{function.__name__} has no derivative here: write jvp and vjp of your own")
+        raise TypeError(f"np.{function.__name__} has no derivative here: {REMEDY}")
 
     def __len__(self) -> int:
         return len(self.value)
@@ -319,7 +320,7 @@ def _einsum(letters: str, *x, optimize=False):
     if "->" not in letters or any(len(set(word)) < len(word) for word in given):
         raise TypeError(
             f"np.einsum({letters!r}) has no derivative here: write its -> out, take np.diagonal for a letter that stands "
-            "twice in one array, or write jvp and vjp of your own"
+            f"twice in one array, or {REMEDY}"
         )
     further = [np.ndim(a) - len(word) + 3 for a, word in zip(plain, letters.split("->")[0].split(",")) if "..." in word]
     words, out = letters.replace("...", "ABCDEF"[: max(further, default=0)]).split("->")
@@ -371,7 +372,7 @@ def _eigvalsh(A):
 
 def _norm(x, ord=None, axis=None, keepdims=False):
     if ord is not None:
-        raise TypeError(f"np.linalg.norm of ord {ord!r} has no derivative here: write jvp and vjp of your own")
+        raise TypeError(f"np.linalg.norm of ord {ord!r} has no derivative here: {REMEDY}")
     return np.sqrt((x * x).sum(axis, keepdims))
 
 
