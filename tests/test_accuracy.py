@@ -124,6 +124,20 @@ def test_what_cancels_is_of_the_frames_that_the_number_is_of():
         assert number.largest(off, {"end": 0 * off["end"]}) == most
 
 
+def test_bars_of_random_problems_hold_the_error_of_most(monkeypatch, capsys):
+    """One block under random loads: ten nodes in equilibrium, four in steps."""
+    random = example("benchmarks/random_error_bars")
+    rows = {moves: random.numbers(1, 1 if moves else 2, moves) for moves in (False, True)}
+    monkeypatch.setattr(random, "numbers", lambda seed, order, moves: rows[moves])
+    random.main(1)
+    for kind, line in zip((False, False, True, True), capsys.readouterr().out.splitlines()[2:], strict=True):
+        error, uncancelled, true, _ = np.array(rows[kind]).T
+        assert np.all(uncancelled >= abs(error)) and 0.7 < np.median(error / true) < 1.0
+        count, held, median, most, worst, quiet, good = map(float, line.split("|")[3:-1])
+        assert count == len(true) > 20 and held > 0.9 and 1.3 < median < most < 8 and worst < 2.5
+        assert 0 < quiet < 1 and good > 0.4
+
+
 def test_doubts_have_names():
     """Of a mesh that locks, with an error that is large, in one tetrahedron, beside contact; and of a smaller, even one."""
     scene = block().scene

@@ -155,7 +155,7 @@ def test_two_cameras_tell_stiffness_and_friction(cameras, filmed):
     found = cameras.identified(filmed, frames, seed=2)
     for name, truth in cameras.TRUTH.items():
         low, high = found.intervals[name]
-        assert low < truth < high and high - low < 0.02 * truth, str(found)
+        assert low < truth < high and high - low < 0.01 * truth, str(found)
 
 
 def test_the_mesh_is_checked_beside_a_floor(filmed):

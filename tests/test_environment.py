@@ -1,6 +1,7 @@
 """Environments of Gymnasium over a batch: the single one's contract, many as one by one, ends, training."""
 
 import ast
+import runpy
 import subprocess
 import sys
 
@@ -135,3 +136,13 @@ def test_cubes_learn_to_jump_by_gradients(capsys):
     assert found["jumped"] > found["rest"] + 0.01
     assert found["best"] > found["first"] + 0.03
     assert "at once" in capsys.readouterr().out
+
+
+def test_steps_of_grasps_are_counted_on_the_processor_of_ones_choice(monkeypatch, capsys):
+    started = []
+    monkeypatch.setattr("diffsim_ti.init", started.append)
+    monkeypatch.setattr(sys, "argv", ["grasp_steps.py", "--arch", "vulkan", "--seconds", "0.01", "1"])
+    runpy.run_path(str(EXAMPLES / "benchmarks/grasp_steps.py"), run_name="__main__")
+    *_, row = capsys.readouterr().out.splitlines()
+    count, steps = map(float, row.split("|")[1:-1])
+    assert started == ["vulkan"] and count == 1 and steps > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti.accuracy.finer import on_finer
+from diffsim_ti.accuracy.finer import on_finer, rollout_on_finer
 from diffsim_ti.common import rotations
 from diffsim_ti.study import recommend
 
@@ -747,6 +747,15 @@ def test_links_hold_new_vertices_of_a_finer_mesh():
     fine = on_finer(scene_of(held), ds.TetrahedralMesh.refined)
     ((_, vertices),) = fine.terms_of(ds.Robot)[0].holds
     np.testing.assert_array_equal(np.sort(vertices), np.flatnonzero(fine.mesh.vertices[:, 0] == 0))
+
+
+def test_the_error_of_the_mesh_has_shares_by_volume(pressing):
+    rollout = ds.Rollout(ds.ImplicitEulerSolver(pressing, dt=2e-3, tolerance=1e-9), 2, outputs=ds.JointPositions("arm"))
+    finer = ds.TetrahedralMesh.refined
+    found, fine = rollout.accuracy("joint_positions", (1.0, 0.0), finer), rollout_on_finer(rollout, finer)
+    difference = found.value - fine.forward()["joint_positions"][-1, 0]
+    assert found.mesh + found.solver == pytest.approx(difference, rel=1e-4) and "unplaced" in found.doubts
+    np.testing.assert_allclose(found.shares / found.mesh, pressing.mesh.volumes / pressing.mesh.volume, rtol=1e-9)
 
 
 def test_what_does_not_go_with_limits_and_held_vertices_is_refused_and_the_advice_works():

@@ -241,10 +241,7 @@ def _of_mesh(own: Replay, frames: "Frames", number: Number, values: dict, finer:
     n, mesh, eps = scene.mesh.num_vertices, fine.scene.mesh, np.finfo(float).eps
     replay, residuals = Replay(fine, [P @ u for u in own.each("places")]), ()
     nodal, rounding, of_solver, unplaced = np.zeros(mesh.num_vertices), eps * abs(value), 0.0, ""
-    whole = not (
-        solver.explicit or scene.has_multipliers or scene.term(Robot)
-    )  # whether `Replay` has all of its residual
-    if not whole:
+    if solver.explicit or scene.has_multipliers or scene.term(Robot):  # `Replay` does not have all of their residual
         unplaced = "explicit steps, robots and what is held exactly have no residual by vertices on the finer mesh"
         rounding *= own.rollout.sweep.num_passes
         if tight:

@@ -4,7 +4,7 @@ As Newton's are measured (github.com/newton-physics/newton/issues/4141): number 
 `step`, with random actions, after some that are not counted. Environments are those of `gymnasium.make_vec`, and restart
 where an episode ends. A step is 10 ms in 40 substeps of a cube of 27 vertices between two pads.
 
-    python examples/benchmarks/grasp_steps.py [--arch cuda|vulkan|cpu] [environments ...]
+    python examples/benchmarks/grasp_steps.py [--arch cuda|vulkan|cpu] [--seconds 20] [environments ...]
 """
 
 import argparse
@@ -50,6 +50,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("environments", nargs="*", type=int, default=[1, 64, 1024])
     parser.add_argument("--arch", choices=("cuda", "vulkan", "cpu"), default="cpu")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="that are measured")
     given = parser.parse_args()
     ds.init(given.arch)
-    main(given.environments)
+    main(given.environments, given.seconds)
