@@ -183,7 +183,7 @@ def test_functions_without_a_derivative_say_so(function):
 
 def test_a_function_without_a_derivative_is_given_one_as_its_error_says():
     x, dx = arrays.Recorded(np.array([0.5, 2.0])), np.array([1.0, -3.0])
-    with pytest.raises(TypeError, match="np.log1p has no derivative here: give it one by made or with_slopes"):
+    with pytest.raises(TypeError, match="np.log1p has no derivative here: give a derivative by made or with_slopes"):
         np.log1p(x)
     slope = 1 / (1 + x.value)
     for y in (

@@ -14,7 +14,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from diffsim_ti.common import rotations
 
-REMEDY = "give it one by made or with_slopes of diffsim_ti.differentiation.arrays"
+REMEDY = "give a derivative by made or with_slopes of diffsim_ti.differentiation.arrays"
 _numbers = count()
 
 
@@ -41,8 +41,8 @@ class Recorded(Node, NDArrayOperatorsMixin):
 
     def _refuse(self, *_, **__):
         raise TypeError(
-            "an array whose derivatives are asked for is not made a plain one, nor changed in place: take np.stack, "
-            f"np.concatenate or np.where, and y = y + x for y += x, or {REMEDY}"
+            f"an array whose derivatives are asked for is not made a plain one, nor changed in place: {REMEDY}, or take "
+            "np.stack, np.concatenate or np.where, and y = y + x for y += x"
         )
 
     __array__ = __float__ = __int__ = __index__ = __bool__ = __setitem__ = _refuse
@@ -319,8 +319,8 @@ def _einsum(letters: str, *x, optimize=False):
     given = letters.partition("->")[0].replace(".", "").split(",")
     if "->" not in letters or any(len(set(word)) < len(word) for word in given):
         raise TypeError(
-            f"np.einsum({letters!r}) has no derivative here: write its -> out, take np.diagonal for a letter that stands "
-            f"twice in one array, or {REMEDY}"
+            f"np.einsum({letters!r}) has no derivative here: {REMEDY}, or write its -> out, and take np.diagonal for a "
+            "letter that stands twice in one array"
         )
     further = [np.ndim(a) - len(word) + 3 for a, word in zip(plain, letters.split("->")[0].split(",")) if "..." in word]
     words, out = letters.replace("...", "ABCDEF"[: max(further, default=0)]).split("->")
