@@ -418,6 +418,7 @@ OF_BACKENDS = """
     test_examples::test_gpu_gate[reference explicit f32]
     test_batch::test_backends[elastic]
     test_batch::test_backends[relaxing]
+    test_batch::test_backend_of_implicit_scenes
     test_contact_area::test_backend_transpose_of_areas[SemiImplicitSolver]
     test_contact_area::test_backend_transpose_of_areas[VelocityVerletSolver]
     test_contact_area::test_backend_transpose_of_areas[SemiImplicitSolver_force]

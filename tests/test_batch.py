@@ -481,6 +481,28 @@ def test_implicit_scenes_are_solved_together(kind, monkeypatch):
         assert type(together.error(1)) is type(by_turns.error(1)) and "step 0" in str(together.error(1))
 
 
+@pytest.mark.backends
+def test_backend_of_implicit_scenes():
+    """Where each has a thread of its own that sums over a dozen chunks of vertices, and ends after rounds of its own."""
+    if runtime.arch_name() == "vulkan":
+        pytest.skip("lavapipe compiles its kernels for minutes")
+    mesh = ds.TetrahedralMesh.create_box((3, 3, 10), (0.02, 0.02, 0.1))
+    floor = ds.Ground(mesh.vertices[:, 1].min() - 1e-3, friction=0.4, stiffness_per_area=2e5, width=2e-3)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.3), terms=[ds.Gravity(), floor], precision="f64")
+    solver, moduli, found = ds.ImplicitEulerSolver(scene, dt=0.01, tolerance=1e-9), [4e3, 1e6, 3e4], []
+    seed = np.random.default_rng(0).normal(size=(3, 2, mesh.num_vertices, 3))
+    for lanes in (True, False):
+        batch = ds.Batch(solver, 2, 3, gradients="youngs_modulus", lanes=lanes)
+        frames = batch.forward(
+            youngs_modulus=moduli, initial_velocities=np.broadcast_to([0.3, -0.5, 0.1], seed.shape[2:])
+        )
+        assert frames.alive.all() and not frames.alone
+        found.append((frames.displacements, batch.vjp(frames, seed)["youngs_modulus"]))
+    for together, alone in zip(*found):
+        for x, expected in zip(together, alone):
+            np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
 def test_steps_of_implicit_scenes_go_on_from_their_ends():
     whole, own = implicit("on a floor at rest")
     batch, start = ds.Batch(whole.solver, 1, 3), own.pop("initial_velocities")
