@@ -334,6 +334,13 @@ def comes_to_rest(run: Run) -> str | None:
     return None if speed < 0.003 * np.sqrt(2 * G * size) else f"still moves at {speed:.2g} m/s"
 
 
+def _lies(run: Run) -> str | None:
+    """That of the last body, up and down alone: without friction it may slide."""
+    height = run.body(3)[[-6, -1], :, 1].mean(1)
+    speed = abs(float(np.diff(height)[0])) / (5 * run.posed.solver.dt)
+    return None if speed < 0.003 * np.sqrt(2 * G) else f"still moves up or down at {speed:.2g} m/s"
+
+
 def _upside_down(mesh: ds.TetrahedralMesh, height: float) -> ds.TetrahedralMesh:
     return set_on(moved(mesh, turned=([0, 0, 1], np.pi)), height)
 
@@ -369,7 +376,7 @@ def slots(meshes: Meshes) -> Posed:
         contact=ds.SelfContact(1e7, 1e-4),
         fixed=np.arange(3 * cube.num_vertices),
         steps=300,
-        expected=comes_to_rest,
+        expected=_lies,
         **ERLEBEN,
     )
 
@@ -395,7 +402,7 @@ def _stack(side: float, mass_ratio_density: float, E: float, steps: int = 120):
 
 
 SCENES["stack of two"] = _stack(1.0, 1000.0, 1e6)
-SCENES["mass ratio 10 000"] = _stack(10.0, 1e4, 1e8)
+SCENES["mass ratio 10 000"] = _stack(10.0, 1e4, 1e8, steps=200)
 
 
 def _arch(friction: float, stands: bool):
@@ -460,10 +467,11 @@ SCENES["house of cards, friction 0.1"] = _cards(0.1)
 
 
 def _slope(friction: float):
-    """A cube that lies on a board, by a gravity that is turned."""
+    """A cube that lies on a board, by a gravity that is turned. It leans forward by a share of the width; the steepest slope
+    that holds it is less by as much, so that the width is small."""
 
     def make(meshes: Meshes) -> Posed:
-        angle, speed, steps, dt, width = np.arctan(0.5), 1e-3, 60, 0.01, 2e-3
+        angle, speed, steps, dt, width = np.arctan(0.5), 1e-3, 60, 0.01, 1e-4
         board = ds.TetrahedralMesh.create_box((5, 2, 3), size=(4, 0.2, 2)).translated([-1, -0.2, -0.5])
         cube = meshes("cube").translated([-0.4, 0.8 * width, 0.03])
         down = G * np.array([np.sin(angle), -np.cos(angle), 0])
@@ -486,7 +494,7 @@ def _slope(friction: float):
                 dt=dt,
                 steps=steps,
                 gravity=False,
-                contact=ds.SelfContact(2e6, width, friction=friction, friction_speed=speed),
+                contact=ds.SelfContact(1e8, width, friction=friction, friction_speed=speed),
                 terms=[ds.Gravity(down)],
                 fixed=np.arange(board.num_vertices),
                 initial_positions=start,
