@@ -8,7 +8,6 @@ import taichi as ti
 from diffsim_ti.batch.free_vertices import FreeVertices
 from diffsim_ti.batch.views import (
     AtVertices,
-    Corners,
     Item,
     Scratch,
     Shared,
@@ -93,14 +92,16 @@ class BlockViews:
 
     @traced
     def item(self, e, b, plan):
-        return Item(e, b, let(3 * b * plan.num_vertices), let(b * plan.num_tetrahedra))
+        return Item(e=e, b=b, vertices=let(3 * b * plan.num_vertices), tetrahedra=let(b * plan.num_tetrahedra))
 
     @traced
     def tetrahedra_of(self, scene, corner, now):
         """The scene in a pass, for functions of tetrahedra."""
-        coefficients = Uniform(scene.coefficients) if self.features.uniform else scene.coefficients
-        shape = {n: getattr(scene, n) if n in self.own else Shared(getattr(scene, n)) for n in ("gradients", "volumes")}
-        own = dict(coefficients=coefficients, corner=Corners(corner, scene.tets)) | self.growth_of(scene, now)
+        coefficients = Uniform(array=scene.coefficients) if self.features.uniform else scene.coefficients
+        shape = {
+            n: getattr(scene, n) if n in self.own else Shared(array=getattr(scene, n)) for n in ("gradients", "volumes")
+        }
+        own = dict(coefficients=coefficients, corner=Bundle(array=corner, tets=scene.tets)) | self.growth_of(scene, now)
         return Bundle(tets=scene.tets, **own, **shape)
 
     @traced
@@ -112,7 +113,7 @@ class BlockViews:
     def of_tetrahedra(self, scene, adjoint):
         """Adjoints that functions of tetrahedra add to."""
         names = "coefficients", "gradients", "volumes", *self.with_state({}), *self.growing
-        corner = Corners(adjoint.rate_corner, scene.tets)
+        corner = Bundle(array=adjoint.rate_corner, tets=scene.tets)
         return Bundle(rate_corner=corner, **{name: getattr(adjoint, name) for name in names})
 
     @traced
@@ -185,7 +186,7 @@ class BlockViews:
     @traced
     def changed_of(self, tangent, now):
         """Changes of what functions of tetrahedra read."""
-        own = dict(coefficients=Uniform(tangent.coefficients) if self.features.uniform else tangent.coefficients)
+        own = dict(coefficients=Uniform(array=tangent.coefficients) if self.features.uniform else tangent.coefficients)
         own |= self.growth_of(tangent, now)
         return Bundle(gradients=tangent.gradients, volumes=tangent.volumes, **own)
 

@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.batch.views import Column, ItemOfScene, Shared, Uniform, element_of_scenes
+from diffsim_ti.batch.views import Column, Item, Shared, Uniform, element_of_scenes
 from diffsim_ti.runtime import Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
@@ -69,16 +69,21 @@ class InnermostKernels(ExplicitKernels):
 
     @traced
     def item(self, e, plan):
-        return ItemOfScene(*self.split(e, plan), plan.num_scenes)
+        e, b = self.split(e, plan)
+        return Item(e=e, b=b, count=plan.num_scenes)
 
     @traced
     def tetrahedra_of(self, scene, now):
-        shape = {n: getattr(scene, n) if n in self.own else Shared(getattr(scene, n)) for n in ("gradients", "volumes")}
+        shape = {
+            n: getattr(scene, n) if n in self.own else Shared(array=getattr(scene, n)) for n in ("gradients", "volumes")
+        }
         return Bundle(tets=scene.tets, **self.coefficients_of(scene, now), **shape)
 
     @traced
     def coefficients_of(self, record, now) -> dict:
-        out = dict(coefficients=Uniform(record.coefficients) if self.vertex.features.uniform else record.coefficients)
+        out = dict(
+            coefficients=Uniform(array=record.coefficients) if self.vertex.features.uniform else record.coefficients
+        )
         return out | (dict(growths=record.growths, now=now) if self.vertex.features.growing else {})
 
     @traced
