@@ -163,7 +163,7 @@ class Elements:
         self._tetrahedra = elements if elements.shape[1] == 4 else elements[:, :4].copy()
         self._surface_faces = checks.surface_of(elements, len(vertices))
         self._surface_triangles = triangles_of(self._surface_faces)
-        self._middles = middles_of(elements, len(vertices))
+        self._middles = middles_of(elements)
         own = (self._tetrahedra, self._surface_faces, self._surface_triangles, self._middles)
         for array in (vertices, elements, volumes, *own):
             frozen(array)

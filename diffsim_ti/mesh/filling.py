@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from diffsim_ti.common.warn import warn
-from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces, surface_edges
+from diffsim_ti.mesh.geometry import edge_matrices, edges_of, signed_volumes, sorted_faces
 from diffsim_ti.mesh.sets import components, places_of_triangles
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")  # files that hold surfaces alone
@@ -120,7 +120,7 @@ def split_to(points: np.ndarray, triangles: np.ndarray, size: float) -> tuple[np
     again and again; neighbours share the cuts."""
     of = np.arange(len(triangles))
     while True:
-        known, sides = surface_edges(triangles)
+        known, sides = edges_of(triangles)
         long = np.linalg.norm(points[known[:, 1]] - points[known[:, 0]], axis=1) > 1.5 * size
         if not long.any():
             return points, triangles, of
@@ -272,7 +272,7 @@ def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
 def fault_of(points: np.ndarray, triangles: np.ndarray) -> str | None:
     """What is wrong with a surface that is not closed, and where: each edge belongs to two triangles, or to four, six ...
     where parts touch."""
-    known, sides = surface_edges(triangles)
+    known, sides = edges_of(triangles)
     odd = known[np.bincount(sides.ravel()) % 2 == 1]
     if len(triangles) >= 4 and not len(odd):
         return None

@@ -8,10 +8,9 @@ import numpy as np
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh import checks
-from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes
+from diffsim_ti.mesh.geometry import FACES, edge_matrices, edges_of, signed_volumes
 from diffsim_ti.mesh.reference_element import MID_EDGES
 from diffsim_ti.mesh.sets import places_of_triangles
-from diffsim_ti.mesh.ten_nodes import edges_of
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -43,7 +42,7 @@ def parts_of_refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable 
         raise ValueError(f'edges to be halved must be "all" of the chosen tetrahedra or their "longest", got {edges!r}')
     n, corners, every = mesh.num_vertices, mesh.tetrahedra, edges == "all"
     chosen = np.arange(len(corners)) if where is None else mesh.tetrahedron_indices(where)
-    edges, place = edges_of(corners, n)
+    edges, place = edges_of(corners, MID_EDGES)
     lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
     rank = np.empty(len(edges), np.int64)
     rank[np.argsort(np.round(lengths / lengths.max(), 9), kind="stable")] = np.arange(len(edges))
@@ -142,7 +141,7 @@ def _new_vertices(mesh, cut: _Cut, edges, middle, halved) -> tuple:
         flat, first = np.unique(cut.tetrahedra, return_index=True)
         first = first[flat >= n]
         return np.zeros((0, 6), np.int64), (cut.parents[first // 4], cut.L.reshape(-1, 4)[first])
-    fine, place = edges_of(cut.tetrahedra, n)
+    fine, place = edges_of(cut.tetrahedra, MID_EDGES)
     _, first = np.unique(place.ravel(), return_index=True)
     keys, own = edges[~halved] @ [n, 1], middle[~halved]
     at = np.minimum(np.searchsorted(keys, fine @ [n, 1]), max(len(keys) - 1, 0))

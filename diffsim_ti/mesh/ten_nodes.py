@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti.mesh.geometry import FACES
+from diffsim_ti.mesh.geometry import FACES, edges_of
 from diffsim_ti.mesh.reference_element import MID_EDGES
 
 _MIDDLE = {frozenset(ends): 4 + k for k, ends in enumerate(MID_EDGES.tolist())}
@@ -24,28 +24,21 @@ def triangles_of(faces: np.ndarray) -> np.ndarray:
     return faces[:, QUARTERS].reshape(-1, 3) if faces.shape[1] == 6 else faces
 
 
-def edges_of(corners: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-    """(edges, the edge of each of MID_EDGES): each edge once, smaller index first, ascending, shape (k, 2) and (m, 6)."""
-    low, high = np.sort(corners[:, MID_EDGES].reshape(-1, 2), 1).T
-    keys, place = np.unique(low * num_vertices + high, return_inverse=True)
-    return np.stack(np.divmod(keys, num_vertices), 1), place.reshape(-1, 6)
-
-
 def with_middles(vertices: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(vertices, elements of ten nodes, edges): a vertex at the middle of each edge, after those given."""
-    edges, place = edges_of(tetrahedra, len(vertices))
+    edges, place = edges_of(tetrahedra, MID_EDGES)
     middles = (vertices[edges[:, 0]] + vertices[edges[:, 1]]) / 2
     return np.concatenate([vertices, middles]), np.concatenate([tetrahedra, len(vertices) + place], 1), edges
 
 
-def middles_of(elements: np.ndarray, num_vertices: int) -> np.ndarray:
+def middles_of(elements: np.ndarray) -> np.ndarray:
     """Rows (mid-edge vertex, its two ends), one for each edge, shape (k, 3); none with four nodes.
 
     ValueError where an edge has two mid-edge vertices, a mid-edge vertex two edges, or a corner is one.
     """
     if elements.shape[1] == 4:
         return np.zeros((0, 3), np.int64)
-    edges, place = edges_of(elements[:, :4], num_vertices)
+    edges, place = edges_of(elements[:, :4], MID_EDGES)
     place, middles = place.ravel(), elements[:, 4:].ravel()
     _, first = np.unique(place, return_index=True)
     out = middles[first]
