@@ -15,7 +15,7 @@ from diffsim_ti.batch.views import (
     Uniform,
     Vectors,
     View,
-    element_of_eight,
+    element_of,
 )
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, at, let, traced
@@ -31,14 +31,15 @@ OF_STEPS = dict(forces="blocks2", motion="blocks2", path="blocks2", anchor="bloc
 
 
 @dataclass(frozen=True)
-class KickDriftOfEight(KickDrift):
-    """As KickDrift, whose tetrahedra are those of eight scenes, and whose energy is not monitored."""
+class KickDriftOfScenes(KickDrift):
+    """As KickDrift, whose tetrahedra are those of eight scenes in lanes or of one of many, and whose energy is not
+    monitored."""
 
     counts_work = False
 
     @cached_property
     def element(self):
-        return element_of_eight(self.law, self.features)
+        return element_of(self.law, self.features, self.lanes)
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ class BlockViews:
     own: frozenset
 
     @cached_property
-    def vertex(self) -> KickDriftOfEight:
-        return KickDriftOfEight(self.law, self.features, True)
+    def vertex(self) -> KickDriftOfScenes:
+        return KickDriftOfScenes(self.law, self.features, True)
 
     @cached_property
     def free(self) -> FreeVertices:

@@ -295,16 +295,9 @@ class PatchOfScenes(TetrahedronOfScenes, PatchedTetrahedron):
         return total
 
 
-def element_of_eight(law, features) -> TetrahedronOfEight:
-    kind = PatchOfEight if isinstance(law, PatchLaw) else TetrahedronOfEight
-    return kind(law, features.uniform, True, features.order, _growth(features))
-
-
-def element_of_scenes(law, features) -> TetrahedronOfScenes:
-    kind = PatchOfScenes if isinstance(law, PatchLaw) else TetrahedronOfScenes
-    return kind(law, features.uniform, False, features.order, _growth(features))
-
-
-def _growth(features) -> tuple | None:
-    """As Tetrahedron has it; each tetrahedron of each scene has its own."""
-    return (features.growth_per_step, False) if features.growing else None
+def element_of(law, features, lanes: bool) -> TetrahedronOfScenes:
+    """Of eight scenes in lanes, or of one."""
+    alone, patch = (TetrahedronOfEight, PatchOfEight) if lanes else (TetrahedronOfScenes, PatchOfScenes)
+    kind = patch if isinstance(law, PatchLaw) else alone
+    growth = (features.growth_per_step, False) if features.growing else None  # of each tetrahedron of each scene
+    return kind(law, features.uniform, lanes, features.order, growth)
