@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from diffsim_ti.common.warn import warn
+from diffsim_ti.mesh.checks import oriented
 from diffsim_ti.mesh.geometry import edge_matrices, edges_of, signed_volumes, sorted_faces
 from diffsim_ti.mesh.sets import components, places_of_triangles
 
@@ -177,9 +178,8 @@ def by_ftetwild(points: np.ndarray, triangles: np.ndarray, size: float | None, f
     vertices, tetrahedra = found["vertices"].astype(np.float64), found["tetrahedra"].astype(np.int64)
     if not len(tetrahedra):
         raise ValueError(f"{fault}; and fTetWild finds no inside; close its holes (in MeshLab: close holes)")
-    turned = signed_volumes(edge_matrices(vertices, tetrahedra)) < 0
-    tetrahedra[turned] = tetrahedra[turned][:, [0, 2, 1, 3]]
-    volume = float(np.abs(signed_volumes(edge_matrices(vertices, tetrahedra))).sum())
+    volumes = signed_volumes(edge_matrices(vertices, tetrahedra))
+    tetrahedra, volume = oriented(tetrahedra, volumes, fix_orientation=True), float(np.abs(volumes).sum())
     lost = f"; its parts {', '.join(parts)} are no sets then" if parts else ""
     warn(
         f"{fault}: filled by fTetWild, which moves the surface by up to {1e-3 * np.linalg.norm(np.ptp(points, 0)):.2g} m; "

@@ -69,10 +69,7 @@ def parts_of_refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable 
     vertices = np.concatenate([mesh.vertices, new_vertices])
     if mesh.order == 2:
         elements = np.concatenate([elements, new], 1)
-    joined = _joined(mesh, element, L)
-    vertex_sets = {
-        name: np.concatenate([rows, n + np.flatnonzero(joined(rows))]) for name, rows in mesh.vertex_sets.items()
-    }
+    vertex_sets = joined_vertex_sets(mesh, element, L)
     if onto is None:
         volumes = signed_volumes(edge_matrices(vertices, elements[:, :4]))
     else:
@@ -154,8 +151,9 @@ def _new_vertices(mesh, cut: _Cut, edges, middle, halved) -> tuple:
     return ids[place], (cut.parents[first // 6], ends.mean(1))
 
 
-def _joined(mesh, element: np.ndarray, L: np.ndarray):
-    """A function of the members of a vertex set: which new vertices join it, as the middles of edges do in `quadratic()`."""
+def joined_vertex_sets(mesh, element: np.ndarray, L: np.ndarray) -> dict[str, np.ndarray]:
+    """The vertex sets with those of new vertices, at L in an element each, that lie within an edge, a face of the surface or
+    a tetrahedron of which all vertices are members; edges count of such faces and tetrahedra."""
     n, on = mesh.num_vertices, L > 0
     ids = np.sort(
         np.where(on, mesh.tetrahedra[element], -1), 1
@@ -177,7 +175,7 @@ def _joined(mesh, element: np.ndarray, L: np.ndarray):
         out = np.where(count == 2, np.isin(ids[:, -2:] @ [n, 1], pairs @ [n, 1]), out)
         return np.where(count == 3, places_of_triangles(ids[:, -3:], faces) >= 0, out)
 
-    return joined
+    return {name: np.concatenate([rows, n + np.flatnonzero(joined(rows))]) for name, rows in mesh.vertex_sets.items()}
 
 
 def _surface_sets(mesh, fine, cut: _Cut) -> dict[str, np.ndarray]:

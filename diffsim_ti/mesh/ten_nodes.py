@@ -1,4 +1,4 @@
-"""Tetrahedra of ten nodes as arrays: their faces, their mid-edge vertices, and the way from four nodes and back."""
+"""Tetrahedra of ten nodes as arrays: their faces and their mid-edge vertices."""
 
 import numpy as np
 
@@ -22,13 +22,6 @@ QUARTERS = np.array([[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]])  # triangles o
 def triangles_of(faces: np.ndarray) -> np.ndarray:
     """Triangles of whole faces, shape (4 k, 3): three at the corners, then the one between; of three nodes, as they are."""
     return faces[:, QUARTERS].reshape(-1, 3) if faces.shape[1] == 6 else faces
-
-
-def with_middles(vertices: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(vertices, elements of ten nodes, edges): a vertex at the middle of each edge, after those given."""
-    edges, place = edges_of(tetrahedra, MID_EDGES)
-    middles = (vertices[edges[:, 0]] + vertices[edges[:, 1]]) / 2
-    return np.concatenate([vertices, middles]), np.concatenate([tetrahedra, len(vertices) + place], 1), edges
 
 
 def middles_of(elements: np.ndarray) -> np.ndarray:
@@ -63,18 +56,3 @@ def middles_of(elements: np.ndarray) -> np.ndarray:
     if len(both):
         raise ValueError(f"a vertex is a corner or stands on an edge: vertex {both[0]} does both; {remedy}")
     return np.concatenate([out[:, None], edges], 1)
-
-
-def middles_in_set(members: np.ndarray, mesh, edges: np.ndarray) -> np.ndarray:
-    """Rows of edges of a linear mesh whose middles belong to a set of vertices.
-
-    These are the edges of triangles of the surface, and of tetrahedra, whose vertices are all in it.
-    """
-    inside = np.zeros(mesh.num_vertices, bool)
-    inside[members] = True
-    triangles = mesh.surface_triangles[inside[mesh.surface_triangles].all(1)]
-    whole = mesh.tetrahedra[inside[mesh.tetrahedra].all(1)]
-    pairs = np.concatenate([triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), whole[:, MID_EDGES].reshape(-1, 2)])
-    low, high = np.sort(pairs, 1).T
-    keys = edges[:, 0] * mesh.num_vertices + edges[:, 1]
-    return np.nonzero(np.isin(keys, low * mesh.num_vertices + high))[0]
