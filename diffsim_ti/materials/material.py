@@ -39,7 +39,8 @@ class Material(metaclass=Public):
     `to_lame` (2 x K) back. One with numbers of its own lists them in `spellings`, in the order of the law's
     coefficients; a spelling may begin with (youngs_modulus, poissons_ratio), which become mu and lam. `shapes` names
     the numbers that are vectors, such as {"fibre": (3,)}: one of shape (3,) for all, or (num_tetrahedra, 3). `units`
-    says the units of numbers that are not in Pa, such as {"exponent": "-", "viscosity": "Pa s"}. `from_own` is a
+    says the units of numbers that are not in Pa, such as {"exponent": "-", "viscosity": "Pa s"}. `positive` and
+    `not_negative` name those that must be so, with a remedy: {"limit": "30 to 100 for rubber"}. `from_own` is a
     constant matrix from a spelling's numbers, vectors spread out, to the coefficients. `lame` says the moduli of small
     strains (those of the stiffest direction), which the limit of explicit steps and the stiffness of a barrier are
     taken from; its derivatives are found from it, so that it takes NumPy functions that record
@@ -51,6 +52,8 @@ class Material(metaclass=Public):
     spellings = (("youngs_modulus", "poissons_ratio"), ("mu", "lam"))
     shapes: dict[str, tuple] = {}
     units: dict[str, str] = {}
+    positive: dict[str, str] = {}
+    not_negative: dict[str, str] = {}
     at_points: tuple[str, ...] = ()  # names of numbers that each point of the stresses of ten nodes may have its own of
     from_lame = np.eye(2)
     to_lame: np.ndarray | None = None
@@ -155,6 +158,9 @@ class Material(metaclass=Public):
                 bad = value[~np.isfinite(value)] if np.ndim(value) else value
                 got = f"got {np.ravel(bad)[0]} ({np.size(bad)} of {np.size(value)})"
                 raise ValueError(f"{name} must be finite, {got}; its unit is {self.unit_of(name)}")
+        for names, zero_too in ((self.positive, False), (self.not_negative, True)):
+            for name in (name for name in names if name in values):
+                check_range(name, values[name], 0, np.inf, zero_too, names[name])
         if "youngs_modulus" in values:
             check_range("youngs_modulus", values["youngs_modulus"], 0, np.inf, False, "a stiffness [Pa]")
             remedy = '0.5 is incompressible; take 0.45, or up to 0.4999 with volume="patches" of the Scene'
