@@ -12,8 +12,9 @@ from diffsim_ti.common.answers import answered
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.common.names import nearest
 from diffsim_ti.common.public import Public
-from diffsim_ti.differentiation.arrays import Recorded, as_array, forward, reverse, value_of
+from diffsim_ti.differentiation.arrays import as_array, value_of
 from diffsim_ti.inputs import Input, Link
+from diffsim_ti.inputs.chain import Recording
 from diffsim_ti.materials import moduli
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.refinement import Refinement
@@ -210,24 +211,6 @@ class Material(metaclass=Public):
         numbers = np.stack([np.broadcast_to(column, shape) for column in columns], -1)
         return numbers if matrix is None else numbers @ matrix.T
 
-    def coefficients_jvp(self, values: dict, tangents: dict) -> np.ndarray:
-        """Change of the coefficients for changes of the values; names left out do not change."""
-        leaves = {name: Recorded(x) for name, x in values.items()}
-        changes = [(leaves[name], np.broadcast_to(x, leaves[name].shape)) for name, x in tangents.items()]
-        return forward(self._coefficients(leaves), changes)
-
-    def coefficients_vjp(self, values: dict, coefficients_adj: np.ndarray) -> dict[str, np.ndarray]:
-        """Adjoint of each value, of its shape, from the adjoint of the coefficients, shape (num_tetrahedra, K) or (K,).
-
-        A uniform value takes the sum over all tetrahedra.
-        """
-        leaves = {name: Recorded(values[name]) for name in self.inputs}
-        p, adjoint = self._coefficients(leaves), np.asarray(coefficients_adj, np.float64)
-        if p.ndim < adjoint.ndim:  # of what is uniform that of each tetrahedron, or point
-            adjoint = adjoint.sum(1) if p.ndim == 2 else adjoint.reshape(-1, adjoint.shape[-1]).sum(0)
-        found = reverse(p, np.broadcast_to(adjoint, p.shape), leaves.values())
-        return {name: leaf.zeros() if x is None else x for (name, leaf), x in zip(leaves.items(), found)}
-
     def _begins_with_E_and_nu(self) -> bool:
         return self.inputs[:2] == Material.spellings[0]
 
@@ -247,8 +230,8 @@ class Material(metaclass=Public):
         return f"{self.name}({numbers}{self._extra})"
 
 
-class Coefficients(Link):
-    """A law's coefficients of a material's numbers; adjoints may come per tetrahedron also where all are uniform."""
+class Coefficients(Recording, Link):
+    """A law's coefficients of a material's numbers; adjoints may come per tetrahedron or point, also where all are alike."""
 
     writes = ("coefficients",)
 
@@ -258,11 +241,11 @@ class Coefficients(Link):
     def value(self, *x):
         return (self.material.coefficients(dict(zip(self.reads, x))),)
 
-    def jvp(self, x, dx):
-        return (self.material.coefficients_jvp(dict(zip(self.reads, x)), dict(zip(self.reads, dx))),)
-
     def vjp(self, x, y_adj):
-        return tuple(self.material.coefficients_vjp(dict(zip(self.reads, x)), y_adj[0]).values())
+        (p,), adjoint = self.value(*x), np.asarray(y_adj[0], np.float64)
+        if p.ndim < adjoint.ndim:
+            adjoint = adjoint.sum(1) if p.ndim == 2 else adjoint.reshape(-1, adjoint.shape[-1]).sum(0)
+        return super().vjp(x, (np.broadcast_to(adjoint, p.shape),))
 
 
 def number_of_terms(kind: str, each: str, **vectors) -> int:

@@ -94,7 +94,8 @@ def _as_tensors(gradients: dict, names, tensors, needed) -> list:
     out = []
     for name, tensor, need in zip(names, tensors, needed):
         value = gradients.get(name) if need else None
-        value = torch.tensor(value) if isinstance(value, np.ndarray | np.floating) else value  # a copy: gradients may be read-only
+        if isinstance(value, np.ndarray | np.floating):
+            value = torch.tensor(value)  # a copy: gradients may be read-only
         out.append(None if value is None else value.to(tensor.device, tensor.dtype))
     return out
 
