@@ -6,7 +6,7 @@ from example_files import example
 
 import diffsim_ti as ds
 from diffsim_ti.accuracy import estimate
-from diffsim_ti.accuracy.finer import on_finer, rollout_on_finer, rollout_on_ten_nodes
+from diffsim_ti.accuracy.finer import on_finer, rollout_on_finer
 from diffsim_ti.mesh.reference_element import quadrature
 
 BARS = example("benchmarks/error_bars")
@@ -188,7 +188,7 @@ def test_small_motions_have_the_exact_difference_of_two_meshes(kind, steps, firs
     weights = np.array([[1.0, -2.0, 3.0], [0.5, 1.0, -1.0]])
     scaled = rollout.on(rollout.solver, clip=1e-9, truncate=1)  # which change gradients, but no estimate
     found = scaled.accuracy("places", weights)
-    other = rollout_on_ten_nodes(rollout, {}).forward()["places"][-1]
+    other = rollout_on_finer(rollout, ds.TetrahedralMesh.quadratic).forward()["places"][-1]
     difference = (weights * (rollout.forward()["places"][-1] - other)).sum()
     assert found.mesh + found.solver == pytest.approx(difference, rel=2e-3, abs=1e-14)
     assert first_order[-1] == pytest.approx(found.mesh, rel=2e-3, abs=1e-14)
@@ -237,7 +237,7 @@ def falling(kind, gravity: float, tip=None, **options) -> ds.Rollout:
 )
 def test_small_motions_of_ties_and_sets_have_the_exact_difference(kind, tip, first_order):
     rollout = glued(kind, 1e-4) if tip == "tie" else falling(kind, 1e-4, tip)
-    found, fine = rollout.accuracy("end", (0.0, 1.0, 0.0)), rollout_on_ten_nodes(rollout, {})
+    found, fine = rollout.accuracy("end", (0.0, 1.0, 0.0)), rollout_on_finer(rollout, ds.TetrahedralMesh.quadratic)
     difference = found.value - fine.forward()["end"][-1, 0, 1]
     assert found.mesh + found.solver == pytest.approx(difference, rel=5e-3)
     assert first_order[-1] == pytest.approx(found.mesh, rel=5e-3)
@@ -250,7 +250,7 @@ FALLS += [(ds.ImplicitEulerSolver, None, 0.06, 9)]  # the estimate has the other
 @pytest.mark.parametrize("kind, tip, dt, most", FALLS)
 def test_the_bar_of_a_motion_has_the_error_by_two_finer_meshes(kind, tip, dt, most):
     rollout = falling(kind, 9.81, tip, dt=dt)
-    found, fine = rollout.accuracy("end", (0.0, 1.0, 0.0)), rollout_on_ten_nodes(rollout, {})
+    found, fine = rollout.accuracy("end", (0.0, 1.0, 0.0)), rollout_on_finer(rollout, ds.TetrahedralMesh.quadratic)
     true = found.value - rollout_on_finer(fine, ds.TetrahedralMesh.refined, {}).forward()["end"][-1, 0, 1]
     of_mesh = 1.5 * abs(found.mesh) + found.uncancelled["mesh"] / 6
     assert abs(true) < of_mesh < most * abs(true) and of_mesh < found.bar
@@ -262,7 +262,7 @@ def test_errors_that_cancel_are_said_and_widen_the_bar(which):
     """A number of two components whose weights leave it without an error."""
     rollout = falling(ds.BDF2Solver, 9.81)
     if which == "mesh":
-        other, part = rollout_on_ten_nodes(rollout, {}), 1.0
+        other, part = rollout_on_finer(rollout, ds.TetrahedralMesh.quadratic), 1.0
     else:
         other, part = rollout.on(rollout.solver.for_scene(rollout.scene, substeps=2)), 0.75
     apart = (rollout.forward()["end"] - other.forward()["end"])[-1, 0]
@@ -284,7 +284,7 @@ def test_a_chamber_that_holds_its_volume_is_solved_on_the_finer_mesh():
     mesh, end = mesh.with_surface_set("wall", wall), ds.MaterialPoints([[1.5, 3, 1.5]], "end")
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=terms, fixed="floor", precision="f64")
     rollout = ds.Rollout(ds.StaticSolver(scene), 1, outputs=end)
-    found, fine = rollout.accuracy("end", (0.0, 1.0, 0.0)), rollout_on_ten_nodes(rollout, {})
+    found, fine = rollout.accuracy("end", (0.0, 1.0, 0.0)), rollout_on_finer(rollout, ds.TetrahedralMesh.quadratic)
     assert found.value - found.error == pytest.approx(fine.forward()["end"][-1, 0, 1], rel=1e-7)
     assert abs(found.solver) < 1e-6 * found.size and abs(found.error) > 1e-3 * found.size
 

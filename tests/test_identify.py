@@ -8,7 +8,8 @@ import pytest
 from scipy.optimize import least_squares
 
 import diffsim_ti as ds
-from diffsim_ti.accuracy.finer import rollout_on_ten_nodes
+from diffsim_ti.accuracy.finer import rollout_on_finer
+from diffsim_ti.identification.mesh_check import _finer
 from diffsim_ti.identification.problem import Point, Problem
 from diffsim_ti.identification.result import save_picture
 from diffsim_ti.identification.search import Ended, Search, levenberg_marquardt
@@ -207,7 +208,9 @@ def test_what_is_given_by_indices_is_carried_to_ten_nodes():
     load = ds.ExternalForce((0.0, -0.1, 0.0), end)
     by_index = bar(COARSE, [load], ds.Reaction(held), fixed=held)
     np.testing.assert_allclose(
-        rollout_on_ten_nodes(by_index, {}).forward()["reaction"][1], [0, 0.1 * len(end), 0], atol=1e-6
+        rollout_on_finer(by_index, ds.TetrahedralMesh.quadratic).forward()["reaction"][1],
+        [0, 0.1 * len(end), 0],
+        atol=1e-6,
     )
     pairs = (
         (bar(COARSE, [ds.Traction((0, -60.0, 0), rows)], fixed=held), bar(COARSE)),
@@ -223,24 +226,25 @@ def test_what_is_given_by_indices_is_carried_to_ten_nodes():
         ),
     )
     for one, other in pairs:
-        a, b = (rollout_on_ten_nodes(rollout, {}).forward() for rollout in (one, other))
+        a, b = (rollout_on_finer(rollout, ds.TetrahedralMesh.quadratic).forward() for rollout in (one, other))
         np.testing.assert_allclose(a.positions, b.positions, atol=1e-9)
         for name in one.computed:
             np.testing.assert_allclose(a[name], b[name], atol=1e-6 * np.abs(b[name]).max())
-    moved = rollout_on_ten_nodes(pairs[1][0], {}).forward().displacements[1]
+    moved = rollout_on_finer(pairs[1][0], ds.TetrahedralMesh.quadratic).forward().displacements[1]
     sides = pairs[1][0].scene.mesh.quadratic().vertex_indices("xmax")
     np.testing.assert_allclose(moved[sides, 0], 0.02, rtol=1e-6)
 
 
 def test_where_the_mesh_cannot_be_checked_it_is_said_why(swing):
     for rollout, words in (
-        (bar(COARSE.quadratic()), "ten-node tetrahedra already"),
         (bar(COARSE, outputs=ds.Reaction("xmin", per_vertex=True)), "of each vertex"),
         (bar(COARSE, outputs=ds.KineticEnergy([[0, 1]])), "by their indices"),
         (ds.Rollout(swing.solver, ds.UnequalSteps([0.01, 0.02], 8)), "unequal lengths"),
     ):
         with pytest.raises(ValueError, match=words):
-            rollout_on_ten_nodes(rollout, {})
+            rollout_on_finer(rollout, ds.TetrahedralMesh.quadratic)
+    with pytest.raises(ValueError, match="ten-node tetrahedra already"):
+        _finer(SimpleNamespace(problem=SimpleNamespace(rollouts=[bar(COARSE.quadratic())])))
     data = tracks(swing.forward(**TRUE), np.random.default_rng(2))
     velocities = ds.Unknown(0.0, regions=np.zeros((MESH.num_vertices, 3), int), scale=1.0, input="initial_velocities")
     found = ds.identify(swing, data, dict(v=velocities), max_iterations=1)

@@ -21,6 +21,7 @@ from diffsim_ti.materials import (
     moduli,
 )
 from diffsim_ti.materials.calculus.tensor import tensor
+from diffsim_ti.materials.material import Coefficients
 
 E, NU, N = 1e5, 0.3, 200
 INDIFFERENT = [m for m in MATERIALS if m is not LinearElastic]
@@ -485,12 +486,13 @@ def test_coefficient_derivatives_are_exact(material, numbers, uniform):
     else:
         chain = np.stack(list(complex_values.values()), -1) @ (m.from_own if "c10" in numbers else m.from_lame).T
     np.testing.assert_allclose(m.coefficients(values), chain.real, rtol=1e-15)
-    jvp = m.coefficients_jvp(values, tangents)
+    link, x = Coefficients(m), [*values.values()]
+    (jvp,) = link.jvp(x, [*tangents.values()])
     np.testing.assert_allclose(jvp, chain.imag / step, rtol=1e-12)  # complex step is exact: round-off
-    single = m.coefficients_jvp(values, {n: v.astype(np.float32) for n, v in tangents.items()})
+    (single,) = link.jvp(x, [v.astype(np.float32) for v in tangents.values()])
     np.testing.assert_allclose(single, jvp, rtol=1e-6)
     w = rng.normal(size=(4, jvp.shape[-1]))
-    vjp = m.coefficients_vjp(values, w)
+    vjp = dict(zip(link.reads, link.vjp(x, (w,))))
     assert {n: a.shape for n, a in vjp.items()} == {n: v.shape for n, v in values.items()}
     left, right = (w * jvp).sum(), sum((vjp[n] * tangents[n]).sum() for n in values)
     assert left == pytest.approx(right, rel=1e-13)

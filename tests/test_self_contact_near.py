@@ -10,7 +10,7 @@ from pairs_alone import evaluate_pairs
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, PARALLEL, VERTEX_TRIANGLE
-from diffsim_ti.mesh.geometry import surface_edges
+from diffsim_ti.mesh.geometry import edges_of
 from diffsim_ti.terms.obstacles.barrier import beta
 
 LAW, STIFFNESS, WIDTH = ds.StableNeoHookean(5e4, 0.3), 2e3, 5e-3
@@ -25,7 +25,7 @@ def scene_of(mesh, stiffness=STIFFNESS, precision="f64", **options):
 
 def all_pairs(mesh):
     """Corners of all pairs of a body's surface that share no vertex: (vertex-triangle, edge-edge)."""
-    s, t, e = mesh.surface_vertices, mesh.surface_triangles, surface_edges(mesh.surface_triangles)[0]
+    s, t, e = mesh.surface_vertices, mesh.surface_triangles, edges_of(mesh.surface_triangles)[0]
     vt = np.array([[i, *row] for i in s for row in t if i not in row])
     ee = np.array([[*e[a], *e[b]] for a in range(len(e)) for b in range(a) if not set(e[a]) & set(e[b])])
     return vt, ee
@@ -49,7 +49,7 @@ def energy_of_all(mesh, x, width):
 
 def crossings(mesh, x):
     """Number of (edge, triangle) of the surface that pass through each other, by signed volumes."""
-    t, e = mesh.surface_triangles, surface_edges(mesh.surface_triangles)[0]
+    t, e = mesh.surface_triangles, edges_of(mesh.surface_triangles)[0]
 
     def volume(a, b, c, d):
         return np.linalg.det(np.stack([b - a, c - a, d - a], -1))

@@ -15,7 +15,7 @@ from diffsim_ti.mechanics.surfaces.broad_phase_kernels import bits_from, lowest,
 from diffsim_ti.mechanics.surfaces.buffers import BLOCK, Buffers, Launches
 from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
-from diffsim_ti.mesh.geometry import surface_edges
+from diffsim_ti.mesh.geometry import edges_of
 from diffsim_ti.mesh.sets import pieces
 
 by_kind = pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])
@@ -156,7 +156,7 @@ def test_broad_phase_finds_what_brute_force_finds(precision):
     shaken = np.random.default_rng(0).normal(size=box.vertices.shape) * 0.03
     rough = ds.TetrahedralMesh(box.vertices + shaken, box.tetrahedra)
     mesh = ds.TetrahedralMesh.joined([rough, box.translated([0.3, 1.1, 0.2]), rough.translated([-900.0, 0, 0])])
-    triangles, edges = mesh.surface_triangles, surface_edges(mesh.surface_triangles)[0]
+    triangles, edges = mesh.surface_triangles, edges_of(mesh.surface_triangles)[0]
     lengths = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
     found = CandidatePairs(mesh.surface_vertices, triangles, edges, lengths, pieces(mesh), precision)
     vector = ti.types.vector(4, runtime.PRECISIONS[precision])

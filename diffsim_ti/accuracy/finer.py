@@ -122,16 +122,9 @@ def _motion(scene: Scene, nodes: TetrahedralMesh, fixed):
     return carried(motion, scene.held, np.unique(np.concatenate([nodes.vertex_indices(name) for name in names])))
 
 
-def rollout_on_ten_nodes(rollout: "Rollout", values: dict) -> "Rollout":
-    """The same rollout of ten-node tetrahedra; an explicit solver takes as many substeps more as these ask for at the values
-    of inputs. Raises ValueError for what cannot be carried over."""
-    if rollout.scene.mesh.order == 2:
-        raise ValueError("the mesh has ten-node tetrahedra already; fit the data on a mesh of smaller ones as well")
-    return rollout_on_finer(rollout, TetrahedralMesh.quadratic, values)
-
-
 def rollout_on_finer(rollout: "Rollout", finer: Callable, values: dict | None = None, **more) -> "Rollout":
-    """The same rollout on a finer mesh, as in `on_finer`, with some arguments of its solver replaced."""
+    """The same rollout on a finer mesh, as in `on_finer`, with some arguments of its solver replaced; an explicit one takes
+    as many substeps more as that asks for at the values of inputs."""
     scene, outputs = rollout.scene, []
     for k, output in enumerate(rollout.given_outputs):
         inner = output.of if isinstance(output, SmoothMaximum) else output

@@ -8,7 +8,6 @@ import taichi as ti
 from diffsim_ti.batch.free_vertices import FreeVertices
 from diffsim_ti.batch.views import (
     AtVertices,
-    Corners,
     Item,
     Scratch,
     Shared,
@@ -16,7 +15,7 @@ from diffsim_ti.batch.views import (
     Uniform,
     Vectors,
     View,
-    element_of_eight,
+    element_of,
 )
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, at, let, traced
@@ -32,14 +31,15 @@ OF_STEPS = dict(forces="blocks2", motion="blocks2", path="blocks2", anchor="bloc
 
 
 @dataclass(frozen=True)
-class KickDriftOfEight(KickDrift):
-    """As KickDrift, whose tetrahedra are those of eight scenes, and whose energy is not monitored."""
+class KickDriftOfScenes(KickDrift):
+    """As KickDrift, whose tetrahedra are those of eight scenes in lanes or of one of many, and whose energy is not
+    monitored."""
 
     counts_work = False
 
     @cached_property
     def element(self):
-        return element_of_eight(self.law, self.features)
+        return element_of(self.law, self.features, self.lanes)
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class BlockViews:
     own: frozenset
 
     @cached_property
-    def vertex(self) -> KickDriftOfEight:
-        return KickDriftOfEight(self.law, self.features, True)
+    def vertex(self) -> KickDriftOfScenes:
+        return KickDriftOfScenes(self.law, self.features, True)
 
     @cached_property
     def free(self) -> FreeVertices:
@@ -93,14 +93,16 @@ class BlockViews:
 
     @traced
     def item(self, e, b, plan):
-        return Item(e, b, let(3 * b * plan.num_vertices), let(b * plan.num_tetrahedra))
+        return Item(e=e, b=b, vertices=let(3 * b * plan.num_vertices), tetrahedra=let(b * plan.num_tetrahedra))
 
     @traced
     def tetrahedra_of(self, scene, corner, now):
         """The scene in a pass, for functions of tetrahedra."""
-        coefficients = Uniform(scene.coefficients) if self.features.uniform else scene.coefficients
-        shape = {n: getattr(scene, n) if n in self.own else Shared(getattr(scene, n)) for n in ("gradients", "volumes")}
-        own = dict(coefficients=coefficients, corner=Corners(corner, scene.tets)) | self.growth_of(scene, now)
+        coefficients = Uniform(array=scene.coefficients) if self.features.uniform else scene.coefficients
+        shape = {
+            n: getattr(scene, n) if n in self.own else Shared(array=getattr(scene, n)) for n in ("gradients", "volumes")
+        }
+        own = dict(coefficients=coefficients, corner=Bundle(array=corner, tets=scene.tets)) | self.growth_of(scene, now)
         return Bundle(tets=scene.tets, **own, **shape)
 
     @traced
@@ -112,7 +114,7 @@ class BlockViews:
     def of_tetrahedra(self, scene, adjoint):
         """Adjoints that functions of tetrahedra add to."""
         names = "coefficients", "gradients", "volumes", *self.with_state({}), *self.growing
-        corner = Corners(adjoint.rate_corner, scene.tets)
+        corner = Bundle(array=adjoint.rate_corner, tets=scene.tets)
         return Bundle(rate_corner=corner, **{name: getattr(adjoint, name) for name in names})
 
     @traced
@@ -185,7 +187,7 @@ class BlockViews:
     @traced
     def changed_of(self, tangent, now):
         """Changes of what functions of tetrahedra read."""
-        own = dict(coefficients=Uniform(tangent.coefficients) if self.features.uniform else tangent.coefficients)
+        own = dict(coefficients=Uniform(array=tangent.coefficients) if self.features.uniform else tangent.coefficients)
         own |= self.growth_of(tangent, now)
         return Bundle(gradients=tangent.gradients, volumes=tangent.volumes, **own)
 

@@ -7,30 +7,19 @@ single scene (explicit/kick_drift.py), by views of it.
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import taichi as ti
 
-from diffsim_ti.batch.views import Column, ItemOfScene, Shared, Uniform, element_of_scenes
+from diffsim_ti.batch.block_views import KickDriftOfScenes
+from diffsim_ti.batch.views import Column, Item, Shared, Uniform
 from diffsim_ti.runtime import Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels
-from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import OF_STEPS
 from diffsim_ti.state.pass_table import pass_at
 
 SIZES = dict(num_rows="int", num_scenes="int")
-
-
-@dataclass(frozen=True)
-class KickDriftOfScene(KickDrift):
-    """As KickDrift, whose tetrahedra are those of one scene of many, and whose energy is not monitored."""
-
-    counts_work = False
-
-    @cached_property
-    def element(self):
-        return element_of_scenes(self.law, self.features)
 
 
 @dataclass(frozen=True)
@@ -69,16 +58,21 @@ class InnermostKernels(ExplicitKernels):
 
     @traced
     def item(self, e, plan):
-        return ItemOfScene(*self.split(e, plan), plan.num_scenes)
+        e, b = self.split(e, plan)
+        return Item(e=e, b=b, count=plan.num_scenes)
 
     @traced
     def tetrahedra_of(self, scene, now):
-        shape = {n: getattr(scene, n) if n in self.own else Shared(getattr(scene, n)) for n in ("gradients", "volumes")}
+        shape = {
+            n: getattr(scene, n) if n in self.own else Shared(array=getattr(scene, n)) for n in ("gradients", "volumes")
+        }
         return Bundle(tets=scene.tets, **self.coefficients_of(scene, now), **shape)
 
     @traced
     def coefficients_of(self, record, now) -> dict:
-        out = dict(coefficients=Uniform(record.coefficients) if self.vertex.features.uniform else record.coefficients)
+        out = dict(
+            coefficients=Uniform(array=record.coefficients) if self.vertex.features.uniform else record.coefficients
+        )
         return out | (dict(growths=record.growths, now=now) if self.vertex.features.growing else {})
 
     @traced
@@ -118,4 +112,4 @@ class InnermostKernels(ExplicitKernels):
 @lru_cache(maxsize=None)
 def innermost_kernels(law, features: Features, own: frozenset, repeated: bool) -> InnermostKernels:
     """Kernels for a law, a scene's features, and what each scene has of its own."""
-    return InnermostKernels(KickDriftOfScene(law, features, False), True, repeated, own)
+    return InnermostKernels(KickDriftOfScenes(law, features, False), True, repeated, own)

@@ -51,31 +51,25 @@ class SeesOneScene(ReadsScenes):
         return Bundle(**vars(record) | own)
 
 
+def of_one(name: str, vertex: int, first: int):
+    """A function of `one`, for which the records from the argument `first` on, two, are those of a vertex's scene."""
+
+    @traced
+    def call(self, *given):
+        own = self.seen_at(given[vertex], *given[first : first + 2])
+        return getattr(self.one, name)(*given[:first], *own, *given[first + 2 :])
+
+    return call
+
+
 @dataclass(frozen=True)
 class ObstaclesOfScenes(SeesOneScene, ObstaclePotential):
     @cached_property
     def one(self) -> ObstaclePotential:
         return ObstaclePotential(self.features, self.precision)
 
-    @traced
-    def total_energy(self, i, u, scene, pass_, plan, rough):
-        scene, pass_ = self.seen_at(i, scene, pass_)
-        return self.one.total_energy(i, u, scene, pass_, plan, rough)
-
-    @traced
-    def total_force(self, i, u, scene, pass_, plan):
-        scene, pass_ = self.seen_at(i, scene, pass_)
-        return self.one.total_force(i, u, scene, pass_, plan)
-
-    @traced
-    def total_product(self, i, u, w, scene, pass_, plan, rough):
-        scene, pass_ = self.seen_at(i, scene, pass_)
-        return self.one.total_product(i, u, w, scene, pass_, plan, rough)
-
-    @traced
-    def add_vjp(self, i, f, u, w, scene, pass_, adjoint, plan):
-        scene, pass_ = self.seen_at(i, scene, pass_)
-        return self.one.add_vjp(i, f, u, w, scene, pass_, adjoint, plan)
+    total_energy, total_force = of_one("total_energy", 0, 2), of_one("total_force", 0, 2)
+    total_product, add_vjp = of_one("total_product", 0, 3), of_one("add_vjp", 0, 4)
 
 
 @dataclass(frozen=True)
@@ -126,15 +120,7 @@ class SweptOfScenes(SeesOneScene, SweptKernels):
     def one(self) -> SweptKernels:
         return SweptKernels(self.features, self.precision, self.parallel)
 
-    @traced
-    def share_of_one(self, g, k, i, scene, way, at, most, kept):
-        scene, way = self.seen_at(i, scene, way)
-        return self.one.share_of_one(g, k, i, scene, way, at, most, kept)
-
-    @traced
-    def gap(self, g, k, i, t, scene, way, at):
-        scene, way = self.seen_at(i, scene, way)
-        return self.one.gap(g, k, i, t, scene, way, at)
+    share_of_one, gap = of_one("share_of_one", 2, 3), of_one("gap", 2, 4)
 
 
 @dataclass(frozen=True)

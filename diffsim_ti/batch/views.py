@@ -99,33 +99,14 @@ class Scratch:
 
 
 @traced
-class Item:
-    """Tetrahedron e of block b; `vertices` and `tetrahedra` are where the block's vectors and tetrahedra begin."""
-
-    _data_oriented = True
-
-    def __init__(self, e, b, vertices, tetrahedra):
-        self.e, self.b, self.vertices, self.tetrahedra = e, b, vertices, tetrahedra
+class Item(Bundle):
+    """Tetrahedron e of scene b, of `count` scenes; or of block b, whose vectors and tetrahedra begin at `vertices` and
+    `tetrahedra`."""
 
     @traced
     def other(self, e):
-        """Another tetrahedron of the block."""
-        return Item(e, self.b, self.vertices, self.tetrahedra)
-
-
-@traced
-class ItemOfScene:
-    """Tetrahedron e of scene b, of `count` scenes."""
-
-    _data_oriented = True
-
-    def __init__(self, e, b, count):
-        self.e, self.b, self.count = e, b, count
-
-    @traced
-    def other(self, e):
-        """Another tetrahedron of the scene."""
-        return ItemOfScene(e, self.b, self.count)
+        """Another tetrahedron of the scene or the block."""
+        return Item(**vars(self) | dict(e=e))
 
 
 @traced
@@ -163,7 +144,7 @@ class ItemsOfScenes(Items):
 
 @dataclass(frozen=True)
 class EightScenes(ItemsOfScenes):
-    """A tetrahedron of eight scenes simultaneously; an item is an `Item`."""
+    """A tetrahedron of eight scenes simultaneously; an item is an `Item` of a block."""
 
     @cached_property
     def lanes(self):
@@ -195,7 +176,7 @@ class EightScenes(ItemsOfScenes):
 
 @dataclass(frozen=True)
 class OneScene(ItemsOfScenes):
-    """A tetrahedron of one scene, where scenes are innermost; an item is an `ItemOfScene`."""
+    """A tetrahedron of one scene, where scenes are innermost; an item is an `Item` of that."""
 
     def broadcast(self, number):
         return number
@@ -218,33 +199,13 @@ class OneScene(ItemsOfScenes):
 
 
 @traced
-class Shared:
-    """Numbers of tetrahedra that all scenes share."""
-
-    _data_oriented = True
-
-    def __init__(self, array):
-        self.array = array
+class Shared(Bundle):
+    """Numbers of tetrahedra, `array`, that all scenes share."""
 
 
 @traced
-class Uniform:
-    """Numbers of which each scene has one set for all tetrahedra."""
-
-    _data_oriented = True
-
-    def __init__(self, array):
-        self.array = array
-
-
-@traced
-class Corners:
-    """Forces at the nodes, and which nodes a tetrahedron has."""
-
-    _data_oriented = True
-
-    def __init__(self, array, tets):
-        self.array, self.tets = array, tets
+class Uniform(Bundle):
+    """Numbers, `array`, of which each scene has one set for all tetrahedra."""
 
 
 @dataclass(frozen=True)
@@ -334,16 +295,9 @@ class PatchOfScenes(TetrahedronOfScenes, PatchedTetrahedron):
         return total
 
 
-def element_of_eight(law, features) -> TetrahedronOfEight:
-    kind = PatchOfEight if isinstance(law, PatchLaw) else TetrahedronOfEight
-    return kind(law, features.uniform, True, features.order, _growth(features))
-
-
-def element_of_scenes(law, features) -> TetrahedronOfScenes:
-    kind = PatchOfScenes if isinstance(law, PatchLaw) else TetrahedronOfScenes
-    return kind(law, features.uniform, False, features.order, _growth(features))
-
-
-def _growth(features) -> tuple | None:
-    """As Tetrahedron has it; each tetrahedron of each scene has its own."""
-    return (features.growth_per_step, False) if features.growing else None
+def element_of(law, features, lanes: bool) -> TetrahedronOfScenes:
+    """Of eight scenes in lanes, or of one."""
+    alone, patch = (TetrahedronOfEight, PatchOfEight) if lanes else (TetrahedronOfScenes, PatchOfScenes)
+    kind = patch if isinstance(law, PatchLaw) else alone
+    growth = (features.growth_per_step, False) if features.growing else None  # of each tetrahedron of each scene
+    return kind(law, features.uniform, lanes, features.order, growth)

@@ -14,14 +14,20 @@ COLUMNS = ("time", "marker", "x", "y", "z")
 CURVE = ("displacement", "force")
 
 
-def read_tracks(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(times [s], places [m] of shape (times, markers, 3)) of a CSV; NaN where missing."""
+def read_table(path: Path) -> tuple[list[dict], set[str]]:
+    """(rows, names of the columns) of a CSV."""
     with open(path, newline="", encoding="utf-8-sig") as file:
         reader = csv.DictReader(file)
-        missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ValueError(f"{path}: no column {missing[0]!r}; needed are {', '.join(COLUMNS)}")
-        rows = [(row["marker"], *(float(row[name] or "nan") for name in ("time", "x", "y", "z"))) for row in reader]
+        return list(reader), set(reader.fieldnames or ())
+
+
+def read_tracks(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(times [s], places [m] of shape (times, markers, 3)) of a CSV; NaN where missing."""
+    table, names = read_table(path)
+    missing = [name for name in COLUMNS if name not in names]
+    if missing:
+        raise ValueError(f"{path}: no column {missing[0]!r}; needed are {', '.join(COLUMNS)}")
+    rows = [(row["marker"], *(float(row[name] or "nan") for name in ("time", "x", "y", "z"))) for row in table]
     times, markers = sorted({row[1] for row in rows}), sorted({row[0] for row in rows})
     places = np.full((len(times), len(markers), 3), np.nan)
     for marker, time, *place in rows:
@@ -33,18 +39,11 @@ def read_tracks(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def read_curve(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """(displacements [m], forces [N], NaN where missing) of a CSV."""
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        rows = [[float(row[name] or "nan") for name in CURVE] for row in csv.DictReader(file)]
+    rows = [[float(row[name] or "nan") for name in CURVE] for row in read_table(path)[0]]
     ways, forces = np.array(rows).reshape(-1, 2).T
     if len(ways) == 0 or not np.isfinite(ways).all():
         raise ValueError(f"{path}: needs a displacement [m] in each of one row or more")
     return ways, forces
-
-
-def is_curve(path: Path) -> bool:
-    """Whether a CSV has the columns of a force curve."""
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        return set(CURVE) <= set(csv.DictReader(file).fieldnames or ())
 
 
 def numbers_of(unknown: list[str]) -> dict[str, float]:
@@ -94,7 +93,7 @@ def identify(
         material, guesses.get("youngs_modulus", youngs_modulus), guesses.get("poissons_ratio", poissons_ratio)
     )
     ds.init(precision="f64")
-    curve = is_curve(data)
+    curve = set(CURVE) <= read_table(data)[1]
     if curve != (pull is not None):
         raise ValueError(
             "--pull: which vertices the machine moves; it belongs to a CSV with columns displacement, force"

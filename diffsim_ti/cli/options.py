@@ -5,7 +5,6 @@ import json
 import math
 import runpy
 from collections.abc import Sequence
-from difflib import get_close_matches
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike
 from typer import Argument, Option
 
 import diffsim_ti
+from diffsim_ti.common.names import nearest
 from diffsim_ti.materials import MATERIALS
 from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
@@ -60,8 +60,8 @@ def read_options(context: typer.Context, path: Path | None) -> Path | None:
         raise ValueError(f"--config {path}: {error}; --write-config writes one to begin with") from error
     known = _parameters(context)
     for key in given.keys() - known.keys():
-        near = get_close_matches(key.replace("_", "-"), known, 1, 0.5)
-        meant = f"did you mean {near[0]!r}? " if near else ""
+        near = nearest(key, known)
+        meant = f"did you mean {near!r}? " if near else ""
         raise ValueError(f"--config {path}: no option is called {key!r}: {meant}there are {', '.join(known)}")
     several = {key: [x] if known[key].multiple and isinstance(x, str) else x for key, x in given.items()}
     context.default_map = {known[key].name: x for key, x in several.items()}

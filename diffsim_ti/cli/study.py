@@ -3,7 +3,7 @@
 import inspect
 import runpy
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated
 
@@ -209,15 +209,9 @@ class FromFile:
         return self._made(**numbers) if callable(self._made) else self._made
 
 
-@dataclass(frozen=True)
-class ResultsOfFile:
-    """`results` of a Python file."""
-
-    path: str
-    precision: str
-
-    def __call__(self, frames):
-        return _of_file(self.path, self.precision)["results"](frames)
+def results_of(path: str, precision: str, frames):
+    """What `results` of a Python file says of frames."""
+    return _of_file(path, precision)["results"](frames)
 
 
 def axis(text: str) -> tuple[str, list[float]]:
@@ -282,7 +276,7 @@ def sweep(
             raise ValueError(f"{scene}: no such file; give a mesh, or a Python file that defines scene or rollout")
         make = FromFile(str(scene), precision)
         if "results" in _of_file(str(scene), precision):
-            results = ResultsOfFile(str(scene), precision)
+            results = partial(results_of, str(scene), precision)
     else:
         make = opt.own_scene(scene, material, youngs_modulus, poissons_ratio, density, fixed)
     with workers_of(workers) as executor:

@@ -15,25 +15,25 @@ def shown(value) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
+def _float(value) -> float:
+    """A number, nan for what is none."""
+    try:
+        return math.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
 def number(name: str, value, low: float = 0.0, unit: str = "") -> float:
     """A finite number above `low`."""
-    rule = f"{name} must be > {low:g}{f' [{unit}]' if unit else ''}, got {shown(value)}"
-    try:
-        out = float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(rule) from None
-    if isinstance(value, bool | str) or not math.isfinite(out) or not out > low:
-        raise ValueError(rule)
+    if not low < (out := _float(value)) < math.inf:
+        raise ValueError(f"{name} must be > {low:g}{f' [{unit}]' if unit else ''}, got {shown(value)}")
     return out
 
 
 def between(name: str, value, low: float, high: float, ends: bool) -> float:
     """A number from `low` to `high`; ends: these too."""
-    try:
-        out = float(value)
-    except (TypeError, ValueError, OverflowError):
-        out = math.nan
-    if isinstance(value, bool | str) or not (low <= out <= high if ends else low < out < high):
+    out = _float(value)
+    if not (low <= out <= high if ends else low < out < high):
         raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {shown(value)}")
     return out
 

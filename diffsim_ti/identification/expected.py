@@ -59,8 +59,11 @@ def expected(
     problem = Problem(rollouts, filled, unknowns)
     priors = Priors(prior, problem.unknowns, rollouts[0].scene.mesh)
     t = np.zeros(problem.size)
-    found = Information.of(problem.labels, problem.jacobian(problem.run(t)), priors.hessian(t))
-    return Expectation(problem.numbers(t), **described(problem, t, found))
+    return _told(problem, t, problem.jacobian(problem.run(t)), priors.hessian(t))
+
+
+def _told(problem: Problem, t: np.ndarray, J: np.ndarray, hessian: np.ndarray) -> Expectation:
+    return Expectation(problem.numbers(t), **described(problem, t, Information.of(problem.labels, J, hessian)))
 
 
 def _complete(data, rollout: Experiment):
@@ -88,8 +91,7 @@ def compare(
     J, hessian = problem.jacobian(problem.run(t)), priors.hessian(t)
     for name, given in lists.items():
         end = begin + sum(len(m.deviation) for m in given)
-        found, begin = Information.of(problem.labels, J[begin:end], hessian), end
-        out[name] = Expectation(problem.numbers(t), **described(problem, t, found))
+        out[name], begin = _told(problem, t, J[begin:end], hessian), end
     return dict(sorted(out.items(), key=lambda pair: pair[1].log_volume))
 
 

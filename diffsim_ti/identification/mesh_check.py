@@ -4,12 +4,13 @@ import warnings
 
 import numpy as np
 
-from diffsim_ti.accuracy.finer import on_ten_nodes, rollout_on_ten_nodes
+from diffsim_ti.accuracy.finer import on_ten_nodes, rollout_on_finer
 from diffsim_ti.identification.measurements import Measurement
 from diffsim_ti.identification.modal_test import ModalTest
 from diffsim_ti.identification.problem import Experiment, Problem
 from diffsim_ti.identification.result import Information, MeshCheck
 from diffsim_ti.identification.search import FAILURES, Search
+from diffsim_ti.mesh import TetrahedralMesh
 
 RUNS, USUAL = 12, 5  # on the finer mesh: at most, and usually
 # a step that is this share of the standard errors, or of the way from the first estimates, is the last
@@ -71,15 +72,13 @@ def _finer(search: Search) -> Problem:
     """The same problem with ten-node tetrahedra. Raises ValueError for what cannot be carried over."""
     problem, rollouts, data = search.problem, [], []
     for k, experiment in enumerate(problem.rollouts):
+        if experiment.scene.mesh.order == 2:
+            raise ValueError("the mesh has ten-node tetrahedra already; fit the data on a mesh of smaller ones as well")
         if isinstance(experiment, ModalTest):
-            if experiment.scene.mesh.order == 2:
-                raise ValueError(
-                    "the mesh has ten-node tetrahedra already; fit the data on a mesh of smaller ones as well"
-                )
             fine = ModalTest(on_ten_nodes(experiment.scene), experiment.k)
         else:
             values = {name: x for name, x in problem.inputs(k, search.point.t).items() if name != "time_offset"}
-            fine = rollout_on_ten_nodes(experiment, values)
+            fine = rollout_on_finer(experiment, TetrahedralMesh.quadratic, values)
         rollouts.append(fine)
         data.append([_carried(m, experiment, fine) for m in problem.data[k]])
     out = Problem(rollouts, data, {free.label: free.unknown for free in problem.unknowns})

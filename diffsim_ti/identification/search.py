@@ -135,6 +135,8 @@ class LevenbergMarquardt:
 
     def step(self) -> np.ndarray:
         """The damped Gauss-Newton step."""
+        from scipy.sparse.linalg import LinearOperator, cg
+
         problem, damping = self.search.problem, self.search.damping
         if self.dense:
             damped = self.hessian + np.diag(damping * np.diag(self.hessian) + LEAST)
@@ -147,7 +149,8 @@ class LevenbergMarquardt:
         solve = np.linalg.inv(self.prior_hessian + np.eye(problem.size))
         before, self.size = self.size, float(self.gradient @ solve @ self.gradient)
         share = FORCING[1] if before is None else float(np.clip(self.size / before, *FORCING))
-        return _conjugate_gradients(product, -self.gradient, solve, share)
+        operator = LinearOperator((problem.size, problem.size), product, dtype=np.float64)
+        return cg(operator, -self.gradient, rtol=share, maxiter=100, M=solve)[0]
 
     def limited(self, step: np.ndarray) -> np.ndarray:
         """A step that changes no logarithm and no bounded number by more than LONGEST."""
@@ -188,25 +191,6 @@ def levenberg_marquardt(search: Search, record: Callable, tolerance: float) -> t
         record(promised, why)
         if rejected > 12:
             return f"no step lowers the cost ({why})", False
-
-
-def _conjugate_gradients(product: Callable, b: np.ndarray, solve: np.ndarray, share: float, iterations: int = 100):
-    """Approximate solution of A x = b, A symmetric and positive, preconditioned by the matrix `solve`, until that share of
-    the residual's norm is left: Steihaug 1983, doi:10.1137/0720042."""
-    x, r = np.zeros_like(b), b.copy()
-    z = solve @ r
-    p, size = z.copy(), float(r @ z)
-    stop = share**2 * size
-    for _ in range(iterations):
-        if size <= stop or size == 0:
-            break
-        Ap = product(p)
-        alpha = size / float(p @ Ap)
-        x, r = x + alpha * p, r - alpha * Ap
-        z = solve @ r
-        size, before = float(r @ z), size
-        p = z + size / before * p
-    return x
 
 
 SMALL_STEPS = 3  # iterations that hardly lower the cost, one after the other, end L-BFGS-B

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.brief import brief
 from diffsim_ti.common.checked import numbers, shape_of, shown
 from diffsim_ti.common.public import Public
+from diffsim_ti.differentiation.arrays import Recorded, forward
 from diffsim_ti.mesh.geometry import inner_faces, triangle_normals
 from diffsim_ti.rollout import Rollout
 
@@ -116,25 +117,25 @@ class Free:
             raise ValueError(f"{self.label}: regions have shape {rows.shape}, the input {shape}")
         return rows
 
+    @property
+    def _at_start(self) -> np.ndarray:
+        """s of bounded numbers at the start."""
+        low, high = self.unknown.range
+        return np.log((self.start - low) / (high - self.start))
+
     def numbers(self, t: np.ndarray) -> np.ndarray:
-        """x(t)"""
+        """x(t); t may record."""
         if self.kind == "log":
             return self.start * np.exp(t)
         if self.kind == "linear":
             return self.start + self.scale * t
         low, high = self.unknown.range
-        at = np.log((self.start - low) / (high - self.start))
-        return low + (high - low) / (1 + np.exp(-(t + at)))
+        return low + (high - low) / (1 + np.exp(-(t + self._at_start)))
 
     def slopes(self, t: np.ndarray) -> np.ndarray:
         """dx/dt"""
-        x = self.numbers(t)
-        if self.kind == "log":
-            return x
-        if self.kind == "linear":
-            return self.scale
-        low, high = self.unknown.range
-        return (x - low) * (high - x) / (high - low)
+        t = Recorded(t)
+        return forward(self.numbers(t), [(t, np.ones(self.size))])
 
     def free(self, x: ArrayLike) -> np.ndarray:
         """t(x)"""
@@ -144,15 +145,13 @@ class Free:
         if self.kind == "linear":
             return (x - self.start) / self.scale
         low, high = self.unknown.range
-        return np.log((x - low) / (high - x)) - np.log((self.start - low) / (high - self.start))
+        return np.log((x - low) / (high - x)) - self._at_start
 
     def reach(self) -> np.ndarray:
         """The least and the largest t of each number, shape (2, size)."""
         if self.kind != "bounded":
             return np.outer((-np.inf, np.inf), np.ones(self.size))
-        low, high = self.unknown.range
-        at = np.log((self.start - low) / (high - self.start))
-        return np.stack([np.minimum(-EDGE - at, 0.0), np.maximum(EDGE - at, 0.0)])
+        return np.stack([np.minimum(-EDGE - self._at_start, 0.0), np.maximum(EDGE - self._at_start, 0.0)])
 
     def spread(self, k: int, x: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The input of experiment k with these numbers where they go, and `into` elsewhere."""

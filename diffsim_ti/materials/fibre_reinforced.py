@@ -51,15 +51,14 @@ class FibreReinforced(Around):
         families = sum(name.split("_")[0] == "k1" for name in getattr(matrix, "inputs", ()))
         names = [f"{name}_{families + 1}" if families else name for name in UNITS]
         self.units, self.shapes = dict(zip(names, UNITS.values())), {names[2]: (3,)}
+        self.positive = {names[1]: "an exponent; 1e-6 makes fibres quadratic"}
+        self.not_negative = {names[0]: "a stiffness [Pa]"}
         self._surround(matrix, dict(zip(names, (k1, k2, fibre))))
 
     def check(self, values):
         super().check(values)
-        k1, k2, fibre = self.own
-        check_range(k1, values[k1], 0, np.inf, True, "a stiffness [Pa]")
-        check_range(k2, values[k2], 0, np.inf, False, "an exponent; 1e-6 makes fibres quadratic")
-        length = np.linalg.norm(values[fibre], axis=-1)
-        check_range(f"length of {fibre}", length, 0, np.inf, False, "a direction needs a length")
+        length = np.linalg.norm(values[self.own[2]], axis=-1)
+        check_range(f"length of {self.own[2]}", length, 0, np.inf, False, "a direction needs a length")
 
     def lame(self, values):
         mu, lam = self.material.lame(self.inner(values))

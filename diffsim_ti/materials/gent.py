@@ -7,7 +7,7 @@ import numpy as np
 from diffsim_ti.differentiation import x_minus_log1p
 from diffsim_ti.materials.calculus.tensor import invariants, isochoric
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,11 @@ class Gent(Material):
 
     spellings = (("mu", "limit", "bulk_modulus"),)
     units = {"limit": "-"}
+    positive = {"limit": "of J^(-2/3) I_C - 3 [-], 30 to 100 for rubber", "bulk_modulus": "a stiffness [Pa]"}
     to_lame = np.array([[1.0, 0, 0], [-2 / 3, 0, 1]])
 
     def __init__(self, mu: PerTetrahedron, limit: PerTetrahedron, bulk_modulus: PerTetrahedron):
         super().__init__(mu, limit, bulk_modulus)
-
-    def check(self, values):
-        super().check(values)
-        check_range("limit", values["limit"], 0, np.inf, False, "of J^(-2/3) I_C - 3 [-], 30 to 100 for rubber")
-        check_range("bulk_modulus", values["bulk_modulus"], 0, np.inf, False, "a stiffness [Pa]")
 
     def law(self, precision):
         return GentLaw(precision)

@@ -164,6 +164,12 @@ class J2Plasticity(Material):
     """
 
     units = {"saturation_exponent": "-"}
+    positive = dict(
+        yield_stress="the stress [Pa] at which flow begins", saturation_exponent="leave both out, or raise it"
+    )
+    not_negative = dict.fromkeys(
+        ("hardening", "kinematic_hardening"), "what softens flows in a band of the mesh's width"
+    )
 
     def __init__(
         self,
@@ -195,13 +201,7 @@ class J2Plasticity(Material):
 
     def check(self, values):
         super().check(values)
-        check_range("yield_stress", values["yield_stress"], 0, np.inf, False, "the stress [Pa] at which flow begins")
-        for name in ("hardening", *("kinematic_hardening",) * self.kinematic):
-            check_range(name, values[name], 0, np.inf, True, "what softens flows in a band of the mesh's width")
         if self.saturating:
-            check_range(
-                "saturation_exponent", values["saturation_exponent"], 0, np.inf, False, "leave both out, or raise it"
-            )
             last, first = values["saturation_stress"], values["yield_stress"]
             if last.shape == first.shape or 1 in (last.size, first.size):  # else of sets, not on a mesh yet
                 rise = last - first

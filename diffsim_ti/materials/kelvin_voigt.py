@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import SIX, green_strain, green_strain_differential, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.law import Law, as_of
-from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron
 from diffsim_ti.materials.sum_law import SumLaw
 from diffsim_ti.runtime import traced
 
@@ -125,6 +123,7 @@ class KelvinVoigt(Around):
     """
 
     units = {"viscous_time": "s", "shear_viscosity": "Pa s", "bulk_viscosity": "Pa s"}
+    not_negative = dict.fromkeys(units, "viscosity takes energy away")
     remembers = False
 
     def __init__(
@@ -141,11 +140,6 @@ class KelvinVoigt(Around):
                 f"KelvinVoigt: needs time, or shear_viscosity and bulk_viscosity, got ({', '.join(given) or 'nothing'})"
             )
         self._surround(material, given)
-
-    def check(self, values):
-        super().check(values)
-        for name in self.own:
-            check_range(name, values[name], 0, np.inf, True, "viscosity takes energy away")
 
     def lame(self, values):
         return self.material.lame(self.inner(values))

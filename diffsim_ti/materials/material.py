@@ -12,8 +12,9 @@ from diffsim_ti.common.answers import answered
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.common.names import nearest
 from diffsim_ti.common.public import Public
-from diffsim_ti.differentiation.arrays import Recorded, as_array, forward, reverse, value_of
+from diffsim_ti.differentiation.arrays import as_array, value_of
 from diffsim_ti.inputs import Input, Link
+from diffsim_ti.inputs.chain import Recording
 from diffsim_ti.materials import moduli
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.refinement import Refinement
@@ -39,7 +40,8 @@ class Material(metaclass=Public):
     `to_lame` (2 x K) back. One with numbers of its own lists them in `spellings`, in the order of the law's
     coefficients; a spelling may begin with (youngs_modulus, poissons_ratio), which become mu and lam. `shapes` names
     the numbers that are vectors, such as {"fibre": (3,)}: one of shape (3,) for all, or (num_tetrahedra, 3). `units`
-    says the units of numbers that are not in Pa, such as {"exponent": "-", "viscosity": "Pa s"}. `from_own` is a
+    says the units of numbers that are not in Pa, such as {"exponent": "-", "viscosity": "Pa s"}. `positive` and
+    `not_negative` name those that must be so, with a remedy: {"limit": "30 to 100 for rubber"}. `from_own` is a
     constant matrix from a spelling's numbers, vectors spread out, to the coefficients. `lame` says the moduli of small
     strains (those of the stiffest direction), which the limit of explicit steps and the stiffness of a barrier are
     taken from; its derivatives are found from it, so that it takes NumPy functions that record
@@ -51,6 +53,8 @@ class Material(metaclass=Public):
     spellings = (("youngs_modulus", "poissons_ratio"), ("mu", "lam"))
     shapes: dict[str, tuple] = {}
     units: dict[str, str] = {}
+    positive: dict[str, str] = {}
+    not_negative: dict[str, str] = {}
     at_points: tuple[str, ...] = ()  # names of numbers that each point of the stresses of ten nodes may have its own of
     from_lame = np.eye(2)
     to_lame: np.ndarray | None = None
@@ -155,6 +159,9 @@ class Material(metaclass=Public):
                 bad = value[~np.isfinite(value)] if np.ndim(value) else value
                 got = f"got {np.ravel(bad)[0]} ({np.size(bad)} of {np.size(value)})"
                 raise ValueError(f"{name} must be finite, {got}; its unit is {self.unit_of(name)}")
+        for names, zero_too in ((self.positive, False), (self.not_negative, True)):
+            for name in (name for name in names if name in values):
+                check_range(name, values[name], 0, np.inf, zero_too, names[name])
         if "youngs_modulus" in values:
             check_range("youngs_modulus", values["youngs_modulus"], 0, np.inf, False, "a stiffness [Pa]")
             remedy = '0.5 is incompressible; take 0.45, or up to 0.4999 with volume="patches" of the Scene'
@@ -204,24 +211,6 @@ class Material(metaclass=Public):
         numbers = np.stack([np.broadcast_to(column, shape) for column in columns], -1)
         return numbers if matrix is None else numbers @ matrix.T
 
-    def coefficients_jvp(self, values: dict, tangents: dict) -> np.ndarray:
-        """Change of the coefficients for changes of the values; names left out do not change."""
-        leaves = {name: Recorded(x) for name, x in values.items()}
-        changes = [(leaves[name], np.broadcast_to(x, leaves[name].shape)) for name, x in tangents.items()]
-        return forward(self._coefficients(leaves), changes)
-
-    def coefficients_vjp(self, values: dict, coefficients_adj: np.ndarray) -> dict[str, np.ndarray]:
-        """Adjoint of each value, of its shape, from the adjoint of the coefficients, shape (num_tetrahedra, K) or (K,).
-
-        A uniform value takes the sum over all tetrahedra.
-        """
-        leaves = {name: Recorded(values[name]) for name in self.inputs}
-        p, adjoint = self._coefficients(leaves), np.asarray(coefficients_adj, np.float64)
-        if p.ndim < adjoint.ndim:  # of what is uniform that of each tetrahedron, or point
-            adjoint = adjoint.sum(1) if p.ndim == 2 else adjoint.reshape(-1, adjoint.shape[-1]).sum(0)
-        found = reverse(p, np.broadcast_to(adjoint, p.shape), leaves.values())
-        return {name: leaf.zeros() if x is None else x for (name, leaf), x in zip(leaves.items(), found)}
-
     def _begins_with_E_and_nu(self) -> bool:
         return self.inputs[:2] == Material.spellings[0]
 
@@ -241,8 +230,8 @@ class Material(metaclass=Public):
         return f"{self.name}({numbers}{self._extra})"
 
 
-class Coefficients(Link):
-    """A law's coefficients of a material's numbers; adjoints may come per tetrahedron also where all are uniform."""
+class Coefficients(Recording, Link):
+    """A law's coefficients of a material's numbers; adjoints may come per tetrahedron or point, also where all are alike."""
 
     writes = ("coefficients",)
 
@@ -252,11 +241,11 @@ class Coefficients(Link):
     def value(self, *x):
         return (self.material.coefficients(dict(zip(self.reads, x))),)
 
-    def jvp(self, x, dx):
-        return (self.material.coefficients_jvp(dict(zip(self.reads, x)), dict(zip(self.reads, dx))),)
-
     def vjp(self, x, y_adj):
-        return tuple(self.material.coefficients_vjp(dict(zip(self.reads, x)), y_adj[0]).values())
+        (p,), adjoint = self.value(*x), np.asarray(y_adj[0], np.float64)
+        if p.ndim < adjoint.ndim:
+            adjoint = adjoint.sum(1) if p.ndim == 2 else adjoint.reshape(-1, adjoint.shape[-1]).sum(0)
+        return super().vjp(x, (np.broadcast_to(adjoint, p.shape),))
 
 
 def number_of_terms(kind: str, each: str, **vectors) -> int:

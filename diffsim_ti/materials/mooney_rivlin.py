@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti.materials.calculus import logarithm
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
-from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ class MooneyRivlin(Material):
 
     spellings = (*Material.spellings, ("c10", "c01", "bulk_modulus"))
     to_lame = np.array([[2.0, 2, 0], [0, 0, 1]])
+    positive, not_negative = dict.fromkeys(("c10", "bulk_modulus"), "a stiffness [Pa]"), {"c01": "a stiffness [Pa]"}
 
     def __init__(
         self,
@@ -86,12 +87,6 @@ class MooneyRivlin(Material):
     def from_own(self) -> np.ndarray:
         """From (c10, c01, bulk_modulus) to the coefficients (c10, c01, lam), lam = K - 4/3 (c10 + c01)."""
         return np.array([[1, 0, 0], [0, 1, 0], [-4 / 3, -4 / 3, 1]])
-
-    def check(self, values: dict) -> None:
-        super().check(values)
-        for name, low_included in (("c10", False), ("c01", True), ("bulk_modulus", False)):
-            if name in values:
-                check_range(name, values[name], 0, np.inf, low_included, "a stiffness [Pa]")
 
     def law(self, precision: str) -> MooneyRivlinLaw:
         return MooneyRivlinLaw(precision, self.J_floor)

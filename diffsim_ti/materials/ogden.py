@@ -49,6 +49,7 @@ class Ogden(Material):
 
     spellings = (("moduli", "exponents", "bulk_modulus"),)
     units = {"exponents": "-"}
+    positive = {"bulk_modulus": "a stiffness [Pa]"}
 
     def __init__(self, moduli: PerTetrahedron, exponents: PerTetrahedron, bulk_modulus: PerTetrahedron):
         self.terms = number_of_terms("Ogden", "term", moduli=moduli, exponents=exponents)
@@ -57,7 +58,6 @@ class Ogden(Material):
 
     def check(self, values):
         super().check(values)
-        check_range("bulk_modulus", values["bulk_modulus"], 0, np.inf, False, "a stiffness [Pa]")
         mu, a = values["moduli"], values["exponents"]
         if mu.shape == a.shape or 1 in (mu.ndim, a.ndim):  # else of sets, not on a mesh yet
             shear = (mu * a).sum(-1) / 2

@@ -8,7 +8,7 @@ from diffsim_ti.differentiation import exp
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import SIX, green_strain, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, PerTetrahedron, check_range, number_of_terms
+from diffsim_ti.materials.material import Material, PerTetrahedron, number_of_terms
 from diffsim_ti.materials.sum_law import SumLaw
 
 
@@ -65,16 +65,12 @@ class Prony(Around):
     """
 
     units = {"prony_shares": "-", "prony_times": "s"}
+    positive, not_negative = {"prony_times": "a time [s]"}, {"prony_shares": "a share of the moduli that last"}
 
     def __init__(self, material: Material, shares: PerTetrahedron, times: PerTetrahedron):
         self.terms = number_of_terms("Prony", "branch", shares=shares, times=times)
         self.shapes = {"prony_shares": (self.terms,), "prony_times": (self.terms,)}
         self._surround(material, dict(prony_shares=shares, prony_times=times))
-
-    def check(self, values):
-        super().check(values)
-        check_range("prony_shares", values["prony_shares"], 0, np.inf, True, "a share of the moduli that last")
-        check_range("prony_times", values["prony_times"], 0, np.inf, False, "a time [s]")
 
     def lame(self, values):
         mu, lam = self.material.lame(self.inner(values))

@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti.materials.calculus.tensor import invariants, isochoric
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, PerTetrahedron, check_range
+from diffsim_ti.materials.material import Material, PerTetrahedron
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,10 @@ class Yeoh(Material):
 
     spellings = (("c10", "c20", "c30", "bulk_modulus"),)
     to_lame = np.array([[2.0, 0, 0, 0], [-4 / 3, 0, 0, 1]])
+    positive = dict.fromkeys(("c10", "bulk_modulus"), "a stiffness [Pa]")
 
     def __init__(self, c10: PerTetrahedron, c20: PerTetrahedron, c30: PerTetrahedron, bulk_modulus: PerTetrahedron):
         super().__init__(c10, c20, c30, bulk_modulus)
-
-    def check(self, values):
-        super().check(values)
-        for name in ("c10", "bulk_modulus"):
-            check_range(name, values[name], 0, np.inf, False, "a stiffness [Pa]")
 
     def law(self, precision):
         return YeohLaw(precision)

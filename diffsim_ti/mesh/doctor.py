@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.mesh import geometry
-from diffsim_ti.mesh.checks import SLIVER
+from diffsim_ti.mesh.checks import SLIVER, oriented
 from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes, sorted_faces, squared_edges, triangle_normals
 from diffsim_ti.mesh.sets import components, parts_of_vertices, without_unused
-from diffsim_ti.mesh.ten_nodes import MIRRORED
 
 COINCIDING = 1e-9  # of the size of the body: nodes that near are one place
 TOUCHING = 1e-6  # of the size: how far a vertex may lie from a face that it is said to lie on
@@ -104,9 +103,7 @@ def mended(parts: tuple) -> tuple:
     """Without what can be mended in only one way: tetrahedra turned, repeated ones once, no vertices that none uses, no
     empty sets."""
     vertices, elements, vertex_sets, tetrahedron_sets, triangles = parts
-    turned = signed_volumes(edge_matrices(vertices, elements[:, :4])) < 0
-    elements = elements.copy()
-    elements[turned] = elements[turned][:, list(MIRRORED[: elements.shape[1]])]
+    elements = oriented(elements, signed_volumes(edge_matrices(vertices, elements[:, :4])), fix_orientation=True)
     _, first, inverse = np.unique(np.sort(elements[:, :4], 1), axis=0, return_index=True, return_inverse=True)
     keep = np.sort(first)
     new = np.searchsorted(keep, first[inverse.ravel()])

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import checks
-from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes
-from diffsim_ti.mesh.reference_element import ReferenceElement, reference_element
-from diffsim_ti.mesh.refinement import Refinement, parts_of_refined
+from diffsim_ti.mesh.geometry import edge_matrices, edges_of, signed_volumes
+from diffsim_ti.mesh.reference_element import MID_EDGES, ReferenceElement, reference_element
+from diffsim_ti.mesh.refinement import Refinement, joined_vertex_sets, parts_of_refined
 from diffsim_ti.mesh.sets import checked_sets, frozen
-from diffsim_ti.mesh.ten_nodes import middles_in_set, middles_of, triangles_of, with_middles
+from diffsim_ti.mesh.ten_nodes import middles_of, triangles_of
 
 if TYPE_CHECKING:
     from diffsim_ti.mesh.named_sets import SetOrIndices
@@ -88,11 +88,11 @@ class Elements:
         """
         if self.order == 2:
             return self
-        vertices, elements, edges = with_middles(self.vertices, self.tetrahedra)
-        middles = {name: middles_in_set(rows, self, edges) for name, rows in self._vertex_sets.items()}
-        vertex_sets = {
-            k: np.concatenate([rows, self.num_vertices + middles[k]]) for k, rows in self._vertex_sets.items()
-        }
+        edges, place = edges_of(self.tetrahedra, MID_EDGES)
+        vertices = np.concatenate([self.vertices, (self.vertices[edges[:, 0]] + self.vertices[edges[:, 1]]) / 2])
+        elements = np.concatenate([self.tetrahedra, self.num_vertices + place], 1)
+        tetrahedron, edge = np.divmod(np.unique(place, return_index=True)[1], len(MID_EDGES))
+        vertex_sets = joined_vertex_sets(self, tetrahedron, np.eye(4)[MID_EDGES[edge]].mean(1))
         surface_sets = {name: (4 * rows[:, None] + np.arange(4)).ravel() for name, rows in self._surface_sets.items()}
         return self._with_nodes(vertices, elements, self._volumes, vertex_sets, surface_sets)
 
@@ -163,7 +163,7 @@ class Elements:
         self._tetrahedra = elements if elements.shape[1] == 4 else elements[:, :4].copy()
         self._surface_faces = checks.surface_of(elements, len(vertices))
         self._surface_triangles = triangles_of(self._surface_faces)
-        self._middles = middles_of(elements, len(vertices))
+        self._middles = middles_of(elements)
         own = (self._tetrahedra, self._surface_faces, self._surface_triangles, self._middles)
         for array in (vertices, elements, volumes, *own):
             frozen(array)

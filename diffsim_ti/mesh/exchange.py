@@ -13,8 +13,7 @@ from diffsim_ti.common.warn import warn
 from diffsim_ti.mesh.files import KEEPS_SETS, as_meshio, of_meshio, read_mesh, write_mesh
 from diffsim_ti.mesh.filling import filled
 from diffsim_ti.mesh.readers.file_mesh import FileMesh, parts_of
-from diffsim_ti.mesh.readers.vtk_cells import KINDS, LAGRANGE
-from diffsim_ti.mesh.readers.vtk_cells import grid as vtk_grid
+from diffsim_ti.mesh.readers.vtk_cells import KINDS, LAGRANGE, grid_of_kinds
 from diffsim_ti.mesh.sets import without_unused
 
 if TYPE_CHECKING:
@@ -149,17 +148,10 @@ class Exchange:
             raise ValueError(
                 f"cells of VTK's types {other} cannot be read; there may be tetrahedra, triangles, lines, vertices"
             )
-        types, cells = np.asarray(grid.celltypes), {int(kind): np.asarray(c) for kind, c in grid.cells_dict.items()}
-        rows = {kind: np.nonzero(types == kind)[0] for kind in cells}
-        sizes = np.zeros(len(types), np.int64)
-        for kind, own in rows.items():
-            sizes[own] = cells[kind].shape[1]
-        offsets = np.concatenate([[0], np.cumsum(sizes)])
-        nodes = np.zeros(offsets[-1], np.int64)
-        for kind, own in rows.items():
-            nodes[offsets[own][:, None] + np.arange(cells[kind].shape[1])] = cells[kind]
+        types = np.asarray(grid.celltypes)
+        parts = [(int(t), np.asarray(own, np.int64), np.nonzero(types == t)[0]) for t, own in grid.cells_dict.items()]
         data = [{name: np.asarray(d[name]) for name in d.keys()} for d in (grid.point_data, grid.cell_data)]
-        return cls._from(vtk_grid(np.asarray(grid.points), nodes, offsets, types, *data), fix_orientation, drop_orphans)
+        return cls._from(grid_of_kinds(np.asarray(grid.points), parts, *data), fix_orientation, drop_orphans)
 
     def to_pyvista(self) -> "pyvista.UnstructuredGrid":
         """As a grid of PyVista, which must be installed, with the sets as 0/1 arrays."""

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from diffsim_ti.common.warn import warn
-from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes, sorted_faces, surface_edges
+from diffsim_ti.mesh.checks import oriented
+from diffsim_ti.mesh.geometry import edge_matrices, edges_of, signed_volumes, sorted_faces
 from diffsim_ti.mesh.sets import components, places_of_triangles
 
 SURFACES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")  # files that hold surfaces alone
@@ -120,7 +121,7 @@ def split_to(points: np.ndarray, triangles: np.ndarray, size: float) -> tuple[np
     again and again; neighbours share the cuts."""
     of = np.arange(len(triangles))
     while True:
-        known, sides = surface_edges(triangles)
+        known, sides = edges_of(triangles)
         long = np.linalg.norm(points[known[:, 1]] - points[known[:, 0]], axis=1) > 1.5 * size
         if not long.any():
             return points, triangles, of
@@ -177,9 +178,8 @@ def by_ftetwild(points: np.ndarray, triangles: np.ndarray, size: float | None, f
     vertices, tetrahedra = found["vertices"].astype(np.float64), found["tetrahedra"].astype(np.int64)
     if not len(tetrahedra):
         raise ValueError(f"{fault}; and fTetWild finds no inside; close its holes (in MeshLab: close holes)")
-    turned = signed_volumes(edge_matrices(vertices, tetrahedra)) < 0
-    tetrahedra[turned] = tetrahedra[turned][:, [0, 2, 1, 3]]
-    volume = float(np.abs(signed_volumes(edge_matrices(vertices, tetrahedra))).sum())
+    volumes = signed_volumes(edge_matrices(vertices, tetrahedra))
+    tetrahedra, volume = oriented(tetrahedra, volumes, fix_orientation=True), float(np.abs(volumes).sum())
     lost = f"; its parts {', '.join(parts)} are no sets then" if parts else ""
     warn(
         f"{fault}: filled by fTetWild, which moves the surface by up to {1e-3 * np.linalg.norm(np.ptp(points, 0)):.2g} m; "
@@ -272,7 +272,7 @@ def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
 def fault_of(points: np.ndarray, triangles: np.ndarray) -> str | None:
     """What is wrong with a surface that is not closed, and where: each edge belongs to two triangles, or to four, six ...
     where parts touch."""
-    known, sides = surface_edges(triangles)
+    known, sides = edges_of(triangles)
     odd = known[np.bincount(sides.ravel()) % 2 == 1]
     if len(triangles) >= 4 and not len(odd):
         return None

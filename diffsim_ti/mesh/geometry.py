@@ -10,6 +10,7 @@ from diffsim_ti.differentiation.arrays import cross
 # Corner a's opposite face, seen from outside of a tetrahedron of positive volume.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+SIDES = np.array([[0, 1], [1, 2], [2, 0]])  # of a triangle
 
 
 def sorted_faces(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -34,13 +35,13 @@ def inner_faces(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, 
     return np.stack([first // 4, second // 4], 1), corners[first]
 
 
-def surface_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(each edge of triangles once, the smaller index first, sorted, shape (k, 2); which of them each triangle has as its
-    sides 01, 12, 20, shape (t, 3))"""
-    low, high = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1).astype(np.int64).T
+def edges_of(corners: np.ndarray, ends: np.ndarray = SIDES) -> tuple[np.ndarray, np.ndarray]:
+    """(each edge once, the smaller index first, ascending, shape (k, 2); which of them each row of corners has, shape
+    (rows, edges)): of triangles, or of what has edges between the corners `ends`."""
+    low, high = np.sort(corners[:, ends].reshape(-1, 2), 1).astype(np.int64).T
     count = high.max(initial=0) + 1
     keys, which = np.unique(low * count + high, return_inverse=True)
-    return np.stack(np.divmod(keys, count), 1), which.reshape(-1, 3)
+    return np.stack(np.divmod(keys, count), 1), which.reshape(-1, len(ends))
 
 
 def squared_edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:

@@ -55,19 +55,14 @@ class ReferenceElement:
     def functions(self, xi: np.ndarray) -> np.ndarray:
         """N_a at points, shape (k, num_nodes)."""
         L = barycentric(xi)
-        if self.order == 1:
-            return L
-        a, b = MID_EDGES.T
-        return np.concatenate([L * (2 * L - 1), 4 * L[:, a] * L[:, b]], 1)
+        return L if self.order == 1 else quadratic(L, MID_EDGES)
 
     def derivatives(self, xi: np.ndarray) -> np.ndarray:
         """dN_a / dxi at points, shape (k, num_nodes, 3)."""
         by_L = np.concatenate([-np.ones((1, 3)), np.eye(3)])  # dL / dxi
         if self.order == 1:
             return np.broadcast_to(by_L, (len(xi), 4, 3))
-        L, (a, b) = barycentric(xi), MID_EDGES.T
-        corners = (4 * L - 1)[:, :, None] * by_L
-        return np.concatenate([corners, 4 * (L[:, a, None] * by_L[b] + L[:, b, None] * by_L[a])], 1)
+        return quadratic_slopes(barycentric(xi), by_L, MID_EDGES)
 
     @cached_property
     def lumped(self) -> np.ndarray:
@@ -92,8 +87,21 @@ def reference_element(num_nodes: int) -> ReferenceElement:
 
 
 def barycentric(xi: np.ndarray) -> np.ndarray:
-    """L, shape (k, 4)."""
+    """L, shape (k, 4), or (k, 3) of coordinates in a triangle."""
     return np.concatenate([1 - xi.sum(1, keepdims=True), xi], 1)
+
+
+def quadratic(L: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """L_a (2 L_a - 1) of corners, then 4 L_a L_b of the middles of edges, shape (k, corners + edges)."""
+    a, b = edges.T
+    return np.concatenate([L * (2 * L - 1), 4 * L[:, a] * L[:, b]], 1)
+
+
+def quadratic_slopes(L: np.ndarray, by_L: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Their derivatives, by those of L."""
+    a, b = edges.T
+    middles = 4 * (L[:, a, None] * by_L[b] + L[:, b, None] * by_L[a])
+    return np.concatenate([(4 * L - 1)[:, :, None] * by_L, middles], 1)
 
 
 @lru_cache(maxsize=None)

@@ -7,24 +7,21 @@ formulas for triangles, doi:10.1002/nme.1620070316.
 
 import numpy as np
 
+from diffsim_ti.mesh.geometry import SIDES
+from diffsim_ti.mesh.reference_element import barycentric, quadratic, quadratic_slopes
+
 BY_L = np.array([[-1.0, -1], [1, 0], [0, 1]])  # dL / d(s, t)
 BY_NEXT = np.roll(BY_L, -1, 0)
 
 
-def _barycentric(st: np.ndarray) -> np.ndarray:
-    return np.concatenate([1 - st.sum(1, keepdims=True), st], 1)
-
-
 def functions(st: np.ndarray) -> np.ndarray:
     """N_a at points, shape (k, 6)."""
-    L = _barycentric(st)
-    return np.concatenate([L * (2 * L - 1), 4 * L * np.roll(L, -1, 1)], 1)
+    return quadratic(barycentric(st), SIDES)
 
 
 def derivatives(st: np.ndarray) -> np.ndarray:
     """dN_a / d(s, t) at points, shape (k, 6, 2)."""
-    L = _barycentric(st)[:, :, None]
-    return np.concatenate([(4 * L - 1) * BY_L, 4 * (L * BY_NEXT + np.roll(L, -1, 1) * BY_L)], 1)
+    return quadratic_slopes(barycentric(st), BY_L, SIDES)
 
 
 # d2N_a / d(s, t)^2, which are constants, shape (6, 2, 2)

@@ -8,10 +8,9 @@ import numpy as np
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh import checks
-from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes
+from diffsim_ti.mesh.geometry import FACES, edge_matrices, edges_of, signed_volumes
 from diffsim_ti.mesh.reference_element import MID_EDGES
 from diffsim_ti.mesh.sets import places_of_triangles
-from diffsim_ti.mesh.ten_nodes import edges_of
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -43,7 +42,7 @@ def parts_of_refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable 
         raise ValueError(f'edges to be halved must be "all" of the chosen tetrahedra or their "longest", got {edges!r}')
     n, corners, every = mesh.num_vertices, mesh.tetrahedra, edges == "all"
     chosen = np.arange(len(corners)) if where is None else mesh.tetrahedron_indices(where)
-    edges, place = edges_of(corners, n)
+    edges, place = edges_of(corners, MID_EDGES)
     lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
     rank = np.empty(len(edges), np.int64)
     rank[np.argsort(np.round(lengths / lengths.max(), 9), kind="stable")] = np.arange(len(edges))
@@ -70,10 +69,7 @@ def parts_of_refined(mesh: "TetrahedralMesh", where, edges: str, onto: Callable 
     vertices = np.concatenate([mesh.vertices, new_vertices])
     if mesh.order == 2:
         elements = np.concatenate([elements, new], 1)
-    joined = _joined(mesh, element, L)
-    vertex_sets = {
-        name: np.concatenate([rows, n + np.flatnonzero(joined(rows))]) for name, rows in mesh.vertex_sets.items()
-    }
+    vertex_sets = joined_vertex_sets(mesh, element, L)
     if onto is None:
         volumes = signed_volumes(edge_matrices(vertices, elements[:, :4]))
     else:
@@ -142,7 +138,7 @@ def _new_vertices(mesh, cut: _Cut, edges, middle, halved) -> tuple:
         flat, first = np.unique(cut.tetrahedra, return_index=True)
         first = first[flat >= n]
         return np.zeros((0, 6), np.int64), (cut.parents[first // 4], cut.L.reshape(-1, 4)[first])
-    fine, place = edges_of(cut.tetrahedra, n)
+    fine, place = edges_of(cut.tetrahedra, MID_EDGES)
     _, first = np.unique(place.ravel(), return_index=True)
     keys, own = edges[~halved] @ [n, 1], middle[~halved]
     at = np.minimum(np.searchsorted(keys, fine @ [n, 1]), max(len(keys) - 1, 0))
@@ -155,8 +151,9 @@ def _new_vertices(mesh, cut: _Cut, edges, middle, halved) -> tuple:
     return ids[place], (cut.parents[first // 6], ends.mean(1))
 
 
-def _joined(mesh, element: np.ndarray, L: np.ndarray):
-    """A function of the members of a vertex set: which new vertices join it, as the middles of edges do in `quadratic()`."""
+def joined_vertex_sets(mesh, element: np.ndarray, L: np.ndarray) -> dict[str, np.ndarray]:
+    """The vertex sets with those of new vertices, at L in an element each, that lie within an edge, a face of the surface or
+    a tetrahedron of which all vertices are members; edges count of such faces and tetrahedra."""
     n, on = mesh.num_vertices, L > 0
     ids = np.sort(
         np.where(on, mesh.tetrahedra[element], -1), 1
@@ -178,7 +175,7 @@ def _joined(mesh, element: np.ndarray, L: np.ndarray):
         out = np.where(count == 2, np.isin(ids[:, -2:] @ [n, 1], pairs @ [n, 1]), out)
         return np.where(count == 3, places_of_triangles(ids[:, -3:], faces) >= 0, out)
 
-    return joined
+    return {name: np.concatenate([rows, n + np.flatnonzero(joined(rows))]) for name, rows in mesh.vertex_sets.items()}
 
 
 def _surface_sets(mesh, fine, cut: _Cut) -> dict[str, np.ndarray]:

@@ -1,8 +1,8 @@
-"""Tetrahedra of ten nodes as arrays: their faces, their mid-edge vertices, and the way from four nodes and back."""
+"""Tetrahedra of ten nodes as arrays: their faces and their mid-edge vertices."""
 
 import numpy as np
 
-from diffsim_ti.mesh.geometry import FACES
+from diffsim_ti.mesh.geometry import FACES, edges_of
 from diffsim_ti.mesh.reference_element import MID_EDGES
 
 _MIDDLE = {frozenset(ends): 4 + k for k, ends in enumerate(MID_EDGES.tolist())}
@@ -24,28 +24,14 @@ def triangles_of(faces: np.ndarray) -> np.ndarray:
     return faces[:, QUARTERS].reshape(-1, 3) if faces.shape[1] == 6 else faces
 
 
-def edges_of(corners: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-    """(edges, the edge of each of MID_EDGES): each edge once, smaller index first, ascending, shape (k, 2) and (m, 6)."""
-    low, high = np.sort(corners[:, MID_EDGES].reshape(-1, 2), 1).T
-    keys, place = np.unique(low * num_vertices + high, return_inverse=True)
-    return np.stack(np.divmod(keys, num_vertices), 1), place.reshape(-1, 6)
-
-
-def with_middles(vertices: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(vertices, elements of ten nodes, edges): a vertex at the middle of each edge, after those given."""
-    edges, place = edges_of(tetrahedra, len(vertices))
-    middles = (vertices[edges[:, 0]] + vertices[edges[:, 1]]) / 2
-    return np.concatenate([vertices, middles]), np.concatenate([tetrahedra, len(vertices) + place], 1), edges
-
-
-def middles_of(elements: np.ndarray, num_vertices: int) -> np.ndarray:
+def middles_of(elements: np.ndarray) -> np.ndarray:
     """Rows (mid-edge vertex, its two ends), one for each edge, shape (k, 3); none with four nodes.
 
     ValueError where an edge has two mid-edge vertices, a mid-edge vertex two edges, or a corner is one.
     """
     if elements.shape[1] == 4:
         return np.zeros((0, 3), np.int64)
-    edges, place = edges_of(elements[:, :4], num_vertices)
+    edges, place = edges_of(elements[:, :4], MID_EDGES)
     place, middles = place.ravel(), elements[:, 4:].ravel()
     _, first = np.unique(place, return_index=True)
     out = middles[first]
@@ -70,18 +56,3 @@ def middles_of(elements: np.ndarray, num_vertices: int) -> np.ndarray:
     if len(both):
         raise ValueError(f"a vertex is a corner or stands on an edge: vertex {both[0]} does both; {remedy}")
     return np.concatenate([out[:, None], edges], 1)
-
-
-def middles_in_set(members: np.ndarray, mesh, edges: np.ndarray) -> np.ndarray:
-    """Rows of edges of a linear mesh whose middles belong to a set of vertices.
-
-    These are the edges of triangles of the surface, and of tetrahedra, whose vertices are all in it.
-    """
-    inside = np.zeros(mesh.num_vertices, bool)
-    inside[members] = True
-    triangles = mesh.surface_triangles[inside[mesh.surface_triangles].all(1)]
-    whole = mesh.tetrahedra[inside[mesh.tetrahedra].all(1)]
-    pairs = np.concatenate([triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), whole[:, MID_EDGES].reshape(-1, 2)])
-    low, high = np.sort(pairs, 1).T
-    keys = edges[:, 0] * mesh.num_vertices + edges[:, 1]
-    return np.nonzero(np.isin(keys, low * mesh.num_vertices + high))[0]

@@ -23,9 +23,9 @@ from diffsim_ti.mesh.grid import box
 from diffsim_ti.mesh.jacobian import lowest_jacobian
 from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
+from diffsim_ti.mesh.reference_element import MID_EDGES
 from diffsim_ti.mesh.seed_names import SeedNames
 from diffsim_ti.mesh.sets import checked_sets, frozen, join, pieces, rows_on_surface, sizes
-from diffsim_ti.mesh.ten_nodes import edges_of
 
 CONNECTIVITY = (  # what stays when vertices move
     "_elements _tetrahedra _surface_faces _surface_triangles _middles _vertex_sets _tetrahedron_sets _surface_sets".split()
@@ -203,7 +203,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements, SeedNames, metaclass=Public
     @cached_property
     def edges(self) -> np.ndarray:
         """Each edge once, by its two corners, shape (k, 2), the smaller index first."""
-        return frozen(edges_of(self.tetrahedra, self.num_vertices)[0])
+        return frozen(geometry.edges_of(self.tetrahedra, MID_EDGES)[0])
 
     @cached_property
     def num_pieces(self) -> int:

@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from diffsim_ti.batch import Batch, BatchFrames
 from diffsim_ti.common.brief import brief
 from diffsim_ti.identification import Identification
+from diffsim_ti.identification.result import ends
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs.modes import Modes
 from diffsim_ti.rollout import Frames, Rollout
@@ -61,8 +63,11 @@ def _film(scene: Scene, moments: Iterable, suffix: str) -> str:
                 out.write(moment)
                 if time.perf_counter() - begin > PATIENCE:
                     break
-        data = base64.b64encode(path.read_bytes()).decode()
-    return f'<img src="data:image/{suffix[1:]};base64,{data}" width="{SIZE[0]}"/>'
+        return _img(path.read_bytes(), suffix)
+
+
+def _img(data: bytes, suffix: str) -> str:
+    return f'<img src="data:image/{suffix[1:]};base64,{base64.b64encode(data).decode()}" width="{SIZE[0]}"/>'
 
 
 def _still(scene: Scene, positions: np.ndarray, at: float = 0.0, step: int = 0, values: dict | None = None) -> str:
@@ -79,24 +84,17 @@ def _still(scene: Scene, positions: np.ndarray, at: float = 0.0, step: int = 0, 
 
 def of_mesh(self: TetrahedralMesh) -> str:
     """Counts, sizes, sets; a picture."""
+    from PIL import Image
+
     from diffsim_ti.visual.drawing import Drawing
 
     text = of_lines(self.describe())
     if self.num_tetrahedra > MANY:
         return text
-    with Drawing(self, SIZE, backend="software", wireframe=self.num_tetrahedra < 20_000) as drawing:
-        return text + _png(drawing.image(self.vertices))
-
-
-def _png(image: np.ndarray) -> str:
-    from io import BytesIO
-
-    from PIL import Image
-
     buffer = BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img src="data:image/png;base64,{data}" width="{image.shape[1]}"/>'
+    with Drawing(self, SIZE, backend="software", wireframe=self.num_tetrahedra < 20_000) as drawing:
+        Image.fromarray(drawing.image(self.vertices)).save(buffer, "PNG")
+    return text + _img(buffer.getvalue(), ".png")
 
 
 def of_scene(self: Scene) -> str:
@@ -164,8 +162,7 @@ def of_identification(self: Identification) -> str:
     rows = [(label, f"{x:.6g}") for label, x in zip(self.labels, self.numbers)]
     if self.intervals is not None and self.residuals_fit:
         errors = np.concatenate([np.atleast_1d(x) for x in self.standard_errors.values()])
-        low, high = (np.concatenate([np.atleast_1d(pair[k]) for pair in self.intervals.values()]) for k in (0, 1))
-        rows = [(*r, f"{e:.2g}", f"{a:.6g} .. {b:.6g}") for r, e, a, b in zip(rows, errors, low, high)]
+        rows = [(*r, f"{e:.2g}", f"{a:.6g} .. {b:.6g}") for r, e, a, b in zip(rows, errors, *ends(self.intervals))]
     return f"{head}{table(rows, ('unknown', 'estimate', 'standard error', '95 %'))}<p>{escape(last)}</p>"
 
 

@@ -94,7 +94,8 @@ def _as_tensors(gradients: dict, names, tensors, needed) -> list:
     out = []
     for name, tensor, need in zip(names, tensors, needed):
         value = gradients.get(name) if need else None
-        value = torch.tensor(value) if isinstance(value, np.ndarray) else value  # a copy: gradients may be read-only
+        if isinstance(value, np.ndarray | np.floating):
+            value = torch.tensor(value)  # a copy: gradients may be read-only
         out.append(None if value is None else value.to(tensor.device, tensor.dtype))
     return out
 
@@ -138,10 +139,7 @@ class _BatchNode(torch.autograd.Function):
             own = gradients["rest_positions"].ndim == 3
             gradients["rest_positions"] = gradients["rest_positions"] - (away if own else away.sum(0))
         gradients["initial_displacements"] = gradients.get("initial_positions")
-        out = []
-        for name, tensor, need in zip(ctx.names, ctx.tensors, ctx.needs_input_grad[3:]):
-            out.append(torch.tensor(gradients[name]).to(tensor.device, tensor.dtype) if need else None)
-        return None, None, None, *out
+        return None, None, None, *_as_tensors(gradients, ctx.names, ctx.tensors, ctx.needs_input_grad[3:])
 
 
 def batch_frames(batch: Batch, tensors: dict) -> TorchBatchFrames:

@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti.common.public import Public
 from diffsim_ti.visual.camera import NEAREST, Camera
 from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.visual.painters import enumerated, planes_of, spans
+from diffsim_ti.visual.painters import nearest
 
 
 @dataclass(eq=False, repr=False)
@@ -75,15 +75,7 @@ def _nearest(corners: np.ndarray, labels: np.ndarray, size: tuple[int, int]) -> 
     width, height = size
     ahead = corners[..., 2].min(1) > NEAREST
     corners, labels = corners[ahead], labels[ahead]
-    triangle, row, first, end = spans(corners[..., :2], size)
-    nearest, found = np.zeros(width * height), np.full(width * height, -1)
-    if len(triangle):
-        plane = planes_of(corners[..., :2], 1 / corners[..., 2:])[triangle, 0]
-        span, along = enumerated(end - first)
-        nearness = plane[span, 0] * (first[span] + along + 0.5) + plane[span, 1] * (row[span] + 0.5) + plane[span, 2]
-        pixel = (row * width + first)[span] + along
-        np.maximum.at(nearest, pixel, nearness)
-        front = nearness == nearest[pixel]
-        found[pixel[front]] = labels[triangle[span[front]]]
-    with np.errstate(divide="ignore"):
-        return (1 / nearest).reshape(height, width), found.reshape(height, width)
+    pixel, triangle, nearness = nearest(corners[..., :2], 1 / corners[..., 2:], size)
+    depth, found = np.full(width * height, np.inf), np.full(width * height, -1)
+    depth[pixel], found[pixel] = 1 / nearness, labels[triangle]
+    return depth.reshape(height, width), found.reshape(height, width)

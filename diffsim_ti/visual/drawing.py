@@ -13,17 +13,7 @@ from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.backdrop import Backdrop
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.colouring import Colouring, to_vertices
-from diffsim_ti.visual.glyphs import (
-    COLOURS,
-    arrow_length,
-    cones,
-    glyphs,
-    key_lines,
-    legend,
-    longest,
-    write_key,
-    write_text,
-)
+from diffsim_ti.visual.glyphs import COLOURS, arrow_length, cones, glyphs, key_lines, legend, longest, with_words
 from diffsim_ti.visual.surface import OBSTACLE, PLAIN, Soup, Surface, marks, with_edges
 
 if TYPE_CHECKING:
@@ -193,9 +183,7 @@ class Drawing(metaclass=Public):
         image = np.ascontiguousarray(np.clip(255 * image + 0.5, 0, 255).astype(np.uint8))
         if values is not None:
             self.add_legend(image)
-        key = self.key(drawn)
-        image = write_key(image, key) if key else image
-        return write_text(image, title) if title else image
+        return with_words(image, title, self.key(drawn))
 
     def add_legend(self, image: np.ndarray) -> None:
         """Draw the colouring's bar into a picture, uint8 or in [0, 1]; nothing if it has no label."""

@@ -160,24 +160,16 @@ def _font(pixels: int):
     return ImageFont.truetype(findfont("DejaVu Sans"), pixels)
 
 
-def write_key(image: np.ndarray, rows: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
-    """The picture with lines of words, each in its colour (RGB in [0, 1]), at its lower left."""
+def with_words(image: np.ndarray, title: str, rows: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
+    """The picture with a title at its upper left, and lines, each in its colour (RGB in [0, 1]), at its lower left."""
+    if not (title or rows):
+        return image
     from PIL import Image, ImageDraw
 
-    out = Image.fromarray(image)
-    height, margin = max(10, round(0.024 * image.shape[0])), 0.025 * image.shape[1]
-    pen = ImageDraw.Draw(out)
+    out, (tall, wide) = Image.fromarray(image), image.shape[:2]
+    pen, margin, height = ImageDraw.Draw(out), 0.025 * wide, max(10, round(0.024 * tall))
+    pen.text((margin, margin), title, INK, _font(max(11, round(0.03 * tall))))
     for k, (text, colour) in enumerate(rows):
-        y = image.shape[0] - margin - 1.35 * height * (len(rows) - k)
+        y = tall - margin - 1.35 * height * (len(rows) - k)
         pen.text((margin, y), text, tuple(int(255 * c) for c in 0.85 * colour), _font(height))
-    return np.array(out)
-
-
-def write_text(image: np.ndarray, text: str) -> np.ndarray:
-    """The picture with words at its upper left."""
-    from PIL import Image, ImageDraw
-
-    out = Image.fromarray(image)
-    margin = 0.025 * image.shape[1]
-    ImageDraw.Draw(out).text((margin, margin), text, INK, _font(max(11, round(0.03 * image.shape[0]))))
     return np.array(out)

@@ -79,32 +79,35 @@ class SoftwarePainter:
         """RGB in [0, 1], float32 (height, width, 3); soup in pixels of this size."""
         s = SUPERSAMPLING
         width, height = (s * n for n in self.size)
-        corners = soup.corners[..., :2] * s
-        triangle, row, first, end = spans(corners, (width, height))
-        if not len(triangle):
+        corners, inverse = soup.corners[..., :2] * s, 1 / soup.corners[..., 2:]
+        pixel, triangle, nearness = nearest(corners, inverse, (width, height))
+        if not len(pixel):
             return np.array(background)
-        inverse = 1 / soup.corners[..., 2:]  # which, as colour / depth, is linear over the picture
-        planes = planes_of(corners, np.concatenate([inverse, soup.colours * inverse], 2))
-        span, along = enumerated(end - first)
-        at_start = np.einsum("nk,nk->n", planes[triangle, 0], np.stack([first + 0.5, row + 0.5, np.ones(len(row))], 1))
-        nearness = at_start[span] + planes[triangle, 0, 0][span] * along
-        pixel = (row * width + first)[span] + along
-        nearest = np.zeros(width * height)
-        np.maximum.at(nearest, pixel, nearness)
-        front = np.flatnonzero(nearness == nearest[pixel])
-        winner = np.full(width * height, -1)
-        winner[pixel[front]] = front  # of triangles equally near, the last
-        front = winner[winner >= 0]
-
-        of, pixel = planes[:, 1:].astype(np.float32)[triangle[span[front]]], pixel[front]
+        of = planes_of(corners, soup.colours * inverse).astype(np.float32)[triangle]  # colour / depth is linear, too
         row, column = np.divmod(pixel, width)
         x, y = (column + 0.5).astype(np.float32), (row + 0.5).astype(np.float32)
         colour = of[..., 0] * x[:, None] + of[..., 1] * y[:, None] + of[..., 2]
-        colour /= nearness[front, None].astype(np.float32)
+        colour /= nearness[:, None].astype(np.float32)
         return _averaged(np.clip(colour, 0, 1), row, column, background)
 
     def close(self) -> None:
         """Nothing is held."""
+
+
+def nearest(corners: np.ndarray, inverse: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
+    """(pixels whose centre is in some triangle, ascending; the nearest triangle there, of those equally near the last; the
+    inverse of its depth): corners (n, 3, 2) in pixels, and inverses of their depths (n, 3, 1), linear over the picture."""
+    width, height = size
+    triangle, row, first, end = spans(corners, size)
+    plane, (span, along) = planes_of(corners, inverse)[triangle, 0], enumerated(end - first)
+    at_start = np.einsum("nk,nk->n", plane, np.stack([first + 0.5, row + 0.5, np.ones(len(row))], 1))
+    nearness, pixel = at_start[span] + plane[span, 0] * along, (row * width + first)[span] + along
+    most = np.zeros(width * height)
+    np.maximum.at(most, pixel, nearness)
+    front, winner = np.flatnonzero(nearness == most[pixel]), np.full(width * height, -1)
+    winner[pixel[front]] = front
+    front = winner[winner >= 0]
+    return pixel[front], triangle[span[front]], nearness[front]
 
 
 def planes_of(corners: np.ndarray, values: np.ndarray) -> np.ndarray:

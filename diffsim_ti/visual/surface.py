@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.visual.camera import Camera
 
 LIGHT = np.array([-0.45, 1.0, 0.55]) / np.linalg.norm([-0.45, 1.0, 0.55])
@@ -41,18 +42,13 @@ class Surface:
         m, corners = len(self.triangles), self.triangles.ravel()
         used = coo_matrix((np.ones(3 * m), (corners, np.repeat(np.arange(m), 3))), (len(self.points), m)).tocsr()
         around = used[corners].tocoo()  # triangle `col` touches corner `row` of triangle row // 3
-        unit = _normalized(self._face_normals(self.points))
+        unit = _normalized(triangle_normals(self.points, self.triangles))
         smooth = np.einsum("nd,nd->n", unit[around.row // 3], unit[around.col]) > CREASE
         self._around = coo_matrix((np.ones(smooth.sum()), (around.row[smooth], around.col[smooth])), (3 * m, m)).tocsr()
 
-    def _face_normals(self, points: np.ndarray) -> np.ndarray:
-        """Normals of the triangles, twice as long as the area [m^2]."""
-        a, b, c = (points[self.triangles[:, k]] for k in range(3))
-        return np.cross(b - a, c - a)
-
     def normals(self, points: np.ndarray) -> np.ndarray:
         """Unit normal of each triangle's corners, shape (n, 3, 3): mean of those around, weighted by area, up to creases."""
-        return _normalized(self._around @ self._face_normals(points)).reshape(-1, 3, 3)
+        return _normalized(self._around @ triangle_normals(points, self.triangles)).reshape(-1, 3, 3)
 
     def lit(self, points: ArrayLike, colour: ArrayLike, camera: Camera, size: tuple[int, int]) -> Soup:
         """The triangles that face the camera, shaded. colour: RGB of all or of each point, shape (3,) or (k, 3)."""

@@ -26,30 +26,12 @@ from diffsim_ti.terms import ExternalForce, Gravity, Obstacle, Robot
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.writers import Writer, writer_for
 
-
-@dataclass(frozen=True)
-class StepRule:
-    """How long an explicit step may be: its `share` of the stable one; how many of them at least a vertex takes through a
-    barrier's width, with contact as a stage and as a force; the J below which the stable step is looked up after each part
-    and not only at the end of a frame, for there it changes fastest."""
-
-    share: float = 0.8
-    in_a_width: dict = field(default_factory=lambda: {"stage": 4, "force": 10})
-    squeezed: float = 0.1
-
-
-@dataclass(frozen=True)
-class EnergyRise:
-    """What energy may rise in a part, as shares of the largest kinetic energy: a method's passing error within an
-    oscillation takes `part`; once the energy is `drift` above its lowest, that is none, and only `later` is left."""
-
-    part: float
-    later: float
-    drift: float
-
-
-STEPS = StepRule()
-ENERGY_RISE = {1: EnergyRise(0.01, 0.001, 0.03), 2: EnergyRise(0.002, 5e-5, 0.004)}  # by the order of the method
+SHARE = 0.8  # of the stable step, which explicit steps take
+IN_A_WIDTH = {"stage": 4, "force": 10}  # steps that a vertex takes through a barrier at least, by the kind of contact
+SQUEEZED = 0.1  # J below which the stable step, which changes fastest there, is looked up after each part of a frame
+# by the order of the method, as shares of the largest kinetic energy: what energy may rise by in a part, which is a passing
+# error within an oscillation; and once it is a third share above its lowest
+ENERGY_RISE = {1: (0.01, 0.001, 0.03), 2: (0.002, 5e-5, 0.004)}
 
 
 class Interrupted(Exception):
@@ -242,7 +224,7 @@ class ForwardRun:
         """Note the extremes of the present state."""
         sim, seen = self.simulator, self.seen
         J = sim.tetrahedron_fields().J
-        self._squeezed = J.min() < STEPS.squeezed
+        self._squeezed = J.min() < SQUEEZED
         seen.J, seen.inverted = min(seen.J, float(J.min())), max(seen.inverted, int((J <= 0).sum()))
         self._check_gaps()
         seen.substeps[-1] += sim.solver.substeps
@@ -266,9 +248,8 @@ class ForwardRun:
         """Why the part that was just run cannot be trusted, or None; `look_up`: find the stable step at its end."""
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
         rise, scale = energy - self._energy, max(self._fastest, energy.parts["kinetic"])
-        allowed = ENERGY_RISE[1 if self.implicit else self.simulator.solver.order]
-        drifted = energy - self._lowest > allowed.drift * scale
-        if not self.driven and not rise <= (allowed.later if drifted else allowed.part) * scale:
+        part, later, drift = ENERGY_RISE[1 if self.implicit else self.simulator.solver.order]
+        if not self.driven and not rise <= (later if energy - self._lowest > drift * scale else part) * scale:
             return f"the energy rose by {rise:.3g} J"
         if not look_up:
             return None
@@ -292,13 +273,13 @@ class ForwardRun:
 
     def _choose_substeps(self) -> int:
         dt = self.simulator.solver.dt
-        fewest = dt / (STEPS.share * self._limit)
+        fewest = dt / (SHARE * self._limit)
         if self.obstacles and not self.implicit:  # a vertex shall not cross the barrier in a few substeps
             speed = np.linalg.norm(self.simulator.velocities, axis=1).max() + self._pull * self.frame_time
             now, then = (self.scene.places(self.simulator.time + step) for step in (0.0, dt))
             positions = self.simulator.positions
             speed += max((t.way(positions, now[t], then[t]) / dt for t in now), default=0.0)
-            in_a_width = STEPS.in_a_width[self.simulator.solver.contact]
+            in_a_width = IN_A_WIDTH[self.simulator.solver.contact]
             width = min(float(t.values["barrier_width"]) for t in self.obstacles)
             fewest = max(fewest, in_a_width * speed * dt / width)
         return max(1, int(np.ceil(fewest)))

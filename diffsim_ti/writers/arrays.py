@@ -19,8 +19,8 @@ class ArraysWriter(Writer):
     suffixes = (".npz",)
 
     def open(self, setting: Setting) -> None:
-        self.setting, self._frames, self.count = setting, [], 0
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        super().open(setting)
+        self._frames = []
 
     def write(self, frame: Frame) -> None:
         own = {name: getattr(frame, name) for name in ("time", "positions", "displacements", "velocities")}

@@ -12,7 +12,7 @@ import numpy as np
 from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.extent import Extent
 from diffsim_ti.visual.frame import Frame, Setting, results_as_arrows
-from diffsim_ti.writers.writer import View, Writer, file_of, numbered, register
+from diffsim_ti.writers.writer import LastOrAll, View, Writer, register
 
 
 class DrawnWriter(Writer):
@@ -21,9 +21,8 @@ class DrawnWriter(Writer):
     usual_size = (640, 480)
 
     def open(self, setting: Setting) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.setting, self.colour, self._extent = setting, self.view.colour, None
-        self._waiting, self.count = tempfile.TemporaryFile(), 0
+        super().open(setting)
+        self.colour, self._extent, self._waiting = self.view.colour, None, tempfile.TemporaryFile()
 
     def write(self, frame: Frame) -> None:
         if self.colour is None:
@@ -57,18 +56,11 @@ class DrawnWriter(Writer):
 
 
 @register
-class PictureWriter(DrawnWriter):
-    """Draws the last frame when it is closed, or, for a name such as "run_%04d.png", every frame, numbered from 0.
-
-    Raises ValueError for a name with a % that is no place for a number.
-    """
+class PictureWriter(LastOrAll, DrawnWriter):
+    """Draws the last frame when it is closed, or, for a name such as "run_%04d.png", every frame, numbered from 0."""
 
     suffixes = (".png", ".jpg", ".jpeg")
     usual_size = (1200, 900)
-
-    def __init__(self, path: str | Path, view: View | None = None):
-        super().__init__(path, view)
-        self.numbered = numbered(self.path)
 
     def write(self, frame: Frame) -> None:
         if not self.numbered:  # only the last one waits
@@ -83,11 +75,8 @@ class PictureWriter(DrawnWriter):
         from PIL import Image
 
         for k, image in enumerate(self.images() if self.count else ()):
-            Image.fromarray(image).save(file_of(self.path, k) if self.numbered else self.path)
+            Image.fromarray(image).save(self.file_of(k))
         self._waiting.close()
-
-    def describe(self) -> str:
-        return super().describe() if self.numbered else str(self.path)
 
 
 @register

@@ -40,14 +40,13 @@ class ParaViewWriter(Writer):
     suffixes = (".pvd",)
 
     def open(self, setting: Setting) -> None:
-        self.setting, self.count = setting, 0
+        super().open(setting)
         self.folder, self.name = self.path.parent, os.fsdecode(text_of(self.path.stem).encode())
         self._rows: list[tuple[float, dict[int, Path]]] = []
         self._labels: list[str] = []  # of marks
         self._units: dict[str, str] = {}
         self._around: list[np.ndarray] | None = None  # obstacles as they were last written
         self._obstacles: list[Path] = []
-        self.folder.mkdir(parents=True, exist_ok=True)
         for _, _, old in listed(self.path, "remove it or choose another folder") if self.path.exists() else []:
             if old.parent == self.folder and old.stem.startswith(f"{self.name}_"):
                 old.unlink(missing_ok=True)

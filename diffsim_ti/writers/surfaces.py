@@ -2,13 +2,12 @@
 over; and PLY files."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
 from diffsim_ti.visual.colouring import Colouring, field_named, to_vertices
 from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.writers.writer import View, Writer, file_of, numbered, register
+from diffsim_ti.writers.writer import LastOrAll, Writer, register
 
 BODY, OBSTACLE = (0.33, 0.55, 0.80), (0.68, 0.68, 0.70)
 Surface = tuple[str, np.ndarray, list[np.ndarray], list[np.ndarray]]
@@ -21,8 +20,8 @@ class SurfacesWriter(Writer):
     coloured = True
 
     def open(self, setting: Setting) -> None:
-        self.setting, self._times, self._places, self._values, self.count = setting, [], [], [], 0
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        super().open(setting)
+        self._times, self._places, self._values = [], [], []
 
     def write(self, frame: Frame) -> None:
         standing, surface = [points for points, _ in self.setting.obstacles], self.setting.mesh.surface_vertices
@@ -51,19 +50,14 @@ class SurfacesWriter(Writer):
 
 
 @register
-class PlyWriter(SurfacesWriter):
+class PlyWriter(LastOrAll, SurfacesWriter):
     """Writes the last frame when it is closed, or, for a name such as "run_%04d.ply", every frame, numbered from 0: the
     surface of the body, then those of the obstacles, with a colour (red, green, blue) for each vertex, in metres, float64.
 
-    Raises ValueError for a name with a % that is no place for a number.
     G. Turk, The PLY polygon file format, 1994.
     """
 
     suffixes = (".ply",)
-
-    def __init__(self, path: str | Path, view: View | None = None):
-        super().__init__(path, view)
-        self.numbered = numbered(self.path)
 
     def write(self, frame: Frame) -> None:
         if not self.numbered:  # only the last one waits
@@ -84,7 +78,4 @@ class PlyWriter(SurfacesWriter):
             shades = np.rint(255 * np.concatenate(colours)).astype(np.uint8)
             data = {name: shades[:, c] for c, name in enumerate(("red", "green", "blue"))}
             mesh = meshio.Mesh(np.concatenate(points), [("triangle", np.concatenate(triangles))], point_data=data)
-            mesh.write(file_of(self.path, k) if self.numbered else self.path, binary=True)
-
-    def describe(self) -> str:
-        return super().describe() if self.numbered else str(self.path)
+            mesh.write(self.file_of(k), binary=True)

@@ -72,9 +72,10 @@ class Writer(metaclass=Public):
     def __init__(self, path: str | Path, view: View | None = None):
         self.path, self.view, self.count = Path(path), view or View(), 0
 
-    @abstractmethod
     def open(self, setting: Setting) -> None:
-        """Begin, or begin again. The folder may have to be made."""
+        """Begin, or begin again; makes the folder. A subclass that does more calls this, too."""
+        self.setting, self.count = setting, 0
+        self.path.parent.mkdir(parents=True, exist_ok=True)
 
     @abstractmethod
     def write(self, frame: Frame) -> None:
@@ -94,17 +95,23 @@ class Writer(metaclass=Public):
         self.close()
 
 
-def file_of(path: Path, k: int) -> Path:
-    """That of frame k, of a name such as "run_%04d.png"."""
-    return path.with_name(path.name % k)
+class LastOrAll(Writer):
+    """A part of writers whose files hold one frame: the last one, or, for a name such as "run_%04d.png", a file for each
+    frame, numbered from 0. Raises ValueError for a name with a % that is no place for a number."""
 
+    def __init__(self, path: str | Path, view: View | None = None):
+        super().__init__(path, view)
+        try:
+            self.numbered = "%" in self.path.name and bool(self.path.name % 0)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"output: {self.path.name!r} has no place for one number; write it as %04d") from error
 
-def numbered(path: Path) -> bool:
-    """Whether a name has a place for the number of a frame. Raises ValueError for a % that is none."""
-    try:
-        return "%" in path.name and bool(file_of(path, 0))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"output: {path.name!r} has no place for one number; write it as %04d") from error
+    def file_of(self, k: int) -> Path:
+        """The file that frame k is in."""
+        return self.path.with_name(self.path.name % k) if self.numbered else self.path
+
+    def describe(self) -> str:
+        return super().describe() if self.numbered else str(self.path)
 
 
 def register(kind: type[Writer]) -> type[Writer]:

@@ -14,7 +14,7 @@ from diffsim_ti.mechanics.surfaces.curved_friction import CurvedLaggedFriction
 from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleMotion, SurfaceWithObstacles
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
-from diffsim_ti.mesh.geometry import surface_edges
+from diffsim_ti.mesh.geometry import edges_of
 from diffsim_ti.runtime import Kernel, kernels_of, vector_type
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
@@ -136,7 +136,7 @@ class CurvedPairs:
 
     def __init__(self, kind: type, arrays, parallel: bool, body, nearby: NearCorners | None):
         self.a, self.nearby, self._kind, self._body = arrays, nearby, kind, body
-        self._edges = surface_edges(body.surface_triangles) if nearby else None
+        self._edges = edges_of(body.surface_triangles) if nearby else None
         self.kernels = kernels_of(Transfer, arrays.precision, parallel, nearby is not None)
         self._began, self._sums = None, None  # what a pass began with, in Newton's method; adjoints of who went
         self._hold()

@@ -117,7 +117,7 @@ class SurfaceWithObstacles:
     """
 
     def __init__(self, body, of_body: tuple, corners: ObstacleCorners, self_contact):
-        """of_body: `surface_edges` of its triangles."""
+        """of_body: `edges_of` of its triangles."""
         (edges, sides), n, given = of_body, body.num_vertices, [x.as_given for x in corners.parts]
         self.num_vertices, self.first, self.vertices = n + corners.count, n, np.concatenate([body.vertices, *given])
         self.body, self.corners, self.surface_triangles = body, corners, body.surface_triangles

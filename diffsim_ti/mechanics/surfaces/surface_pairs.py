@@ -13,7 +13,7 @@ from diffsim_ti.mechanics.surfaces.listed_pair import MANY
 from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ContactNumbers, SurfaceWithObstacles
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
-from diffsim_ti.mesh.geometry import surface_edges
+from diffsim_ti.mesh.geometry import edges_of
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.terms.self_contact import SelfContact
@@ -66,7 +66,7 @@ class SurfacePairs:
         self.first = MANY if self.kinematic else arrays.parameters_of_self_contact.start
         self.kernels = kernels_of(PairKernels, arrays.precision, self.first, parallel)
         self.motion = kernels_of(MotionKernels, arrays.precision, self.first, parallel)
-        edges = mesh.edges if self.kinematic else surface_edges(mesh.surface_triangles)[0]
+        edges = mesh.edges if self.kinematic else edges_of(mesh.surface_triangles)[0]
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
         self.edges, self.term = edges, term
         self.body = np.full(mesh.num_vertices, -1)

@@ -26,24 +26,33 @@ def grid(points, nodes, offsets, types, point_arrays: dict, cell_arrays: dict) -
     """The mesh of a grid: nodes of cell k are nodes[offsets[k]:offsets[k + 1]], of VTK's type types[k]."""
     if len(offsets) != len(types) + 1 or (len(offsets) and (offsets[-1] > len(nodes) or np.any(np.diff(offsets) < 0))):
         raise ValueError(f"{len(types)} cell types, where {max(len(offsets) - 1, 0)} cells have nodes")
-    sizes, out, rows_of = np.diff(offsets), FileMesh(points), []
-    keep = np.ones(len(types), bool)
-    if GHOSTS in cell_arrays and len(cell_arrays[GHOSTS]) == len(types):
-        keep = (np.asarray(cell_arrays[GHOSTS]).astype(np.int64) & 1) == 0
+    sizes, parts = np.diff(offsets), []
     for kind, size in sorted({(int(t), int(s)) for t, s in zip(types, sizes)}):
-        rows = np.nonzero((types == kind) & (sizes == size) & keep)[0]
+        rows = np.nonzero((types == kind) & (sizes == size))[0]
+        parts.append((kind, nodes[offsets[rows][:, None] + np.arange(size)].astype(np.int64), rows))
+    return grid_of_kinds(points, parts, point_arrays, cell_arrays)
+
+
+def grid_of_kinds(points, parts: list, point_arrays: dict, cell_arrays: dict) -> FileMesh:
+    """The mesh of a grid whose cells come by kinds: (VTK's type, nodes of the cells, their places among all cells)."""
+    out, rows_of, count = FileMesh(points), [], sum(len(rows) for *_, rows in parts)
+    arrays = {name: np.asarray(values) for name, values in cell_arrays.items() if len(values) == count}
+    for kind, cells, rows in parts:
+        if GHOSTS in arrays:
+            own = (arrays[GHOSTS][rows].astype(np.int64) & 1) == 0
+            cells, rows = cells[own], rows[own]
         if not len(rows):
             continue
+        size = cells.shape[1]
         name = KINDS.get(kind, f"vtk_{kind}")
         if kind in LAGRANGE:
             name = LAGRANGE[kind].get(size, f"tetra{size}" if kind in (71, 78) else f"vtk_{kind}_{size}")
-        out.blocks.append((name, nodes[offsets[rows][:, None] + np.arange(size)].astype(np.int64)))
+        out.blocks.append((name, cells))
         rows_of.append(rows)
     for name, values in point_arrays.items():
         if name.startswith(VERTEX_PREFIX):
             out.point_sets[name.removeprefix(VERTEX_PREFIX)] = np.nonzero(values)[0]
-    arrays = {n: [np.asarray(v)[rows] for rows in rows_of] for n, v in cell_arrays.items() if len(v) == len(types)}
-    groups_of_arrays(out, arrays)
+    groups_of_arrays(out, {name: [values[rows] for rows in rows_of] for name, values in arrays.items()})
     return out
 
 

@@ -17,7 +17,7 @@ from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.supports.free import projectors_of
 from diffsim_ti.mechanics.surfaces.curved_pairs import CurvedPairs
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
-from diffsim_ti.mesh.geometry import surface_edges
+from diffsim_ti.mesh.geometry import edges_of
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree, nearest_of_triangles
 
@@ -122,7 +122,7 @@ def _crossed(pairs, x: np.ndarray, gap: float, most: float):
 
     t = pairs.mesh.surface_triangles
     normals = np.cross(x[t[:, 1]] - x[t[:, 0]], x[t[:, 2]] - x[t[:, 0]])
-    edges, sides = surface_edges(t)
+    edges, sides = edges_of(t)
     out = np.zeros((len(edges), 3))
     np.add.at(out, sides.ravel(), np.repeat(normals / np.linalg.norm(normals, axis=1, keepdims=True), 3, 0))
     out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)

@@ -14,7 +14,7 @@ from diffsim_ti.differentiation.arrays import cross
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
 from diffsim_ti.materials.calculus.tensor import sum_of
-from diffsim_ti.mesh.geometry import surface_edges
+from diffsim_ti.mesh.geometry import edges_of
 from diffsim_ti.runtime import assign, at, let, traced, variable
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
@@ -125,7 +125,7 @@ class MeshObstacle(Obstacle):
         out = super().settled(scene, density, initial_positions, initial_velocities)
         if "barrier_width" in self.left_to_scene:
             out._check_rounding()
-        out._edges_of_bodies, _ = surface_edges(scene.mesh.surface_triangles)
+        out._edges_of_bodies, _ = edges_of(scene.mesh.surface_triangles)
         return out
 
     def check_start(self, positions, surface, offset=(0.0, 0.0, 0.0)):

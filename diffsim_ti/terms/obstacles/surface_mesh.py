@@ -7,7 +7,7 @@ import numpy as np
 
 from diffsim_ti.common.checked import numbers, shown, wholes
 from diffsim_ti.differentiation.arrays import cross
-from diffsim_ti.mesh.geometry import surface_edges
+from diffsim_ti.mesh.geometry import edges_of
 from diffsim_ti.mesh.sets import components
 
 CORNERS = dict(triangles=3, segments=2, points=1)
@@ -67,7 +67,7 @@ class SurfaceMesh:
 
     @cached_property
     def _edges_of_triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        return surface_edges(self.one[self.triangles])
+        return edges_of(self.one[self.triangles])
 
     def sharp_edges(self, length: float, bow: float) -> np.ndarray:
         """Edges that act on a flat face of this length [m]: segments, edges of one triangle or of more than two, and
@@ -106,7 +106,7 @@ class SurfaceMesh:
         (t, s, p), n = (self.one[x] for x in (self.triangles, self.segments, self.points)), len(self.vertices)
         corners = np.concatenate([t, s[:, [0, 1, 1]], p[:, None][:, [0, 0, 0]]])
         a, b, c = corners.T
-        edges, which = surface_edges(corners)
+        edges, which = edges_of(corners)
         side = np.stack([a != b, (b != c) & (a != c), (c != a) & (a != b) & (b != c)], 1)
         corner = np.stack([a == a, a != b, (c != a) & (c != b)], 1)
         faces = np.flatnonzero(side.all(1))
