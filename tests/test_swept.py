@@ -190,7 +190,8 @@ def test_midpoint_steps_are_not_blamed_for_the_work_of_obstacles():
 def test_part_of_the_battery(capsys):
     """The whole of it: python tests/battery_of_impacts.py --cases 200"""
     cases = [draw(n, 5, SOLVERS) for n in range(40) if n % 5 != 4]  # in float64: fewer kernels to compile
-    implicit = [next(c for c in cases if c.solver == name) for name in SOLVERS if not SOLVERS[name].explicit]
+    few = [c for c in cases if c.kind in ("ball", "plate")]
+    implicit = [next(c for c in few if c.solver == name) for name in SOLVERS if not SOLVERS[name].explicit]
     explicit = [c for c in cases if c.explicit and c.slow][:2]
     table = battery([*implicit, *explicit], show=lambda text: print(text))
     assert sum(row["cases"] for row in table.values()) == 6 and len(table) == len(SOLVERS)
