@@ -66,6 +66,7 @@ LEFT_OUT = {
         test_quadratic::test_forces_and_stiffness_are_derivatives_of_the_energy[SmithNeoHookean-tetrahedra]
         test_quadratic::test_forces_and_stiffness_are_derivatives_of_the_energy[Corotated-tetrahedra]
         test_quadratic::test_forces_and_stiffness_are_derivatives_of_the_energy[MooneyRivlin-tetrahedra]
+        test_quadratic::test_forces_and_stiffness_are_derivatives_of_the_energy[LinearElastic-tetrahedra]
         test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-StVenantKirchhoff-SemiImplicitSolver]
         test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-StVenantKirchhoff-VelocityVerletSolver]
         test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-SmithNeoHookean-SemiImplicitSolver]
