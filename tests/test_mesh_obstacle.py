@@ -247,12 +247,13 @@ def in_a_groove(solver, dt, steps, path=None, obstacles=(slice(0, 4),)):
     against mu N / sin 30. The bottom of the groove is out of reach: thick sides are nearer. obstacles: the triangles of
     each. Returns normal forces and friction at frames, over mu / sin 30, and the frames."""
     mu, width, radius = 0.2, 0.01, 0.02
+    # with kernels of the valley above or, on a path, of the land of test_obstacle_pairs.py
+    like = dict(stiffness=1.5e3, shapeable=True) if path is None else dict(stiffness_per_area=1.5e5)
     sides = np.array([[x, abs(z), z * np.tan(np.pi / 6)] for x in (-1, 3) for z in (-1.0, 0.0, 1.0)])
     groove = [
         ds.MeshObstacle(
-            sides, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]][own], radius=radius, width=width, stiffness=1.5e3,
-            friction=mu, friction_speed=1e-3, path=path, name=f"side_{k}",
-            shapeable=path is None,  # with kernels of the valley above, or of the land of test_obstacle_pairs.py
+            sides, [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]][own], radius=radius, width=width,
+            friction=mu, friction_speed=1e-3, path=path, name=f"side_{k}", **like,
         )
         for k, own in enumerate(obstacles)
     ]  # fmt: skip
