@@ -6,8 +6,8 @@ from pathlib import Path
 PAGE = Path(__file__).parent / "README.md"
 HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 
-# area -> files, without test_ and .py. Neighbours have kinds of scenes in common, and short files stand in the middle: of two
-# processes one begins with the first file, and the other with the last.
+# area -> files, without test_ and .py. Neighbours have kinds of scenes in common, and short files stand in the middle: of
+# two processes one begins with the first file, and the other with the last.
 AREAS = {
     "obstacles and friction": "contact_stage contact_gradients contact contact_crossing contact_friction contact_force "
     "contact_rollers mesh_obstacle obstacle_pairs poses own_obstacle contact_area far_from_origin robots",

@@ -216,7 +216,7 @@ LEFT_OUT = {
     "statics far away, and semi-implicit steps": """
         test_far_from_origin::test_it_does_not_matter_where_a_scene_is[ImplicitEulerSolver-exact]
     """,
-    "the other problem, which is run at the steps advised, too": """
+    "a body that twists": """
         test_study::test_advice_keeps_its_promise[drop]
     """,
     "dashpots beside relaxing parts": """
