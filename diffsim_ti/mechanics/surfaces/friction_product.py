@@ -60,8 +60,8 @@ class FrictionProduct:
         self.kernels = kernels_of(FrictionProductKernels, pairs.a.precision, pairs.parallel)
         self.of, self.count = SimpleNamespace(row=runtime.array(ti.i32, len(pairs.mesh.surface_vertices) + 1)), 0
         self.begin(np.zeros((0, 4), int), np.zeros((0, 4)))
-        # without pairs, too; on one thread it takes none, and conjugate gradients compile once if it is always there
-        self.takes_time = pairs.parallel or not runtime.runs_on_cpu()
+        # on one thread it costs nothing without pairs, and conjugate gradients, of which it is then a part, compile once
+        self.always = runtime.runs_on_cpu() and not pairs.parallel
 
     def begin(self, corners: np.ndarray, weights: np.ndarray) -> None:
         """Four corners and weights of each pair."""
