@@ -47,7 +47,7 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Without the thorough ones; of several processes none waits at the end for another's long file."""
+    """Without the thorough ones; for several processes in the order of areas.py."""
     if not config.getoption("--thorough"):
         single = left_out(PLAIN)
         if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.getoption("lf"):  # all of them
@@ -57,20 +57,24 @@ def pytest_collection_modifyitems(config, items):
         config.hook.pytest_deselected(items=list(deselected))
         items[:] = [item for item in items if item not in deselected]
     if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: areas.place(item.path.stem))
+        items.sort(key=lambda item: areas.place(item.path))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """With `--dist loadfile` a process takes whole files, and with a file those that have its scenes."""
+    """With `--dist loadfile` a process takes whole files, every other one from the end: those that have scenes in common are
+    neighbours."""
     if config.getoption("dist") == "loadfile":
         from xdist.scheduler import LoadFileScheduling
 
-        class Together(LoadFileScheduling):
-            def _split_scope(self, nodeid):
-                return areas.together(super()._split_scope(nodeid))
+        class FromBothEnds(LoadFileScheduling):
+            def _assign_work_unit(self, node):
+                early = [scope for scope in self.workqueue if areas.place(scope) < len(areas.ORDER)]
+                if self.nodes.index(node) % 2 and early:
+                    self.workqueue.move_to_end(early[-1], last=False)
+                super()._assign_work_unit(node)
 
-        return Together(config, log)
+        return FromBothEnds(config, log)
 
 
 def _id(item) -> str:

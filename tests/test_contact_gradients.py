@@ -66,6 +66,7 @@ def test_smooth_contact_without_friction(solver):
     assert ds.check_gradients(rollout_of("cylinder", solver, rough=False), verbose=False).passed
 
 
+@pytest.mark.thorough
 def test_several_rough_and_moving_obstacles():
     """Rows of sums, columns of paths and the order of frictions: two that move, two that are rough, one that is neither."""
     options = dict(stiffness=300.0, width=0.2)

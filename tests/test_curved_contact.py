@@ -207,7 +207,8 @@ def test_curved_faces_rub_on_each_other(solver, precision):
         assert np.abs(q - p).max() < {"f64": 1e-12, "f32": 1e-5}[precision] * np.abs(p).max()
         assert np.abs(frames.velocities - without.velocities).max() > 0.1
     if solver.explicit and precision == "f64":
-        names = ["rest_positions", "density", "self_contact_friction", "self_contact_friction_speed"]
+        names = ["rest_positions", "density", "self_contact_width", "self_contact_stiffness", "youngs_modulus"]
+        names += ["self_contact_friction", "self_contact_friction_speed"]
         assert ds.check_gradients(rollout, inputs=names, verbose=False).passed
 
 

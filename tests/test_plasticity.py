@@ -238,6 +238,23 @@ def test_gradients_of_ten_nodes():
     assert r.forward()["dissipation"][-1] > 0
 
 
+def test_gradients_of_explicit_steps_are_those_of_differences():
+    """By all numbers together, of a law with all hardenings."""
+    r, rng = thrown(8e-3, 3, gradients=NUMBERS, outputs=OUTPUTS[2]), np.random.default_rng(1)
+    frames = r.forward()
+    seed = rng.standard_normal(frames.positions.shape)
+    assert frames.law_state[-1, ..., 9].min() > 1e-3
+    way = {name: rng.uniform(0.5, 1, np.shape(x)) * np.abs(x) for name, x in frames.inputs.items() if name in NUMBERS}
+    analytic = sum((x * way[name]).sum() for name, x in r.vjp(frames, seed).items())
+
+    def loss(t):
+        there = r.forward(**{name: frames.inputs[name] + t * change for name, change in way.items()})
+        return (there.positions * seed).sum()
+
+    assert (loss(1e-5) - loss(-1e-5)) / 2e-5 == pytest.approx(analytic, rel=1e-6)
+
+
+@pytest.mark.thorough
 def test_gradients_in_single_precision():
     """Those of float64 to a few of float32's roundings, each of which a stretch of a hundredth makes a hundred times as
     large."""

@@ -109,16 +109,14 @@ def test_statics_rest_on_a_needle():
     scene = ds.Scene(
         mesh,
         SOFT,
-        terms=[needle(stiffness=1e3)],
+        terms=[ds.Gravity((0, 0, 0)), needle(stiffness=1e3)],
         fixed=mesh.vertices[:, 1] > 0.09,
         motion=lambda t: [0, -0.02 * t, 0],
         precision="f64",
     )
     simulator = ds.Simulator(ds.StaticSolver(scene, dt=0.5))
     judged(simulator, NEEDLE, 2)
-    free = ds.Simulator(ds.StaticSolver(scene.replace(terms=[]), dt=0.5))
-    free.run(2)
-    assert np.abs(simulator.positions - free.positions).max() > 2e-3
+    assert np.abs(simulator.positions - (mesh.vertices - [0, 0.02, 0])).max() > 2e-3  # where it would be without
 
 
 def test_a_state_from_outside_is_looked_at_between_its_vertices():
@@ -190,7 +188,8 @@ def test_midpoint_steps_are_not_blamed_for_the_work_of_obstacles():
 def test_part_of_the_battery(capsys):
     """The whole of it: python tests/battery_of_impacts.py --cases 200"""
     cases = [draw(n, 5, SOLVERS) for n in range(40) if n % 5 != 4]  # in float64: fewer kernels to compile
-    implicit = [next(c for c in cases if c.solver == name) for name in SOLVERS if not SOLVERS[name].explicit]
+    few = [c for c in cases if c.kind in ("ball", "plate")]
+    implicit = [next(c for c in few if c.solver == name) for name in SOLVERS if not SOLVERS[name].explicit]
     explicit = [c for c in cases if c.explicit and c.slow][:2]
     table = battery([*implicit, *explicit], show=lambda text: print(text))
     assert sum(row["cases"] for row in table.values()) == 6 and len(table) == len(SOLVERS)

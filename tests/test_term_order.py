@@ -153,7 +153,8 @@ def test_names_follow_the_list_as_written():
                     np.testing.assert_array_equal(scene.inputs.values[here], term.values[own])
 
 
-@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_tape(precision):
     """By a Taichi loss; gradients also in the fields of inputs."""
     expected = None

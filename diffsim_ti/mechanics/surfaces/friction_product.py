@@ -59,6 +59,9 @@ class FrictionProduct:
         self.pairs, self.arrays = pairs, pairs.a
         self.kernels = kernels_of(FrictionProductKernels, pairs.a.precision, pairs.parallel)
         self.of, self.count = SimpleNamespace(row=runtime.array(ti.i32, len(pairs.mesh.surface_vertices) + 1)), 0
+        self.begin(np.zeros((0, 4), int), np.zeros((0, 4)))
+        # on one thread it costs nothing without pairs, and conjugate gradients, of which it is then a part, compile once
+        self.always = runtime.runs_on_cpu() and not pairs.parallel
 
     def begin(self, corners: np.ndarray, weights: np.ndarray) -> None:
         """Four corners and weights of each pair."""

@@ -152,7 +152,7 @@ class LaggedFriction:
 
     def multiplying(self, u, w, out) -> list[tuple]:
         """What adds the change of the forces at u[0] for changes w[0] of the positions to the last corners of `out`."""
-        if not self._product.count:
+        if not (self._product.count or self._product.always):
             return []
         if not self._is_put:
             self._product.put(self._stiffness(runtime.fetch_row(u, 0)))
