@@ -397,15 +397,15 @@ def test_scenes_that_are_refused_are_named():
 @pytest.mark.parametrize("lanes", [None, False], ids=["lanes", "by turns"])
 def test_outputs_of_all_scenes(lanes):
     points = MESH.vertices[:4] * 0.9 + 0.005
-    batch = simple(3, outputs=[ds.MaterialPoints(points)], lanes=lanes)
+    batch = simple(3, outputs=[ds.MaterialPoints(points), ds.ElasticEnergy()], lanes=lanes)  # the latter reads E itself
     frames = batch.forward(youngs_modulus=[1e4, 2e4, 3e4])
-    name = next(iter(frames.outputs))
-    assert frames[name].shape == (3, 3, 4, 3)
-    seed = np.random.default_rng(0).normal(size=frames[name].shape)
+    assert frames["material_points"].shape == (3, 3, 4, 3)
     along = dict(youngs_modulus=np.array([3e3, 1e3, 2e3]))
-    change = batch.tangents(frames, **along)[name]
-    gradient = batch.vjp(frames, **{name: seed})["youngs_modulus"]
-    assert (change * seed).sum() == pytest.approx(gradient @ along["youngs_modulus"], rel=1e-10)
+    changes = batch.tangents(frames, **along)
+    for name, values in frames.outputs.items():
+        seed = np.random.default_rng(0).normal(size=values.shape)
+        gradient = batch.vjp(frames, **{name: seed})["youngs_modulus"]
+        assert (changes[name] * seed).sum() == pytest.approx(gradient @ along["youngs_modulus"], rel=1e-10)
 
 
 def test_scenes_by_turns_where_lanes_do_not_serve():

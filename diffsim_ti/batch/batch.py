@@ -341,8 +341,7 @@ class Batch(metaclass=Public):
         for b, by_inputs in direct:
             for name in set(by_inputs).intersection(wanted):
                 out[name] = np.array(out[name])
-                target = out[name][b] if name in own else out[name]
-                target += by_inputs[name]
+                out[name][b if name in own else ...] += by_inputs[name]
         return out
 
     def _vjp_by_turns(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
