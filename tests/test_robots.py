@@ -189,6 +189,8 @@ def test_a_run_that_stops_keeps_its_joints_and_has_no_gradient(wheel):
     found = batch.forward(**{"robot.velocities": [[1.0], [400.0]]})
     assert found.alive.tolist() == [True, False]
     assert found["joint_positions"][0, -1, 0] == pytest.approx(0.02)
+    with pytest.raises(ValueError, match="a run does not start from joints of robots that have moved"):
+        _ = found.end
 
 
 @pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.VelocityVerletSolver])
