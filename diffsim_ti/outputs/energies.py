@@ -138,7 +138,8 @@ class WorkOfLoads(Output):
     a, b: positions in the two frames; F_b(x), F_e(x): forces of all tractions, body forces, external forces, pressures,
     chambers, springs, cables, muscles, foundations and relations with a stiffness at x, as the first step between the frames
     begins and as the last one ends; with weight=True also those of gravity. A `FilledChamber` pushes with what
-    `ChamberPressure` says of the two frames, before the first step with that of the second: its work is the mean of both times the change of volume, 0 where V stays.
+    `ChamberPressure` says of the two frames, before the first step with that of the second: its work is the mean of both
+    times the change of volume, 0 where V stays.
     It is Simpson's rule along straight lines from frame to frame under loads that go linearly in time: exact, to round-off,
     for such motions; for loads that are constant and dead (and weight), and for a constant pressure on a closed surface
     (minus p times the change of volume), whatever the motion. Else its error falls as the square of the time between
