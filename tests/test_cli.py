@@ -341,7 +341,7 @@ def test_errors_are_one_line(cube_file, tmp_path, capsys):
     assert "poissons_ratio" in fails(capsys, *run, "--nu", "0.5")
     assert "cpu, cuda, vulkan" in fails(capsys, *run, "--backend", "abacus")
     assert "longer than a frame, 1 / 30 s" in fails(capsys, *run, "--dt", "0.1")
-    assert "of which --height" in fails(capsys, *run, "--no-ground", "--ground-friction", "0.5")
+    assert "no floor, of which friction would be" in fails(capsys, *run, "--no-ground", "--ground-friction", "0.5")
     assert "name what is by --fixed" in fails(capsys, *run, "--arrows", "reaction")
     assert "precision" in fails(capsys, *run, "--precision", "f16")
     assert "--solver" in fails(capsys, *run, "--solver", "magic")

@@ -436,7 +436,10 @@ def test_refusals(swing):
         ((data, {"density": 1.0}, {"velocities": 1.0}), "noise is of velocities, data of positions"),
         ((data, {"density": ds.Unknown(1.0, experiments=[-1])}, 1.0), "one or more indices in 0..0, got \\[-1"),
         ((data, {"density": 1.0, "rho": ds.Unknown(2.0, input="density")}, 1.0), "density and rho are both the same"),
-        ((data, {"time_offset": ds.Unknown(0.0, scale=1.0)}, 1.0), "and experiment 0 has none: give its Measurement times"),
+        (
+            (data, {"time_offset": ds.Unknown(0.0, scale=1.0)}, 1.0),
+            "and experiment 0 has none: give its Measurement times",
+        ),
     ):
         with pytest.raises(ValueError, match=expected):
             identify(swing, *arguments)
@@ -449,7 +452,11 @@ def test_refusals(swing):
             ds.Measurement("positions", np.zeros((11, 2, 3)), 1.0, [0, 999]),
             "at must be a list of indices in 0..",
         ),
-        (swing, ds.Measurement("positions", three, 1.0, [0, 1], [0.0, np.nan, 0.1]), "must be a list of finite numbers"),
+        (
+            swing,
+            ds.Measurement("positions", three, 1.0, [0, 1], [0.0, np.nan, 0.1]),
+            "must be a list of finite numbers",
+        ),
         (swing, ds.Measurement("positions", three, 1.0, [0, 1], [0.0, 0.1, 9.0]), "times must lie within"),
     ):
         with pytest.raises(ValueError, match=expected):

@@ -144,9 +144,7 @@ def check_length(duration: float, fps: float, dt: float | None) -> None:
             "shorten it, or take fewer frames per second"
         )
     if dt is not None and dt * fps > 1 + 1e-9:
-        raise ValueError(
-            f"--dt {dt:g} s is longer than a frame, 1 / {fps:g} s: take a shorter one, or a smaller --fps"
-        )
+        raise ValueError(f"--dt {dt:g} s is longer than a frame, 1 / {fps:g} s: take a shorter one, or a smaller --fps")
     if dt is not None and duration / dt > 1e12:
         raise ValueError(
             f"--duration {duration:g} in steps of --dt {dt:g} s takes {duration / dt:.3g} steps, more than 1e12: shorten "
@@ -293,8 +291,8 @@ def fall_scene(
         body = body.translated([0, height - low, 0])
         speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
         terms.append(make_ground(body, law, density, gravity, speed, **ground))
-    elif height is not None or any(ground.values()):
-        raise ValueError("--no-ground leaves the floor out, of which --height and --ground-... are: leave these out, too")
+    elif given := [name for name, x in (dict(height=height) | ground).items() if x]:
+        raise ValueError(f"there is no floor, of which {', '.join(given)} would be: leave that out, too")
     fixed = fixed_vertices(body, list(fixed or []))
     return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity, volume=volume), body
 
