@@ -84,8 +84,8 @@ class Measurement(metaclass=Public):
             moved = f", with time_offset = {offset:g} s," if offset else ""
             raise ValueError(
                 f"{self.output}: times{moved} must lie within those of the run, {first:g} to {last:g} s; got "
-                f"{at.min() + offset:g} to {at.max() + offset:g} s: simulate longer, begin with another time_offset, or leave "
-                "these rows out"
+                f"{at.min() + offset:g} to {at.max() + offset:g} s: simulate longer, begin with another time_offset, or "
+                "leave these rows out"
             )
 
     def when(self, rollout: Rollout) -> np.ndarray:
