@@ -13,6 +13,7 @@ import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_scene import JoinedArrays
+from diffsim_ti.batch.joined_workspace import JoinedSweep
 from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.solvers.implicit.preconditioners import Preconditioner
 
@@ -406,6 +407,16 @@ def test_outputs_of_all_scenes(lanes):
         seed = np.random.default_rng(0).normal(size=values.shape)
         gradient = batch.vjp(frames, **{name: seed})["youngs_modulus"]
         assert (changes[name] * seed).sum() == pytest.approx(gradient @ along["youngs_modulus"], rel=1e-10)
+
+
+def test_a_scene_whose_adjoint_is_not_solved_has_its_gradient_alone(monkeypatch):
+    solver = ds.ImplicitEulerSolver(simple(1).scene, dt=5e-3, tolerance=1e-11)
+    batch = ds.Batch(solver, 1, 3, outputs=[ds.ElasticEnergy()], gradients="youngs_modulus", lanes=True)
+    frames = batch.forward(youngs_modulus=[1e4, 2e4, 3e4], initial_positions=MESH.vertices * [1.1, 1, 1])
+    seed = np.ones((3, 2))
+    together = batch.vjp(frames, elastic_energy=seed)["youngs_modulus"]
+    monkeypatch.setattr(JoinedSweep, "left", [1])
+    np.testing.assert_allclose(batch.vjp(frames, elastic_energy=seed)["youngs_modulus"], together, rtol=1e-8)
 
 
 def test_scenes_by_turns_where_lanes_do_not_serve():
