@@ -13,6 +13,7 @@ import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_scene import JoinedArrays
+from diffsim_ti.batch.joined_workspace import JoinedSweep
 from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.solvers.implicit.preconditioners import Preconditioner
 
@@ -397,15 +398,25 @@ def test_scenes_that_are_refused_are_named():
 @pytest.mark.parametrize("lanes", [None, False], ids=["lanes", "by turns"])
 def test_outputs_of_all_scenes(lanes):
     points = MESH.vertices[:4] * 0.9 + 0.005
-    batch = simple(3, outputs=[ds.MaterialPoints(points)], lanes=lanes)
-    frames = batch.forward(youngs_modulus=[1e4, 2e4, 3e4])
-    name = next(iter(frames.outputs))
-    assert frames[name].shape == (3, 3, 4, 3)
-    seed = np.random.default_rng(0).normal(size=frames[name].shape)
+    batch = simple(3, outputs=[ds.MaterialPoints(points), ds.ElasticEnergy()], lanes=lanes)  # the latter reads E itself
+    frames = batch.forward(youngs_modulus=[1e4, 2e4, 3e4], initial_positions=MESH.vertices * [1.1, 1, 1])
+    assert frames["material_points"].shape == (3, 3, 4, 3)
     along = dict(youngs_modulus=np.array([3e3, 1e3, 2e3]))
-    change = batch.tangents(frames, **along)[name]
-    gradient = batch.vjp(frames, **{name: seed})["youngs_modulus"]
-    assert (change * seed).sum() == pytest.approx(gradient @ along["youngs_modulus"], rel=1e-10)
+    changes = batch.tangents(frames, **along)
+    for name, values in frames.outputs.items():
+        seed = np.random.default_rng(0).normal(size=values.shape)
+        gradient = batch.vjp(frames, **{name: seed})["youngs_modulus"]
+        assert (changes[name] * seed).sum() == pytest.approx(gradient @ along["youngs_modulus"], rel=1e-10)
+
+
+def test_a_scene_whose_adjoint_is_not_solved_has_its_gradient_alone(monkeypatch):
+    solver = ds.ImplicitEulerSolver(simple(1).scene, dt=5e-3, tolerance=1e-11)
+    batch = ds.Batch(solver, 1, 3, outputs=[ds.ElasticEnergy()], gradients="youngs_modulus", lanes=True)
+    frames = batch.forward(youngs_modulus=[1e4, 2e4, 3e4], initial_positions=MESH.vertices * [1.1, 1, 1])
+    seed = np.ones((3, 2))
+    together = batch.vjp(frames, elastic_energy=seed)["youngs_modulus"]
+    monkeypatch.setattr(JoinedSweep, "left", [1])
+    np.testing.assert_allclose(batch.vjp(frames, elastic_energy=seed)["youngs_modulus"], together, rtol=1e-8)
 
 
 def test_scenes_by_turns_where_lanes_do_not_serve():

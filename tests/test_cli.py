@@ -325,7 +325,7 @@ def test_simulate_says_how_accurate_the_end_is(solver, cube_file, tmp_path, caps
 
 
 def test_simulate_refuses_an_unstable_step_in_one_line(cube_file, tmp_path, capsys):
-    run = ["simulate", str(cube_file), "-o", str(tmp_path), "--dt", "0.1"]
+    run = ["simulate", str(cube_file), "-o", str(tmp_path), "--dt", "0.03"]
     assert "exceeds the stable step" in fails(capsys, *run)
     with pytest.raises(ValueError, match="exceeds the stable step"):
         cli.main(["--traceback", *run])
@@ -337,6 +337,9 @@ def test_errors_are_one_line(cube_file, tmp_path, capsys):
     assert "StableNeoHookean" in fails(capsys, *run, "--material", "Rubber")
     assert "poissons_ratio" in fails(capsys, *run, "--nu", "0.5")
     assert "cpu, cuda, vulkan" in fails(capsys, *run, "--backend", "abacus")
+    assert "longer than a frame, 1 / 30 s" in fails(capsys, *run, "--dt", "0.1")
+    assert "no floor, of which friction would be" in fails(capsys, *run, "--no-ground", "--ground-friction", "0.5")
+    assert "name what is by --fixed" in fails(capsys, *run, "--arrows", "reaction")
     assert "precision" in fails(capsys, *run, "--precision", "f16")
     assert "--solver" in fails(capsys, *run, "--solver", "magic")
     assert "patches" in fails(capsys, *run, "--volume", "vertices")

@@ -437,6 +437,13 @@ def test_refusals(swing):
         ((data, {"density": -1.0}, 1.0), "has no logarithm; give range or scale"),
         ((data, {"youngs_modulus": ds.Unknown(1.0, regions="soft")}, 1.0), "no set of tetrahedra named 'soft'"),
         ((data, {"density": 1.0}, 1.0, {"E": ds.Normal(1.0, 1.0)}), "prior: no unknown named 'E'"),
+        ((data, {"density": 1.0}, {"velocities": 1.0}), "noise is of velocities, data of positions"),
+        ((data, {"density": ds.Unknown(1.0, experiments=[-1])}, 1.0), "one or more indices in 0..0, got \\[-1"),
+        ((data, {"density": 1.0, "rho": ds.Unknown(2.0, input="density")}, 1.0), "density and rho are both the same"),
+        (
+            (data, {"time_offset": ds.Unknown(0.0, scale=1.0)}, 1.0),
+            "and experiment 0 has none: give its Measurement times",
+        ),
     ):
         with pytest.raises(ValueError, match=expected):
             identify(swing, *arguments)
@@ -449,11 +456,17 @@ def test_refusals(swing):
             ds.Measurement("positions", np.zeros((11, 2, 3)), 1.0, [0, 999]),
             "at must be a list of indices in 0..",
         ),
-        (swing, ds.Measurement("positions", three, 1.0, [0, 1], [0.0, np.nan, 0.1]), "times must lie within"),
+        (
+            swing,
+            ds.Measurement("positions", three, 1.0, [0, 1], [0.0, np.nan, 0.1]),
+            "must be a list of finite numbers",
+        ),
         (swing, ds.Measurement("positions", three, 1.0, [0, 1], [0.0, 0.1, 9.0]), "times must lie within"),
     ):
         with pytest.raises(ValueError, match=expected):
             ds.identify(rollout, measurement, {"density": 1.0})
+    with pytest.raises(ValueError, match="time_offset = -2 s, must lie within .* got -2 to 7 s: simulate longer"):
+        identify(swing, measurement, {"time_offset": ds.Unknown(-2.0, scale=1.0)})
     inside, priors = ds.Unknown(1e5, range=(1e4, 1e6)), (ds.Normal(2e6, 0.1), ds.Normal(1e6, 0.1), ds.Normal(1e5, 0.0))
     for prior in priors:
         with pytest.raises(ValueError, match="lies where the unknown cannot be, or its deviation is 0"):

@@ -189,6 +189,8 @@ def test_a_run_that_stops_keeps_its_joints_and_has_no_gradient(wheel):
     found = batch.forward(**{"robot.velocities": [[1.0], [400.0]]})
     assert found.alive.tolist() == [True, False]
     assert found["joint_positions"][0, -1, 0] == pytest.approx(0.02)
+    with pytest.raises(ValueError, match="a run does not start from joints of robots that have moved"):
+        _ = found.end
 
 
 @pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.VelocityVerletSolver])
@@ -303,7 +305,8 @@ def test_a_pendulum_swings_as_its_equation_says(kind, ratio):
 
 @pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
 def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses(kind):
-    """A sliding ball flies at a body that floats; p of both is kept to the tolerance of the solves, or to round-off."""
+    """A sliding ball with a drive flies at a body that floats; p of both changes by its efforts alone, to the tolerance of
+    the solves, or to round-off."""
     text = urdf(
         link("a"),
         link("b", 1.0, 0.0, shape='<sphere radius="0.02"/>'),
@@ -311,13 +314,18 @@ def test_a_link_hits_a_body_and_momentum_stays_whatever_the_masses(kind):
     )
     robot = ds.Robot.from_urdf(text, velocities=[1.0], width=2e-3, stiffness_per_area=3e7, friction=0.3)
     scene = scene_of(robot)
-    solver = kind(scene, dt=4e-3, **({} if kind.explicit else dict(tolerance=1e-9)))
-    rollout = ds.Rollout(solver, 6, save_every=6, outputs=[ds.JointVelocities("robot")])
+    solver = kind(scene, dt=5e-4, substeps=1) if kind.explicit else kind(scene, dt=4e-3, tolerance=1e-9)
+    rollout = ds.Rollout(
+        solver, round(0.024 / solver.dt), save_every=1, outputs=[ds.JointVelocities("robot"), ds.JointEfforts("robot")]
+    )
     body, m = 500.0 * 0.06**3, scene.mass_matrix().diagonal()[::3]
     for ratio in (1e-3, 1.0, 1e3):
-        frames = rollout.forward(**{"robot.masses": [ratio * body]})
+        drive = {"robot.drive_stiffness": [100 * ratio], "robot.drive_damping": [ratio]}
+        frames = rollout.forward(**{"robot.masses": [ratio * body]}, **drive)
         gained = float(m @ frames.velocities[-1, :, 0])
-        lost = ratio * body * (1.0 - frames["joint_velocities"][-1, 0])
+        lost = ratio * body * (1.0 - frames["joint_velocities"][-1, 0]) + solver.dt * float(
+            frames["joint_efforts"].sum()
+        )
         exact = 1e-12 * max(ratio, 1.0) if kind.explicit else 1e-6
         assert lost > 0.1 * body * min(ratio, 1.0) and gained == pytest.approx(lost, rel=exact)
 

@@ -195,6 +195,16 @@ def test_wrong_names_and_shapes_are_answered():
     np.testing.assert_array_equal(simulator.positions, before)
     with pytest.raises(ValueError, match="BDF2Solver looks back two steps"):
         TorchSimulator(ds.BDF2Solver(simulator.scene))
+    steps = solver_of(ds.ImplicitEulerSolver, simulator.scene)
+    for name, said in (
+        ("initial_positions", "to reset"),
+        ("rest_positions", "make the scene with it"),
+        ("moves.path", "to step"),
+    ):
+        with pytest.raises(ValueError, match=f"numbers that hold in all steps, got {name}: .*{said}"):
+            TorchSimulator(steps, values={name: simulator.scene.inputs.values["rest_positions"]})
+    with pytest.raises(ValueError, match="work counts from the start of a run, and each step starts afresh"):
+        TorchSimulator(steps, outputs=[ds.WorkOfLoads()])
     turned = simulator.scene.replace(motion=ds.Pose(lambda t: np.zeros(6)))
     with pytest.raises(ValueError, match="a motion by a Pose"):
         TorchSimulator(ds.ImplicitEulerSolver(turned))

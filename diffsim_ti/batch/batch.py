@@ -218,9 +218,8 @@ class Batch(metaclass=Public):
 
     def _frames_of(self, values: dict, b: int, states: tuple, noted: dict, times, resolution) -> Frames:
         own = self.sweep.values_of(values, b)
-        frames = Frames(
-            *(x[b] for x in states), times, own, resolution, run=Run(own), **{n: x[b] for n, x in noted.items()}
-        )
+        run, noted = Run(own, contacts=lambda: resolution), {n: x[b] for n, x in noted.items()}
+        frames = Frames(*(x[b] for x in states), times, own, resolution, run=run, **noted)
         frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
         frames.scene = self.scene
         for name, output in self.one.computed.items():
@@ -316,6 +315,7 @@ class Batch(metaclass=Public):
         for part in derived.parts().values():
             if part is not None:
                 part[~alive] = 0  # they have left no trace in others
+        direct = [(b, by_inputs) for b, by_inputs in direct if b not in alone]
         out = self._by_inputs(frames, derived.mapped(np.asarray), direct)
         for b in sorted(alone.intersection(np.flatnonzero(frames.alive).tolist())):
             by_one = self.one.vjp(frames[b], **{name: x[b] for name, x in given.items()})
@@ -341,8 +341,7 @@ class Batch(metaclass=Public):
         for b, by_inputs in direct:
             for name in set(by_inputs).intersection(wanted):
                 out[name] = np.array(out[name])
-                target = out[name][b] if name in own else out[name]
-                target += by_inputs[name]
+                out[name][b if name in own else ...] += by_inputs[name]
         return out
 
     def _vjp_by_turns(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:

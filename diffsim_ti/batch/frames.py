@@ -13,6 +13,7 @@ from diffsim_ti.common.public import Public
 from diffsim_ti.outputs.output import Frames
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.watch import ContactResolution
+from diffsim_ti.terms import Robot
 
 if TYPE_CHECKING:
     from diffsim_ti.batch.batch import Batch
@@ -101,8 +102,15 @@ class BatchFrames(Sequence, metaclass=Public):
     def end(self) -> dict[str, np.ndarray]:
         """The last states as inputs of a run that goes on from there, in float64: initial_positions, initial_velocities.
 
-        `reset` restarts some scenes.
+        `reset` restarts some scenes. What is given over time begins again with that run, and BDF2 with backward Euler.
+        Raises ValueError for scenes with robots, and laws that remember, whose states no input of a run has.
         """
+        scene = self._batch.scene
+        if scene.law.state_names or scene.term(Robot):
+            raise ValueError(
+                "a run does not start from joints of robots that have moved, nor from what a law remembers: take a "
+                "Simulator for each scene, whose steps go on from there"
+            )
         rest = self.values["rest_positions"]
         rest = np.stack(rest) if isinstance(rest, tuple) else rest
         return dict(

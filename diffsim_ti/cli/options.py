@@ -143,6 +143,8 @@ def check_length(duration: float, fps: float, dt: float | None) -> None:
             f"--duration {duration:g} at --fps {fps:g} makes {duration * fps:.3g} frames, more than {MOST_FRAMES:.0e}: "
             "shorten it, or take fewer frames per second"
         )
+    if dt is not None and dt * fps > 1 + 1e-9:
+        raise ValueError(f"--dt {dt:g} s is longer than a frame, 1 / {fps:g} s: take a shorter one, or a smaller --fps")
     if dt is not None and duration / dt > 1e12:
         raise ValueError(
             f"--duration {duration:g} in steps of --dt {dt:g} s takes {duration / dt:.3g} steps, more than 1e12: shorten "
@@ -289,6 +291,8 @@ def fall_scene(
         body = body.translated([0, height - low, 0])
         speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
         terms.append(make_ground(body, law, density, gravity, speed, **ground))
+    elif given := [name for name, x in (dict(height=height) | ground).items() if x]:
+        raise ValueError(f"there is no floor, of which {', '.join(given)} would be: leave that out, too")
     fixed = fixed_vertices(body, list(fixed or []))
     return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity, volume=volume), body
 
@@ -304,6 +308,8 @@ def forces_named(names: Sequence[str], scene: Scene) -> list[Output]:
             raise ValueError(f"--arrows: must be {', '.join(FORCES[:-1])} or {FORCES[-1]}, got {name!r}")
         if name != "reaction" and not scene.obstacles:
             raise ValueError(f"--arrows {name}: there is no obstacle; leave --no-ground out")
+        if name == "reaction" and not len(scene.held):
+            raise ValueError("--arrows reaction: nothing is held; name what is by --fixed")
         own = dict(name=name, per_vertex=True) | (dict(part="friction") if name == "friction" else {})
         out.append(Reaction(**own) if name == "reaction" else ContactForce(scene.obstacles[0], **own))
     return out

@@ -71,12 +71,22 @@ class Measurement(metaclass=Public):
         if self.times is not None:
             if rollout.num_frames < 2:
                 raise ValueError(f"{self.output}: values are of one instant, which has no times: leave `times` out")
-            first, last = rollout.times[0], rollout.times[-1]
-            if self.times.ndim != 1 or not np.all((self.times >= first) & (self.times <= last)):
-                raise ValueError(f"{self.output}: times must lie within those of the run, {first:g} to {last:g} s")
+            if self.times.ndim != 1 or not np.all(np.isfinite(self.times)):
+                raise ValueError(f"{self.output}: times must be a list of finite numbers [s], got {shown(self.times)}")
             shape[0] = len(self.times)
         if self.values.shape != tuple(shape):
             raise ValueError(f"{self.output}: expected values of shape {tuple(shape)}, got {self.values.shape}")
+
+    def check_times(self, rollout: Rollout, offset: float) -> None:
+        """Raise ValueError where a time is none of the run."""
+        (first, last), at = rollout.times[[0, -1]], self.times
+        if at is not None and np.any((at + offset < first) | (at + offset > last)):
+            moved = f", with time_offset = {offset:g} s," if offset else ""
+            raise ValueError(
+                f"{self.output}: times{moved} must lie within those of the run, {first:g} to {last:g} s; got "
+                f"{at.min() + offset:g} to {at.max() + offset:g} s: simulate longer, begin with another time_offset, or "
+                "leave these rows out"
+            )
 
     def when(self, rollout: Rollout) -> np.ndarray:
         """The share of the run that had passed at each of the values that are not missing."""
@@ -127,7 +137,10 @@ def measurements(data, noise) -> list[Measurement]:
     if isinstance(data, dict):
         if noise is None:
             raise ValueError("identify: data given as {output: values} need noise, a number or {output: deviation}")
-        return [Measurement(k, x, noise[k] if isinstance(noise, dict) else noise) for k, x in data.items()]
+        each = noise if isinstance(noise, dict) else dict.fromkeys(data, noise)
+        if set(each) != set(data):
+            raise ValueError(f"identify: noise is of {', '.join(each)}, data of {', '.join(data)}: name each of these")
+        return [Measurement(k, x, each[k]) for k, x in data.items()]
     out = list(data)
     if not out or not all(isinstance(one, Measurement) for one in out):
         raise ValueError("identify: data are {output: values}, a Measurement, or a list of those, for each experiment")

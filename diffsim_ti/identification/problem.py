@@ -49,6 +49,8 @@ class Problem:
         self.rollouts, self.data, self.simulations = rollouts, data, 0
         given = {k: x if isinstance(x, Unknown) else _plain(k, x) for k, x in unknowns.items()}
         self.unknowns = [Free(unknown, label, rollouts) for label, unknown in given.items()]
+        for k in range(len(rollouts)):
+            self._check_unknowns(k)
         ends = np.cumsum([0, *(free.size for free in self.unknowns)])
         self.parts, self.size = [slice(a, b) for a, b in zip(ends, ends[1:])], int(ends[-1])
         self.labels = [f"{f.label}[{i}]" if f.size > 1 else f.label for f in self.unknowns for i in range(f.size)]
@@ -56,6 +58,25 @@ class Problem:
         self.num_data = sum(int(m.seen.sum()) for given in data for m in given)
         when = [m.when(rollout) for rollout, given in zip(rollouts, data) for m in given]
         self.when, self.counts = np.concatenate([np.zeros(0), *when]), np.ones(())  # whether a datum does
+
+    def _check_unknowns(self, k: int) -> None:
+        """Raise ValueError where unknowns share a number of experiment k, or an offset of time moves nothing there."""
+        seen: dict[str, list[Free]] = {}
+        for free in self.unknowns:
+            if k not in free.experiments:
+                continue
+            if free.is_offset and all(m.times is None for m in self.data[k]):
+                raise ValueError(
+                    f"{free.label}: time_offset moves measurements with times of their own, and experiment {k} has none: "
+                    "give its Measurement times, or choose other experiments"
+                )
+            for other in seen.setdefault(free.input, []):
+                if np.any((free.rows[k] >= 0) & (other.rows[k] >= 0)):
+                    raise ValueError(
+                        f"{other.label} and {free.label} are both the same numbers of {free.input!r} in experiment {k}: "
+                        "keep one, or tell them apart by regions (-1 for what is fixed) or experiments"
+                    )
+            seen[free.input].append(free)
 
     def _of(self, k: int) -> Iterable[tuple[Free, slice]]:
         return [(free, part) for free, part in zip(self.unknowns, self.parts) if k in free.experiments]
@@ -88,10 +109,12 @@ class Problem:
 
     def run(self, t: np.ndarray) -> Point:
         """A run of each experiment."""
-        frames, residual = [], []
-        for k, rollout in enumerate(self.rollouts):
-            values = self.inputs(k, t)
-            offset = float(values.pop(TIME_OFFSET, 0.0))
+        inputs, frames, residual = [self.inputs(k, t) for k in range(len(self.rollouts))], [], []
+        offsets = [float(values.pop(TIME_OFFSET, 0.0)) for values in inputs]
+        for rollout, given, offset in zip(self.rollouts, self.data, offsets):
+            for m in given:
+                m.check_times(rollout, offset)
+        for k, (rollout, values, offset) in enumerate(zip(self.rollouts, inputs, offsets)):
             frames.append(rollout.forward(**values))
             self.simulations += 1
             residual += [m.residual(frames[-1], offset) for m in self.data[k]]

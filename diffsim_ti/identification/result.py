@@ -272,12 +272,14 @@ def save_picture(
     frames: Frames,
     at: np.ndarray | None = None,
     at_label: str = "time [s]",
+    offset: float | None = None,
 ) -> None:
     """Write the picture of one experiment's measurement; frames: of the run with the numbers found; at: what the values'
-    rows are drawn over, default their times."""
+    rows are drawn over, default their times; offset: of these [s], default the estimate of that name, "time_offset"."""
     from matplotlib.figure import Figure
 
-    r = measurement.residual(frames, float(found.estimates.get("time_offset", 0.0)))
+    offset = found.estimates.get("time_offset", 0.0) if offset is None else offset
+    r = measurement.residual(frames, float(offset))
     seen = measurement.seen
     times = frames.times if measurement.times is None else measurement.times
     times = times if at is None else at

@@ -29,7 +29,8 @@ class Unknown(metaclass=Public):
     high). scale: a change that matters, in the input's unit, one or one for each number.
     regions: names of the mesh's sets of tetrahedra, a number for each, what lies in none keeps the scene's value; "each" for
     one per tetrahedron; or whole numbers of the input's shape, equal ones for what changes together, -1 for what is fixed.
-    input: its name; default the unknown's own. "time_offset" [s] is added to the times of measurements.
+    input: its name; default the unknown's own. "time_offset" [s] is added to the times of measurements,
+    which must stay within those of the run.
     experiments: indices of the rollouts that it acts in; default all.
     Errors are ValueErrors before any run. Seber, Wild, Nonlinear Regression, 1989, sec. 2.8, on such transformations.
     """
@@ -67,6 +68,9 @@ class Free:
     def __init__(self, unknown: Unknown, label: str, rollouts: list[Rollout]):
         self.label, self.input, self.unknown = label, unknown.input or label, unknown
         self.experiments = range(len(rollouts)) if unknown.experiments is None else unknown.experiments
+        if not self.experiments or not set(self.experiments) <= set(range(len(rollouts))):
+            said = f"one or more indices in 0..{len(rollouts) - 1}, got {list(self.experiments)}"
+            raise ValueError(f"{label}: experiments must be {said}")
         self.rows = {k: self._groups(rollouts[k]) for k in self.experiments}
         self.is_offset = self.input == TIME_OFFSET
         self.size = 1 + max(int(rows.max(initial=0)) for rows in self.rows.values())

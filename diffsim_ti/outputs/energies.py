@@ -136,14 +136,16 @@ class WorkOfLoads(Output):
         W_k - W_(k-1) = 1/6 [F_b(a) + 2 F_b(m) + 2 F_e(m) + F_e(b)] . (b - a),        m = (a + b) / 2
 
     a, b: positions in the two frames; F_b(x), F_e(x): forces of all tractions, body forces, external forces, pressures,
-    chambers, springs, cables and foundations at x, as the first step between the frames begins and as the last one ends;
-    with weight=True also those of gravity. A `FilledChamber` pushes with what `ChamberPressure` says of the two frames,
-    before the first step with that of the second: its work is the mean of both times the change of volume, 0 where V stays.
+    chambers, springs, cables, muscles, foundations and relations with a stiffness at x, as the first step between the frames
+    begins and as the last one ends; with weight=True also those of gravity. A `FilledChamber` pushes with what
+    `ChamberPressure` says of the two frames, before the first step with that of the second: its work is the mean of both
+    times the change of volume, 0 where V stays.
     It is Simpson's rule along straight lines from frame to frame under loads that go linearly in time: exact, to round-off,
     for such motions; for loads that are constant and dead (and weight), and for a constant pressure on a closed surface
     (minus p times the change of volume), whatever the motion. Else its error falls as the square of the time between
     frames; with save_every=1 loads for each step are those of their step. Loads that change between frames further apart are
-    not seen there. What moves fixed vertices, obstacles, drag and a rotating frame do no work of loads.
+    not seen there. What moves fixed vertices, relations that are held exactly, obstacles, drag and a rotating frame do no
+    work of loads.
 
     weight: whether gravity counts. name: how a loss calls it. The gradient is exact by all inputs.
     Raises ValueError for a scene without such loads.

@@ -57,8 +57,9 @@ class JointEfforts(JointPositions):
 
         tau + k (q_target - q) - c (q - q_n) / h - dE_limit/dq,
 
-    so of a prescribed joint what it takes to move it. With save_every=1 and one substep in each step, effort times (q - q_n)
-    is the work on the joints.
+    so of a prescribed joint what it takes to move it; in explicit steps with -(c + h k) times the velocity that a contact
+    gives back, so that efforts, weight and contact change momentum to round-off there, too. With save_every=1 and one
+    substep in each step, effort times (q - q_n) is the work on the joints.
     Featherstone 2008, Rigid Body Dynamics Algorithms, sec. 3.
     """
 

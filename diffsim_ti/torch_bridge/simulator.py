@@ -24,7 +24,8 @@ class TorchSimulator(metaclass=Public):
     """Steps of a solver as nodes of torch's graph: a `Simulator` whose states are tensors.
 
     scenes: None for one scene, or how many of a `Batch`, whose states and, where they are given so, inputs have that axis
-    in front. values: {name of an input: tensor or array} that hold in all steps, such as youngs_modulus or density.
+    in front. values: {name of an input: tensor or array} that hold in all steps, such as youngs_modulus or density, or until
+    a step is given others; not of the start, of the rest shape or of what the scene has over time.
     outputs: what `outputs` has after each step, besides.
 
     positions, displacements [m] and velocities [m/s], shape (num_vertices, 3) or (scenes, num_vertices, 3), lead back to all
@@ -56,20 +57,29 @@ class TorchSimulator(metaclass=Public):
     ):
         instance("TorchSimulator", "solver", solver, Solver, "a solver such as SemiImplicitSolver(scene)")
         self.scene, self.values, self.scenes = solver.scene, dict(values or {}), scenes
-        remedy = "each step starts afresh; take rollout_frames(Rollout(solver, steps), ...) for a whole run"
-        refuse_state(self.scene.law, "TorchSimulator", remedy)
+        afresh = "each step starts afresh; take rollout_frames(Rollout(solver, steps), ...) for a whole run"
+        refuse_state(self.scene.law, "TorchSimulator", afresh)
         if getattr(solver, "multistep", False):
             raise ValueError(
-                f"TorchSimulator: {type(solver).__name__} looks back two steps, and {remedy}, or ImplicitEulerSolver"
+                f"TorchSimulator: {type(solver).__name__} looks back two steps, and {afresh}, or ImplicitEulerSolver"
             )
         if self.scene.terms_of(Robot):
-            raise ValueError(f"TorchSimulator: its states have no joints of robots: {remedy}")
+            raise ValueError(f"TorchSimulator: its states have no joints of robots: {afresh}")
         if self.scene.posed_supports:
             raise ValueError("TorchSimulator: a motion by a Pose counts from the start of a run; give displacements")
         self._run = Rollout(solver, 1, outputs=outputs)
         if scenes is not None:
             self._run = Batch(solver, 1, whole("scenes", scenes, 1), outputs=outputs)
         self._step_values = StepValues(self.scene.inputs, solver.dt, _joined, scenes)
+        inputs, known = self.scene.inputs.at_step(0, solver.dt, {}), self.scene.inputs.values
+        for name in self.values:
+            remedy = "pass it to step" if name in inputs and inputs[name] is not known.get(name) else ""
+            remedy = "pass it to reset" if name.startswith("initial_") else remedy
+            if remedy := "make the scene with it" if name in ("rest_positions", "shape") else remedy:
+                raise ValueError(f"TorchSimulator: values are numbers that hold in all steps, got {name}: {remedy}")
+        for name, output in self._run.outputs.items():
+            if output.cumulative:
+                raise ValueError(f"TorchSimulator: {name} counts from the start of a run, and {afresh}")
         self.reset()
 
     @property
@@ -123,7 +133,7 @@ class TorchSimulator(metaclass=Public):
             timed[MOTION] = _tensor(timed[MOTION]) - (self.displacements - self._begun)[..., None, held, :].double()
         own = {name: x for name, x in timed.items() if name not in inputs.values or x is not inputs.values[name]}
         start = dict(initial_displacements=self.displacements, initial_velocities=self.velocities)
-        frames = rollout_frames(self._run, **self.values, **start, **own)
+        frames = rollout_frames(self._run, **self.values | start | own)
         end = (slice(None), -1) if self.scenes is not None else -1
         self._set, self.step_count = given, step + 1
         self.displacements, self.velocities = frames["displacements"][end], frames["velocities"][end]

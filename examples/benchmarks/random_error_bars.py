@@ -2,7 +2,7 @@
 
 Meshes are nested, so that one assembly of the finest serves all: matrices of coarser ones are P^T K P. Their numbers are
 those of `Rollout.accuracy`: the estimate is the difference to ten nodes, or to halved edges of ten nodes, the truth that to
-a mesh refined once more; the bar is its formula. Motions are of some steps of backward Euler.
+a mesh refined once more; the bar is `Accuracy.bar`. Motions are of some steps of backward Euler.
 
     python examples/benchmarks/random_error_bars.py [meshes of each kind]    # 20: about 4 minutes
 """
@@ -14,7 +14,7 @@ from scipy.sparse import eye, kron
 from scipy.sparse.linalg import eigsh, splu
 
 import diffsim_ti as ds
-from diffsim_ti.accuracy.estimate import CANCELLED, CANCELS, COARSE, MISSED
+from diffsim_ti.accuracy.estimate import CANCELS, COARSE, Accuracy
 from diffsim_ti.accuracy.finer import interpolation
 
 COUNT = 40  # loads, and as many numbers, for each mesh
@@ -97,7 +97,8 @@ def main(meshes: int) -> None:
         for order in (1, 2):
             all_of = np.array([row for seed in range(meshes) for row in numbers(seed, order, moves)]).T
             error, uncancelled, true, value = all_of
-            bar = ((1 + MISSED) * abs(error) + CANCELLED * uncancelled) / abs(true)
+            found = Accuracy("", value, value, error, 0.0, 0.0, 0.0, dict(mesh=uncancelled), np.zeros(0), {})
+            bar = found.bar / abs(true)
             quiet = (uncancelled < CANCELS * abs(error)) & (abs(error) < COARSE * abs(value))
             good = np.mean((abs(error / true - 1.05) < 0.35)[quiet])
             cells = ["steps" if moves else "equilibria", (4, 10)[order - 1], len(true), f"{np.mean(bar >= 1):.3f}"]

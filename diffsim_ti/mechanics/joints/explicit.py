@@ -109,7 +109,8 @@ class JointStage(Stage):
                 self.held.put(target, at.end, row)
         if self.own.size:
             ws.impulses.note_pass(at.numbers["counted"])
-        history.joints[at.end] = J.q, J.w - self.rebound(), sum(J.efforts()), J.q_n, J.v_n
+        z = self.rebound()
+        history.joints[at.end] = J.q, J.w - z, sum(J.efforts()) + self.resistance * z, J.q_n, J.v_n
         self.met[at.end] = J.w, touches, self.v_star
 
     @property
@@ -234,6 +235,11 @@ class JointStage(Stage):
         """(1 - b) A^-1 J^T P"""
         return (1 - self.blend) * np.linalg.solve(self.inertia, self.on_joints(self.wrenches)[0])
 
+    @property
+    def resistance(self) -> np.ndarray:
+        """Effort by which drives and damping resist a change of velocity in a pass: (A - M) / h."""
+        return self.joints.c + self.joints.h * self.joints.k
+
     def answers(self) -> np.ndarray:
         """Changes of what acts on joints, by w, shape (2, joints, joints of w). `moves`: of each joint of w those of
         displacements, velocities and impulses of the vertices that are near; `follows`: those of J^T m v* of vertices that
@@ -324,7 +330,8 @@ class JointStageTangent(Stage):
             acting = acting[0] + answers[0] @ dw
             _, _, dk, dc, dm = J.robots.numbers(own.tangent.parameters)
             by_q, by_m = stage.mass_derivatives(z)
-            dA = by_q @ own.dq + by_m @ dm + (h * dc + h**2 * np.where(J.robots.prescribed, 0.0, dk)) * z
+            dresistance = dc + h * np.where(J.robots.prescribed, 0.0, dk)
+            dA = by_q @ own.dq + by_m @ dm + h * dresistance * z
             dv = dw - np.linalg.solve(stage.inertia, (1 - stage.blend) * acting - dA)
             for b, du_b, dv_b, given_b in stage.moves:
                 u[0, near] += du_b * dw[b]
@@ -342,6 +349,8 @@ class JointStageTangent(Stage):
             run.impulses.note_pass(at.numbers["counted"])
         own.step(own.dq + h * dw)
         own.dv = dv
+        if touches:
+            own.deffort = own.deffort + stage.resistance * (dw - dv) + dresistance * z
 
 
 class JointStageAdjoint(JointAdjoint):
@@ -384,7 +393,7 @@ class JointStageAdjoint(JointAdjoint):
         if touches:
             near, answers, z = stage.near, stage.answers(), stage.rebound()
             K = K + stage.weighed(answers) - stage.follows
-            eased = np.linalg.solve(stage.inertia, self.by_v)
+            eased = np.linalg.solve(stage.inertia, self.by_v - stage.resistance * self.by_effort)
             by_push = (stage.blend - 1) * eased
             by_w = by_w + by_push @ answers[0]
             seeded = seeds[:, near] if np.ndim(seeds) else 0.0
@@ -410,8 +419,9 @@ class JointStageAdjoint(JointAdjoint):
             by_q, by_m = stage.mass_derivatives(z)
             self._to_q_n += np.einsum("kba,ka->b", stage.bent(), by) + eased @ by_q
             self.numbers[4] += eased @ by_m
-            self.numbers[3] += h * eased * z
-            self.numbers[2] += np.where(J.robots.prescribed, 0.0, h**2 * eased * z)
+            by_resistance = (h * eased + self.by_effort) * z
+            self.numbers[3] += by_resistance
+            self.numbers[2] += np.where(J.robots.prescribed, 0.0, h * by_resistance)
         if stage.own.size:
             runtime.fill(run.impulses.impulse, seeds)
             runtime.clear([run.offsets])

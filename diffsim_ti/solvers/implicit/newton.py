@@ -269,8 +269,8 @@ class Newton:
         if not self.indefinite:
             d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
             self.indefinite = negative is not None
+            self.report.indefinite += self.indefinite
         if self.indefinite:
-            self.report.indefinite += 1
             if count <= self.trusted and not A.saddle_is_known:
                 for slight in self.slight:
                     A.correction = Projection(self.potential, slight)
