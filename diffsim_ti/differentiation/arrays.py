@@ -241,7 +241,10 @@ def _add(known: dict, own: set, node: Node, more) -> None:
         more(known[key])
     elif more is not None:
         more = _fitted(np.asarray(more), node.shape) if isinstance(node, Recorded) else more
-        known[key] = known[key] + more if key in known else more
+        if key in own:
+            known[key] += more
+        else:
+            known[key] = known[key] + more if key in known else more
 
 
 def _add_at(into: np.ndarray, index, x) -> None:

@@ -2,29 +2,16 @@
 
 from contextlib import nullcontext
 
-from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import VolumeConstraintAdjoint, VolumeConstraintTangent
-from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
-from diffsim_ti.mechanics.constraints import HeldRelations
+from diffsim_ti.mechanics.corrections import Correction, CorrectionAdjoint, CorrectionTangent
 from diffsim_ti.mechanics.joints.explicit import JointStage, JointStageAdjoint, JointStageTangent
-from diffsim_ti.mechanics.reduced.projected_sets import ProjectedAdjoint, ProjectedSets, ProjectedTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.nearby_contact import NearbyContact
 
 # stages whose tangents and adjoints have buffers: what makes these of them for a run
 BUFFERED = dict(
-    tangent={
-        VolumeConstraints: VolumeConstraintTangent,
-        HeldRelations: VolumeConstraintTangent,
-        ProjectedSets: ProjectedTangent,
-        JointStage: JointStageTangent,
-    },
-    adjoint={
-        VolumeConstraints: VolumeConstraintAdjoint,
-        HeldRelations: VolumeConstraintAdjoint,
-        ProjectedSets: ProjectedAdjoint,
-        JointStage: JointStageAdjoint,
-    },
+    tangent={Correction: CorrectionTangent, JointStage: JointStageTangent},
+    adjoint={Correction: CorrectionAdjoint, JointStage: JointStageAdjoint},
 )
 
 
@@ -73,5 +60,5 @@ def _contact_of(pairs, damping: float, bodies) -> Stage | None:
 
 def with_buffers(way: str, stages: list[Stage], run) -> list:
     """The same with the buffers that a tangent or an adjoint has for them."""
-    makers = BUFFERED[way]
-    return [makers[type(stage)](stage, run) if type(stage) in makers else stage for stage in stages]
+    made = [(stage, [make for kind, make in BUFFERED[way].items() if isinstance(stage, kind)]) for stage in stages]
+    return [make[0](stage, run) if make else stage for stage, make in made]
