@@ -7,7 +7,7 @@ import numpy as np
 from diffsim_ti.differentiation.arrays import summed_at, value_of
 from diffsim_ti.inputs.loads import PressureRows
 from diffsim_ti.mechanics.chambers.pressures import PrescribedVolume
-from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints, along
+from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints, along, slopes
 from diffsim_ti.mechanics.corrections import Correction
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction
@@ -187,12 +187,12 @@ class HeldRelations(VolumeConstraints):
         parts = [summed_at(at, of.parameters[own][: 3 * len(at)].reshape(-1, 3), len(self.nodes)) for at, own in each]
         return np.stack(parts)
 
-    def volumes(self, of, x):
+    def volumes(self, of, x, G=None):
         return along(self.gradients(of, x), x)
 
     def meet(self, of, y, d, targets):
         g = self.gradients(of, y)
-        return np.linalg.solve(along(g, d), targets - along(g, y))
+        return np.linalg.solve(slopes(g, d), targets - along(g, y))
 
     def note(self, at, found):
         """Frames do not show it."""

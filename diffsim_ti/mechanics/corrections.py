@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import Recorded, forward, reverse_of_all, value_of
+from diffsim_ti.differentiation.arrays import Recorded, forward_of_all, reverse_of_all, value_of
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import VertexRows
@@ -124,9 +124,9 @@ class RecordedPass:
     def shown(self) -> tuple:
         return self.stage.shown(self.of, self.at, self.u, self.between)
 
-    def tangent(self, y, changes: dict, *states: tuple) -> np.ndarray:
-        """Change of y for those of numbers, and of states, (leaf, change) each."""
-        return forward(y, [*((self.leaves[name], change) for name, change in changes.items()), *states])
+    def tangent(self, values: list, changes: dict, *states: tuple) -> list[np.ndarray]:
+        """Changes of values for those of numbers, and of states, (leaf, change) each."""
+        return forward_of_all(values, [*((self.leaves[name], change) for name, change in changes.items()), *states])
 
     def adjoint(self, sums: dict, seeds: list[tuple], *states: Recorded) -> list[np.ndarray]:
         """Adjoints of states; adds those of numbers to `sums`."""
@@ -154,15 +154,17 @@ class CorrectionTangent(Stage):
         one, frame = RecordedPass(stage, at), stage.frame(at)
         if one.kept:
             states = (one.u, du), (one.y, stage.rows(run.u, 0)), (one.v, stage.rows(run.v, 0))
-            *ends, found = one.ends
-            for array, end in zip((run.u, run.v), ends):
-                stage.put(array, 0, one.tangent(end, self.changes, *states))
-            if self.record and found is not None:
-                change = one.tangent(stage.seen(one.of, at, found), self.changes, *states)
-                self.record.note(at.j, at.save_every, change)
+            *values, found = one.ends
+            seen = self.record and found is not None
+            values += [stage.seen(one.of, at, found)] if seen else []
+            u, v, *more = one.tangent(values, self.changes, *states)
+            stage.put(run.u, 0, u)
+            stage.put(run.v, 0, v)
+            if seen:
+                self.record.note(at.j, at.save_every, more[0])
         if frame >= 0:
             states = (one.u, du), (one.between, stage.rows(run.frames.frames_v, frame))
-            stage.put(run.frames.frames_v, frame, one.tangent(one.shown[0], self.changes, *states))
+            stage.put(run.frames.frames_v, frame, one.tangent(one.shown[:1], self.changes, *states)[0])
 
 
 class CorrectionAdjoint(Stage):

@@ -9,6 +9,7 @@ order is said once: in the adjoint a stage first goes back through what it did l
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -58,6 +59,7 @@ class Passes:
         """way: "do", "tangent" or "adjoint"; launches: their numbers."""
         ways = [getattr(stage, way) for stage in stages if stage.in_kicks or not self.kick]
         for self.numbers in launches:
+            vars(self).pop("now", None)
             with ExitStack() as within:
                 for act in ways:
                     within.enter_context(act(self))
@@ -75,7 +77,7 @@ class Passes:
     def end(self) -> int:
         return self.slot + self.stride
 
-    @property
+    @cached_property
     def now(self) -> SimpleNamespace:
         """Length [s] and weights of pass j."""
         return self.ws.numbers_of(self.j, self.num_passes)

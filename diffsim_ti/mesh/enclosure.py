@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import cross, made, summed_at, value_of, with_slopes
+from diffsim_ti.differentiation.arrays import cross, summed_at, value_of, with_slopes
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.sets import components
 
@@ -105,12 +105,10 @@ class Enclosure:
         return with_slopes(self.volume(places), (x, lambda: self.gradient(places)))
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
-        """dV/dx, shape (num_vertices, 3); what is held counts too. Of arrays that record, too."""
-        places = value_of(x)
-        y = self._corners(places)
+        """dV/dx, shape (num_vertices, 3); what is held counts too."""
+        y = self._corners(x)
         by = np.stack([cross(y[:, (a + 1) % 3], y[:, (a + 2) % 3]) for a in range(3)], 1)
-        change = lambda dx: self.gradient_jvp(places, dx)  # noqa: E731
-        return made(self._summed(by, len(x)), (x, change, change))
+        return self._summed(by, len(x))
 
     def _summed(self, by: np.ndarray, num_vertices: int) -> np.ndarray:
         """What triangles' corners have, weighted, at the vertices."""

@@ -56,14 +56,31 @@ class ChamberRecord:
 
 
 def along(G: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """G_k . x, of x (n, 3) or of several."""
-    flat = G.reshape(len(G), -1)
-    return flat @ x.ravel() if x.ndim == 2 else flat @ x.reshape(len(x), -1).T
+    """G_k . x; of arrays that record, too."""
+    A, X = value_of(G), value_of(x)
+    by_G = (G, lambda dG: _dots(dG, X), lambda w: w[:, None, None] * X)
+    return made(_dots(A, X), by_G, (x, lambda dx: _dots(A, dx), lambda w: np.tensordot(w, A, 1)))
+
+
+def _dots(G: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return G.reshape(len(G), -1) @ x.ravel()
 
 
 def spread(s: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """sum_k s_k d_k"""
-    return (s @ d.reshape(len(d), -1)).reshape(d.shape[1:])
+    """sum_k s_k d_k; of arrays that record, too."""
+    S, D = value_of(s), value_of(d)
+    by_s = (s, lambda ds: np.tensordot(ds, D, 1), lambda w: _dots(D, w))
+    return made(np.tensordot(S, D, 1), by_s, (d, lambda dd: np.tensordot(S, dd, 1), lambda w: S[:, None, None] * w))
+
+
+def _root(s: np.ndarray, K: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """s, for which what is left is zero, and changes by -K with s."""
+    return made(s, (left, lambda change: np.linalg.solve(K, change), lambda w: np.linalg.solve(K.T, w)))
+
+
+def slopes(G: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """G_k . d_l."""
+    return np.tensordot(G, d, ([1, 2], [1, 2]))
 
 
 class VolumeConstraints(Correction):
@@ -98,12 +115,17 @@ class VolumeConstraints(Correction):
         """What V depends on, at displacements u."""
         return of.rest + u
 
-    def volumes(self, of, x: np.ndarray) -> np.ndarray:
-        return np.stack([enclosure.recorded(x) for enclosure in self.enclosures])
+    def volumes(self, of, x: np.ndarray, G: np.ndarray | None = None) -> np.ndarray:
+        """V of each; G: plain gradients, where x records."""
+        volumes = np.array([enclosure.volume(value_of(x)) for enclosure in self.enclosures])
+        return made(volumes, (x, lambda dx: _dots(G, dx), lambda w: np.tensordot(w, G, 1)))
 
     def gradients(self, of, x: np.ndarray) -> np.ndarray:
         """dV/dx, shape (chambers, n, 3)."""
-        return np.stack([enclosure.gradient(x) for enclosure in self.enclosures])
+        at = value_of(x)
+        turned = lambda dx: np.stack([enclosure.gradient_jvp(at, dx) for enclosure in self.enclosures])  # noqa: E731
+        pull = lambda w: sum(enclosure.gradient_jvp(at, by) for enclosure, by in zip(self.enclosures, w))  # noqa: E731
+        return made(np.stack([enclosure.gradient(at) for enclosure in self.enclosures]), (x, turned, pull))
 
     def targets(self, of, j: int) -> np.ndarray:
         """Volumes after pass j."""
@@ -123,7 +145,7 @@ class VolumeConstraints(Correction):
             at = y + spread(s, d)
             left = targets - self.volumes(of, at)
             try:
-                s = s + np.linalg.solve(along(self.gradients(of, at), d), left)
+                s = s + np.linalg.solve(slopes(self.gradients(of, at), d), left)
             except np.linalg.LinAlgError:
                 return None
             if near:
@@ -136,7 +158,11 @@ class VolumeConstraints(Correction):
     def _ways(self, of, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(dV/dx where a pass begins, d)"""
         g = self.gradients(of, self.positions(of, u))
-        return g, np.stack([self.freed(1 / of.mass[:, None] * own) for own in g])
+        G, inverse = value_of(g), 1 / value_of(of.mass)[:, None]
+        eased = lambda by: np.stack([self.freed(inverse * own) for own in by])  # noqa: E731
+        d = eased(G)
+        by_mass = (lambda dm: -d * (dm[:, None] * inverse), lambda w: -(d * w).sum((0, 2)) * inverse[:, 0])
+        return g, made(d, (g, eased, lambda w: inverse * np.stack(list(map(self.freed, w)))), (of.mass, *by_mass))
 
     def ends(self, of, at, u, y, v, found=None):
         now, (_, d) = at.now, self._ways(of, u)
@@ -147,11 +173,10 @@ class VolumeConstraints(Correction):
             s = self.meet(of, x, d, targets)
             if s is None:
                 raise self._lost(at, self.volumes(of, x), targets)
-        else:  # as the targets, and all that V depends on, change
+        else:
             met = x + spread(s, d)
-            K = along(value_of(self.gradients(of, met)), value_of(d))
-            solve = lambda left: np.linalg.solve(K, left)  # noqa: E731
-            s = made(s, (targets - self.volumes(of, met), solve, lambda w: np.linalg.solve(K.T, w)))
+            G = value_of(self.gradients(of, value_of(met)))
+            s = _root(s, slopes(G, value_of(d)), targets - self.volumes(of, met, G))
         way = spread(s, d)
         by_rate = (now.decay_by_rate * now.alpha - now.decay * now.alpha_by_rate) / now.alpha**2
         return y + way, v + self._by_rate(of, now.decay / now.alpha, by_rate) * way, s
@@ -164,7 +189,10 @@ class VolumeConstraints(Correction):
     def shown(self, of, at, u, v, found=None):
         (g, d), q = self._ways(of, u), found
         if q is None:
-            q = np.linalg.solve(along(g, d), self.rates(of, at.j) - along(g, v))
+            (G, D, V), rates = map(value_of, (g, d, v)), self.rates(of, at.j)
+            K = slopes(G, D)
+            q = np.linalg.solve(K, value_of(rates) - _dots(G, V))
+            q = _root(q, K, rates - along(g, v + spread(q, d)))
         return v + spread(q, d), q
 
     # ---- pressures ---------------------------------------------------------------------------------------------------
