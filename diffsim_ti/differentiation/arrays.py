@@ -236,6 +236,12 @@ def reverse_of_all(adjoints: Iterable[tuple], leaves: Iterable[Node]) -> list:
     return [x if x is None or fresh else np.array(x) for fresh, x in found]
 
 
+def add_transposed(into: np.ndarray, read: Callable, seed) -> None:
+    """Add to the adjoint of x that by read(x), which is linear in x, for the adjoint of the latter."""
+    leaf = Recorded(into, zeros=lambda: into)
+    reverse(read(leaf), seed, [leaf])
+
+
 def _add(known: dict, own: set, node: Node, more) -> None:
     """Add to what is known of a node; own: those whose arrays nothing else has."""
     key = id(node)
