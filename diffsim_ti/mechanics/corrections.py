@@ -55,6 +55,9 @@ class Correction(Stage):
     def seen(self, of, at: Passes, found) -> np.ndarray:
         """What frames say of what was found."""
 
+    def with_buffers(self, way: str, run) -> Stage:
+        return CorrectionTangent(self, run) if way == "tangent" else CorrectionAdjoint(self, run)
+
     # ---- a pass ----------------------------------------------------------------------------------------------------------
 
     def numbers_of(self, values: Derived) -> dict[str, np.ndarray]:

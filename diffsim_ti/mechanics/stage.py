@@ -20,10 +20,14 @@ from diffsim_ti.state.history import History
 class Stage:
     """A stage of a step: context managers `do`, `tangent` and `adjoint`, which take `Passes`; stages within act meanwhile.
 
-    Where its tangent and adjoint need buffers, other objects have these two, which a run makes of the stage.
+    Where its tangent and adjoint need buffers, other objects have these two, which `with_buffers` makes.
     """
 
     in_kicks: ClassVar[bool] = False  # whether it acts in a kick alone, too
+
+    def with_buffers(self, way: str, run) -> "Stage":
+        """What has its "tangent" or "adjoint" along a run."""
+        return self
 
     def clear(self) -> None:
         """A reverse sweep begins."""

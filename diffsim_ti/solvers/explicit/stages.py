@@ -2,17 +2,9 @@
 
 from contextlib import nullcontext
 
-from diffsim_ti.mechanics.corrections import Correction, CorrectionAdjoint, CorrectionTangent
-from diffsim_ti.mechanics.joints.explicit import JointStage, JointStageAdjoint, JointStageTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.nearby_contact import NearbyContact
-
-# stages whose tangents and adjoints have buffers: what makes these of them for a run
-BUFFERED = dict(
-    tangent={Correction: CorrectionTangent, JointStage: JointStageTangent},
-    adjoint={Correction: CorrectionAdjoint, JointStage: JointStageAdjoint},
-)
 
 
 class KickDrift(Stage):
@@ -56,9 +48,3 @@ def _contact_of(pairs, damping: float, bodies) -> Stage | None:
     if not pairs:
         return None
     return NearbyContact(make) if pairs.nearby and pairs.nearby.many else make()
-
-
-def with_buffers(way: str, stages: list[Stage], run) -> list:
-    """The same with the buffers that a tangent or an adjoint has for them."""
-    made = [(stage, [make for kind, make in BUFFERED[way].items() if isinstance(stage, kind)]) for stage in stages]
-    return [make[0](stage, run) if make else stage for stage, make in made]
