@@ -9,6 +9,7 @@ from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_potential import JoinedCollisions, JoinedPotential, JoinedPreconditioners, SharesOfScenes
 from diffsim_ti.batch.joined_scene import JoinedArrays, joined_derived, joined_hosts, joined_scene, of_each, of_scenes
 from diffsim_ti.batch.sweep import BatchSweep
+from diffsim_ti.differentiation.arrays import add_transposed
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.supports.free import held_as
@@ -64,9 +65,17 @@ class JoinedWorkspace(ImplicitWorkspace):
     def _host_values(self):
         return of_each(self.each)
 
-    def _on_vertices(self, rows, j, stage):
-        own, n = of_scenes(rows, self.num_scenes, 1), self.arrays.num_vertices // self.num_scenes
-        return np.concatenate([self._of_one(own[b], j, stage, n) for b in range(self.num_scenes)])
+    def _add_forces(self, rows, out, j, stage):
+        if rows is not None:
+            share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
+            for own, target in zip(of_scenes(rows, self.num_scenes, 1), of_scenes(out, self.num_scenes)):
+                target[acts_at] += self.solver.schedule.load(own, j, share, keyed)
+        return out
+
+    def add_loads(self, rows_adj, j, stage, by_vertices) -> None:
+        share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
+        for own, by in zip(of_scenes(rows_adj, self.num_scenes, 1), of_scenes(by_vertices, self.num_scenes)):
+            add_transposed(own, lambda rows: self.solver.schedule.load(rows, j, share, keyed), by[acts_at])
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 

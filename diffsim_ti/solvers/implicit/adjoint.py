@@ -181,7 +181,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.gravity = self.gravity + share * self._sum(ws.mass * by_star)
         self._add_mass(by_star, self.weight(share))
         if self.forces is not None:
-            add_transposed(self.forces, lambda rows: ws.applied_forces(rows, j, s), by_star)
+            ws.add_loads(self.forces, j, s, share * by_star)
         # where inertia starts from
         inertial = self.mass * by_star
         reaction = reaction - inertial  # the inertia of neighbours acts on fixed vertices, too

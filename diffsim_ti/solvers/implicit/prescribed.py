@@ -4,7 +4,7 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import summed_at
+from diffsim_ti.differentiation.arrays import add_transposed
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, Multipliers
 from diffsim_ti.mechanics.constraints import ConstraintForce
@@ -148,8 +148,8 @@ class PrescribedInPasses(Workspace):
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
         values = self.arrays.values
         out = np.zeros_like(values.displacement) + self.mass * self.arrays.gravity_of(values)
-        rows = self.arrays.rows["forces"]
-        return (out if rows is None else out + self._on_vertices(rows, j, stage)) * self.load_share(j, stage)
+        out = self._add_forces(self.arrays.rows["forces"], out, j, stage)
+        return out * self.load_share(j, stage)
 
     def led_by_loads(self, j: int, stage: Stage, inertial: np.ndarray, mass: Mass) -> tuple:
         """(where inertia leads, loads that are left): dead loads act like a shift of where it leads, so that free flight is
@@ -161,19 +161,22 @@ class PrescribedInPasses(Workspace):
         inertial = inertial + self.arrays.gravity_of(self.arrays.values) / stage.inertia
         return inertial, self.applied_forces(self.arrays.rows["forces"], j, stage)
 
-    def _on_vertices(self, rows: np.ndarray, j: int, stage: Stage) -> np.ndarray:
-        """What rows of dead loads say of each vertex in pass j, whole [N]; of rows that record, too."""
-        return self._of_one(rows, j, stage, self.arrays.num_vertices)
+    def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:
+        if rows is not None:
+            share, keyed = self.share_at_stage(j, stage), self.dead_loads.keyed
+            out[self.dead_loads.acts_at] += self.solver.schedule.load(rows, j, share, keyed)
+        return out
 
-    def _of_one(self, rows: np.ndarray, j: int, stage: Stage, num_vertices: int) -> np.ndarray:
-        loads = self.solver.schedule.load(rows, j, self.share_at_stage(j, stage), self.dead_loads.keyed)
-        return summed_at(self.dead_loads.acts_at, loads, num_vertices)
+    def add_loads(self, rows_adj: np.ndarray, j: int, stage: Stage, by_vertices: np.ndarray) -> None:
+        """Adjoint of `_add_forces`."""
+        share, keyed = self.share_at_stage(j, stage), self.dead_loads.keyed
+        read = lambda rows: self.solver.schedule.load(rows, j, share, keyed)  # noqa: E731
+        add_transposed(rows_adj, read, by_vertices[self.dead_loads.acts_at])
 
     def applied_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
-        """Given forces on each vertex in pass j [N], from rows of them or of their tangent, without weight; likewise."""
-        if rows is None:
-            return np.zeros_like(self.arrays.values.displacement)
-        return self._on_vertices(rows, j, stage) * self.load_share(j, stage)
+        """Given forces on each vertex in pass j [N], from rows of them or of their tangent, without weight."""
+        out = np.zeros_like(self.arrays.values.displacement)
+        return self._add_forces(rows, out, j, stage) * self.load_share(j, stage)
 
     def load_share(self, j: int, stage: Stage) -> float:
         """Share of the loads in pass j."""
