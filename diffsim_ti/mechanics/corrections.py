@@ -19,8 +19,8 @@ from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.runtime.slots import VertexRows
 
 
-class Correction(Stage):
-    """Of the vertices `nodes`, whose vectors have the shape (n, 3).
+class Correction:
+    """A stage (mechanics/stage.py) of the vertices `nodes`, whose vectors have the shape (n, 3).
 
     `of` has the numbers that it reads: masses and rest positions of the vertices, and the arrays of `Derived` in `reads`.
     kept: of recorded passes, by the slot they led to: (u*, v*, what the correction found), None where it did nothing.
@@ -28,6 +28,7 @@ class Correction(Stage):
     """
 
     reads: ClassVar[tuple[str, ...]] = ()
+    in_kicks = False
 
     def __init__(self, workspace, nodes: np.ndarray):
         self.ws, self.nodes = weakref.proxy(workspace), nodes
