@@ -9,6 +9,7 @@ from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_potential import JoinedCollisions, JoinedPotential, JoinedPreconditioners, SharesOfScenes
 from diffsim_ti.batch.joined_scene import JoinedArrays, joined_derived, joined_hosts, joined_scene, of_each, of_scenes
 from diffsim_ti.batch.sweep import BatchSweep
+from diffsim_ti.differentiation.arrays import add_transposed
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.supports.free import held_as
@@ -74,7 +75,7 @@ class JoinedWorkspace(ImplicitWorkspace):
     def add_loads(self, rows_adj, j, stage, by_vertices) -> None:
         share, keyed, acts_at = self.share_at_stage(j, stage), self.dead_loads.keyed, self.dead_loads.acts_at
         for own, by in zip(of_scenes(rows_adj, self.num_scenes, 1), of_scenes(by_vertices, self.num_scenes)):
-            self.solver.schedule.add_load(own, j, share, keyed, by[acts_at])
+            add_transposed(own, lambda rows: self.solver.schedule.load(rows, j, share, keyed), by[acts_at])
 
     # ---- a pass ------------------------------------------------------------------------------------------------------
 

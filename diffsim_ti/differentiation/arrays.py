@@ -5,7 +5,7 @@ was recorded, forwards or backwards. `Graph` does so for the numbers of kernels.
 Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from heapq import heappop, heappush
 from itertools import count
 
@@ -194,14 +194,19 @@ def ratio(a, b):
 
 def forward(y, changes: Iterable[tuple[Node, object]]):
     """Change of y for changes of nodes."""
+    return forward_of_all([y], changes)[0]
+
+
+def forward_of_all(values: Sequence, changes: Iterable[tuple[Node, object]]) -> list:
+    """The same of several values."""
     known, own = {id(node): change for node, change in changes}, set()
-    for node in _before(y):
+    for node in _before(values):
         if id(node) not in known:
             for parent, push, _ in node.parents:
                 if known.get(id(parent)) is not None:
                     _add(known, own, node, push(known[id(parent)]))
-    change = known.get(id(y))
-    return np.zeros(np.shape(value_of(y))) if change is None else np.array(change)
+    found = [(y, known.get(id(y))) for y in values]
+    return [np.zeros(np.shape(value_of(y))) if change is None else np.array(change) for y, change in found]
 
 
 def reverse(y, seed, leaves: Iterable[Node]) -> list:
@@ -231,6 +236,12 @@ def reverse_of_all(adjoints: Iterable[tuple], leaves: Iterable[Node]) -> list:
     return [x if x is None or fresh else np.array(x) for fresh, x in found]
 
 
+def add_transposed(into: np.ndarray, read: Callable, seed) -> None:
+    """Add to the adjoint of x that by read(x), which is linear in x, for the adjoint of the latter."""
+    leaf = Recorded(into, zeros=lambda: into)
+    reverse(read(leaf), seed, [leaf])
+
+
 def _add(known: dict, own: set, node: Node, more) -> None:
     """Add to what is known of a node; own: those whose arrays nothing else has."""
     key = id(node)
@@ -241,7 +252,10 @@ def _add(known: dict, own: set, node: Node, more) -> None:
         more(known[key])
     elif more is not None:
         more = _fitted(np.asarray(more), node.shape) if isinstance(node, Recorded) else more
-        known[key] = known[key] + more if key in known else more
+        if key in own:
+            known[key] += more
+        else:
+            known[key] = known[key] + more if key in known else more
 
 
 def _add_at(into: np.ndarray, index, x) -> None:
@@ -257,9 +271,9 @@ def _fitted(x: np.ndarray, shape: tuple) -> np.ndarray:
     return np.broadcast_to(x.sum(axes, keepdims=True) if axes else x, shape)
 
 
-def _before(y) -> list[Node]:
-    """The nodes that y was made of, in their order, itself the last."""
-    found, waiting = {}, [y] if isinstance(y, Node) else []
+def _before(values: Sequence) -> list[Node]:
+    """The nodes that values were made of, in their order, and themselves."""
+    found, waiting = {}, [y for y in values if isinstance(y, Node)]
     while waiting:
         node = waiting.pop()
         if id(node) not in found:

@@ -2,16 +2,13 @@
 multipliers as volumes are (chambers/multipliers.py), in explicit steps by a stage; or, with a stiffness, by a penalty in
 implicit steps and statics, E = sum of stiffness / 2 g^2."""
 
-import weakref
-from dataclasses import dataclass
-
 import numpy as np
 
 from diffsim_ti.differentiation.arrays import summed_at, value_of
-from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.loads import PressureRows
 from diffsim_ti.mechanics.chambers.pressures import PrescribedVolume
-from diffsim_ti.mechanics.chambers.volume_constraints import ChamberWalls, VolumeConstraints, along, slopes
+from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints, along, slopes
+from diffsim_ti.mechanics.corrections import Correction
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.pressure.follower_pressure import pressures_at
@@ -167,67 +164,38 @@ class Constraints(Interaction):
         return ConstraintForce([term.indices(self.mesh) for term in self.terms], rows)
 
 
-@dataclass
-class RelatedVertices(ChamberWalls):
-    """The same of vertices with relations between their displacements x, whose coefficients are in the place of dV/dx."""
-
-    held: "HeldRelations"
-
-    def gradients(self, y):
-        return self.held.c
-
-    def turned(self, dx):
-        return self.held.c_dot
-
-    def turned_vjp(self, weights, w):
-        self.held.c_adj += weights[:, None, None] * w
-        return np.zeros_like(self.x)
-
-    def moved(self, y):
-        return along(self.held.c_dot, y)
-
-    def moved_vjp(self, weights, y):
-        self.held.c_adj += weights[:, None, None] * y
-
-    def meet(self, y, targets):
-        return np.linalg.solve(slopes(self.g, self.d), targets - along(self.g, y))
-
-
 class HeldRelations(VolumeConstraints):
     """Explicit passes hold relations as they hold volumes (volume_constraints.py), sum c . u in the place of V."""
 
-    numbers, is_shown = "relations", False
+    reads = ("parameters", "relations")
 
     def __init__(self, workspace):
-        self.ws, scene = weakref.proxy(workspace), workspace.scene
+        scene = workspace.scene
         terms = scene.terms_of(MultiPointConstraint)
         indices = [term.indices(scene.mesh) for term in terms]
-        self.places = self.columns = list(range(len(terms)))
-        self._hold(workspace, np.unique(np.concatenate(indices)))
+        Correction.__init__(self, workspace, np.unique(np.concatenate(indices)))
+        self.columns = list(range(len(terms)))
         self._own_numbers = [scene.inputs.parameters.of(term) for term in terms]
         self._at = [np.searchsorted(self.nodes, own) for own in indices]
 
-    def _coefficients(self, parameters: np.ndarray) -> np.ndarray:
-        """Of all relations and vertices, shape (relations, vertices, 3)."""
-        out = np.zeros((len(self._at), len(self.nodes), 3))
-        for c, at, own in zip(out, self._at, self._own_numbers):
-            np.add.at(c, at, parameters[own][: 3 * len(at)].reshape(-1, 3))
-        return out
+    def positions(self, of, u):
+        return u
 
-    def walls(self, u):
-        values = self.ws.arrays.values
-        self.c = self._coefficients(values.parameters)
-        return RelatedVertices([], u, 1 / values.mass[self.nodes, None], self.free, self)
+    def gradients(self, of, x):
+        """c, of all relations and vertices."""
+        each = zip(self._at, self._own_numbers)
+        parts = [summed_at(at, of.parameters[own][: 3 * len(at)].reshape(-1, 3), len(self.nodes)) for at, own in each]
+        return np.stack(parts)
 
-    def of_rest(self, x):
-        return np.zeros((len(self.nodes), 3))
+    def volumes(self, of, x, G=None):
+        return along(self.gradients(of, x), x)
 
-    def take_change(self, change: Derived):
-        self.c_dot = self._coefficients(change.parameters)
+    def meet(self, of, y, d, targets):
+        g = self.gradients(of, y)
+        return np.linalg.solve(slopes(g, d), targets - along(g, y))
 
-    def clear_adjoint(self):
-        self.c_adj = np.zeros((len(self._at), len(self.nodes), 3))
+    def note(self, at, found):
+        """Frames do not show it."""
 
-    def collect(self, out: Derived, by_rest):
-        for by_c, at, own in zip(self.c_adj, self._at, self._own_numbers):
-            out.parameters[own][: 3 * len(at)] += by_c[at].ravel()
+    def record_of(self, run):
+        return None

@@ -9,6 +9,7 @@ order is said once: in the adjoint a stage first goes back through what it did l
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -19,10 +20,14 @@ from diffsim_ti.state.history import History
 class Stage:
     """A stage of a step: context managers `do`, `tangent` and `adjoint`, which take `Passes`; stages within act meanwhile.
 
-    Where its tangent and adjoint need buffers, other objects have these two, which a run makes of the stage.
+    Where its tangent and adjoint need buffers, other objects have these two, which `with_buffers` makes.
     """
 
     in_kicks: ClassVar[bool] = False  # whether it acts in a kick alone, too
+
+    def with_buffers(self, way: str, run) -> "Stage":
+        """What has its "tangent" or "adjoint" along a run."""
+        return self
 
     def clear(self) -> None:
         """A reverse sweep begins."""
@@ -58,6 +63,7 @@ class Passes:
         """way: "do", "tangent" or "adjoint"; launches: their numbers."""
         ways = [getattr(stage, way) for stage in stages if stage.in_kicks or not self.kick]
         for self.numbers in launches:
+            vars(self).pop("now", None)
             with ExitStack() as within:
                 for act in ways:
                     within.enter_context(act(self))
@@ -75,7 +81,7 @@ class Passes:
     def end(self) -> int:
         return self.slot + self.stride
 
-    @property
+    @cached_property
     def now(self) -> SimpleNamespace:
         """Length [s] and weights of pass j."""
         return self.ws.numbers_of(self.j, self.num_passes)

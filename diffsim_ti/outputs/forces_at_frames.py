@@ -214,14 +214,18 @@ class BodyForces:
                 yield others
 
         def push(moved, *changes):
-            moved = of.zeros() if moved is None else moved
-            du, dv, dz = (np.zeros(x.shape) if dx is None else dx for x, dx in zip(states, changes))
-            tangent = self.tangent(moved)
-            return np.stack([self.jvp(a, b, tangent, c) for a, b, c in each(du, dv, dz)])
+            changes = [np.zeros(x.shape) if dx is None else dx for x, dx in zip(states, changes)]
+            records = dict(change=self.change, tangent=Tangent(self.arrays, of.zeros() if moved is None else moved))
+            out = []
+            for change in each(*changes):
+                self._put(self.change, *change)
+                out.append(self._run("jvp", **records))
+            return np.stack(out)
 
         def by_numbers(w):
-            adjoint = self.adjoint()
-            found[:] = zip(*[self.vjp(own, adjoint) for (own,) in each(w)])
+            adjoint = Adjoint(self.arrays, self.arrays.features(True, True))
+            adjoint.clear()
+            found[:] = zip(*[self._pull(own, adjoint) for (own,) in each(w)])
             adj = adjoint.collect()
             adj.element_masses = None
             return lambda into: into.add(adj)
@@ -237,34 +241,19 @@ class BodyForces:
 
     def place(self, u: np.ndarray, v: np.ndarray, law_state: np.ndarray | None = None) -> None:
         """Go to a displacement [m] and a velocity [m/s], and to what the law remembers."""
-        if self.at.z is not None:
-            runtime.fill(self.at.z, self.arrays.to_blocks(law_state)[None])
-        runtime.fill(self.at.u, u[None])
-        runtime.fill(self.at.v, v[None])
+        self._put(self.at, u, v, law_state)
+
+    def _put(self, record, u: np.ndarray, v: np.ndarray, z: np.ndarray | None) -> None:
+        if record.z is not None:
+            runtime.fill(record.z, self.arrays.to_blocks(z)[None])
+        runtime.fill(record.u, u[None])
+        runtime.fill(record.v, v[None])
 
     def forces(self) -> np.ndarray:
-        """f."""
+        """f there."""
         return self._run("forces")
 
-    def jvp(self, du: np.ndarray, dv: np.ndarray, tangent: Tangent, dz: np.ndarray | None = None) -> np.ndarray:
-        """Its change; dz: of what the law remembers."""
-        if self.change.z is not None:
-            runtime.fill(self.change.z, self.arrays.to_blocks(dz)[None])
-        runtime.fill(self.change.u, du[None])
-        runtime.fill(self.change.v, dv[None])
-        return self._run("jvp", change=self.change, tangent=tangent)
-
-    def tangent(self, change: Derived) -> Tangent:
-        """Changes of the scene's numbers, for `jvp`."""
-        return Tangent(self.arrays, change)
-
-    def adjoint(self) -> Adjoint:
-        """Room for the adjoints of the scene's numbers, for `vjp`; `collect()` gives them."""
-        out = Adjoint(self.arrays, self.arrays.features(True, True))
-        out.clear()
-        return out
-
-    def vjp(self, w: np.ndarray, adjoint: Adjoint) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    def _pull(self, w: np.ndarray, adjoint: Adjoint) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """(adjoint of u, of v, of what the law remembers) for that of f; adds those of coefficients, grad N and V."""
         runtime.fill(self.at.w, w[None])
         if self.out.z is not None:

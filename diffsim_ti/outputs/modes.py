@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.checked import shown
 from diffsim_ti.common.public import Public, public
-from diffsim_ti.inputs import StressPoints
+from diffsim_ti.differentiation.arrays import Recorded, reverse
+from diffsim_ti.inputs import DerivedNode, StressPoints
 from diffsim_ti.inputs.description import InputValue
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
@@ -94,31 +95,26 @@ FOURTH_ORDER = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))  # shift
 
 
 def _slope(body: BodyForces, hosts: HostForces, u: np.ndarray, phi: np.ndarray, derived):
-    """Derivatives of phi . K phi, of what kernels read and of u."""
-    X, H = derived.rest, StressPoints.of(body.scene.mesh, derived).displacement_gradients(phi)
-    step = 2e-3 / max(np.abs(H).max(), 1e-300)  # a strain that a law's third derivatives resolve
-    total, by_u, v = derived.zeros(), np.zeros_like(X), np.zeros_like(X)
-    for shift, weight in FOURTH_ORDER:
-        body.place(u + shift * step * phi, v)
-        adjoint = body.adjoint()
-        own, *_ = body.vjp(phi, adjoint)
-        found, weight = adjoint.collect(), -weight / step
-        by_u += weight * own
-        for name in ("coefficients", "gradients", "volumes"):
-            setattr(total, name, getattr(total, name) + weight * getattr(found, name))
-    if hosts:
-        by_u += _slope_of_hosts(hosts.take(derived), u, phi, derived, total)
-    return total, by_u
+    """Derivatives of phi . K phi, of what kernels read and of u: those of stress and of host forces."""
+    H, none = StressPoints.of(body.scene.mesh, derived).displacement_gradients(phi), np.zeros((1, *u.shape))
 
+    def of_stress(u):
+        of, at = DerivedNode(derived), Recorded(u)
+        return reverse(body.at_frames(of, at[None], none, none)[0], phi, [of, at])
 
-def _slope_of_hosts(hosts: HostForces, u: np.ndarray, phi: np.ndarray, derived, total) -> np.ndarray:
-    """The same of host forces; adds what kernels read to `total`."""
-    step, by_u = 2e-3 / hosts.turning(u, phi), np.zeros_like(u)
-    for shift, weight in FOURTH_ORDER:
+    def of_hosts(u):
         found = derived.zeros()
-        by_u -= weight / step * hosts.vjp(u + shift * step * phi, phi, found)[0]
-        total.add(found, -weight / step)
-    return by_u
+        return found, hosts.vjp(u, phi, found)[0]
+
+    parts = [(of_stress, max(np.abs(H).max(), 1e-300))]  # 2e-3 is a strain that a law's third derivatives resolve
+    parts += [(of_hosts, hosts.take(derived).turning(u, phi))] if hosts else []
+    total, by_u = derived.zeros(), np.zeros_like(u)
+    for pull, size in parts:
+        for shift, weight in FOURTH_ORDER:
+            found, by = pull(u + shift * 2e-3 / size * phi)
+            total.add(found, -weight * size / 2e-3)
+            by_u -= weight * size / 2e-3 * by
+    return total, by_u
 
 
 def free_directions(scene: Scene):

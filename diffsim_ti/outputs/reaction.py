@@ -94,17 +94,15 @@ class Reaction(Output):
         return (num_frames, len(self.vertices), 3) if self.per_vertex else (num_frames, 3)
 
     def value(self, frames: Frames) -> np.ndarray:
-        of, u, v = (
+        of, (u, v) = (
             derived(self.scene, frames),
-            frames.displacements.astype(np.float64),
-            frames.velocities.astype(np.float64),
+            (x.astype(np.float64) for x in (frames.displacements, frames.velocities)),
         )
         f, held = self.body.at_frames(of, u, v, self.remembered(frames, self.scene)), []
         for k, step in enumerate(frames.steps):
-            x, p = (
-                frames.positions[k].astype(np.float64),
-                frames.chamber_pressures[k] if self.scene.holds_volumes else None,
-            )
+            x, p = frames.positions[k].astype(np.float64), None
+            if self.scene.holds_volumes:
+                p = frames.chamber_pressures[k]
             both = f[k] + self.loads.forces(of, x, int(step), held=p, v=v[k])
             held.append(-np.einsum("kij,kj->ki", self.onto, both[self.vertices]))
         held = np.stack(held)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.common import rotations
+from diffsim_ti.differentiation.arrays import Recorded, forward, made, reverse, value_of
 from diffsim_ti.state.schedule import Schedule
 
 MORE = 6  # rows of an obstacle that turns
@@ -19,9 +20,13 @@ TAU = 5  # of those of one that turns
 
 
 def _at_share(s: np.ndarray, phi: np.ndarray, share: float) -> np.ndarray:
-    """Modified Rodrigues parameters of R(share phi) R, from those of R; in kernels turning.py."""
-    turn = rotations.quaternion(share * phi)
-    return rotations.rodrigues(rotations.product(turn, rotations.from_rodrigues(s)))
+    """Modified Rodrigues parameters of R(share phi) R, from those of R; in kernels turning.py. Of arrays that record, too:
+    changes of rotations are theta."""
+    now, way = value_of(s), share * value_of(phi)
+    turn, J = rotations.quaternion(way), lambda: share * rotations.left_jacobian(way)
+    back = lambda by: rotations.turned(rotations.conjugate(turn), by)  # noqa: E731
+    parents = (s, lambda theta: rotations.turned(turn, theta), back), (phi, lambda d: J() @ d, lambda by: J().T @ by)
+    return made(rotations.rodrigues(rotations.product(turn, rotations.from_rodrigues(now))), *parents)
 
 
 @dataclass(frozen=True)
@@ -60,23 +65,23 @@ class ObstaclePoses:
 
     def value(self, path: np.ndarray | None, at: Moment | None) -> np.ndarray:
         """The rows, shape (size, 3); without a path all zero."""
-        out = np.zeros((self.size, 3))
+        out = [*np.zeros((self.size, 3))]
         if path is not None:
-            self._translations(out, path, at)
+            schedule, s = at.schedule, at.schedule.row_of(path, at.j)
+            moments = (
+                schedule.place(path, at.j, at.at_stage),
+                schedule.place(path, at.j, at.begin),
+                schedule.rate(path, at.j),
+            )
+            for k, c in self.columns:
+                out[3 * k : 3 * k + 3] = (x[c] for x in moments)
             for row, c in self.turning:
-                s = at.schedule.row_of(path, at.j)
                 phi = path[s, c + 2]
                 for m, share in ((AT_STAGE, at.at_stage), (AT_BEGIN, at.begin)):
                     out[row + m] = _at_share(path[s, c + 1], phi, share)
-                out[row + RATE] = phi / at.schedule.step_length(at.j)
-                out[row + TAU, 0] = at.tau
-        return out
-
-    def _translations(self, out, path, at):
-        before = at.schedule.place(path, at.j, at.begin)
-        at_stage, speed = at.schedule.place(path, at.j, at.at_stage), at.schedule.rate(path, at.j)
-        for k, c in self.columns:
-            out[3 * k : 3 * k + 3] = at_stage[c], before[c], speed[c]
+                out[row + RATE] = phi / schedule.step_length(at.j)
+                out[row + TAU] = np.array([at.tau, 0.0, 0.0])
+        return np.stack(out) if out else np.zeros((0, 3))
 
     def row_of(self, k: int, rows: np.ndarray) -> np.ndarray:
         """Where obstacle k is where forces are taken: 3 numbers, or 7 of a pose."""
@@ -124,32 +129,10 @@ class ObstaclePoses:
 
     def jvp(self, path: np.ndarray | None, dpath: np.ndarray | None, at: Moment) -> np.ndarray:
         """Change of the rows."""
-        out = np.zeros((self.size, 3))
-        if dpath is not None:
-            self._translations(out, dpath, at)
-            for row, c in self.turning:
-                s = at.schedule.row_of(path, at.j)
-                phi, theta, dphi = path[s, c + 2], dpath[s, c + 1], dpath[s, c + 2]
-                for m, share in ((AT_STAGE, at.at_stage), (AT_BEGIN, at.begin)):
-                    turn = rotations.quaternion(share * phi)
-                    out[row + m] = share * rotations.left_jacobian(share * phi) @ dphi + rotations.turned(turn, theta)
-                out[row + RATE] = dphi / at.schedule.step_length(at.j)
-        return out
+        leaf = None if dpath is None else Recorded(path)
+        return forward(self.value(leaf, at), [(leaf, dpath)])
 
     def vjp(self, path: np.ndarray, poses_adj: np.ndarray, at: Moment, path_adj: np.ndarray) -> None:
         """Add the adjoints of the rows of paths for those of the rows here."""
-        schedule, j = at.schedule, at.j
-        for k, c in self.columns:
-            by_stage, by_before, by_speed = poses_adj[3 * k : 3 * k + 3]
-            rows = path_adj[:, c]
-            schedule.add_place(rows, j, at.at_stage, by_stage)
-            schedule.add_place(rows, j, at.begin, by_before)
-            schedule.add_rate(rows, j, by_speed)
-        for row, c in self.turning:
-            s = schedule.row_of(path, j)
-            phi = path[s, c + 2]
-            for m, share in ((AT_STAGE, at.at_stage), (AT_BEGIN, at.begin)):
-                by, back = poses_adj[row + m], rotations.quaternion(-share * phi)
-                path_adj[s, c + 1] += rotations.turned(back, by)
-                path_adj[s, c + 2] += share * rotations.left_jacobian(share * phi).T @ by
-            path_adj[s, c + 2] += poses_adj[row + RATE] / schedule.step_length(j)
+        leaf = Recorded(path, zeros=lambda: path_adj)
+        reverse(self.value(leaf, at), poses_adj, [leaf])

@@ -33,12 +33,6 @@ def between(begin, end, share):
     return begin + share * (end - begin)
 
 
-def add_between(begin: np.ndarray, end: np.ndarray, share: float, adjoint: np.ndarray) -> None:
-    """Adjoint of `between`: adds to those of both ends."""
-    begin += (1 - share) * adjoint
-    end += share * adjoint
-
-
 @runtime.traced
 def kicks(now, per_step: bool, fp) -> list:
     """(row of numbers given over time, share of its step at which they count, weight) of the two kicks of a pass. A step

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.common.public import Public
-from diffsim_ti.state.pass_table import FLOATS, INTS, add_between, between
+from diffsim_ti.state.pass_table import FLOATS, INTS, between
 
 
 class Schedule(metaclass=Public):
@@ -83,7 +83,7 @@ class Schedule(metaclass=Public):
         """Time between a frame and the one before [s]."""
         return float(self.time(frame * every) - self.time((frame - 1) * every))
 
-    # ---- rows of a motion, and their adjoints ------------------------------------------------------------------------
+    # ---- rows of a motion: all that is read of rows is linear in them ------------------------------------------------
 
     def place(self, rows: np.ndarray, j: int, share: float) -> np.ndarray:
         """The value at a share of the step of pass j; beyond the last row it stays."""
@@ -98,17 +98,6 @@ class Schedule(metaclass=Public):
     def row_of(self, rows: np.ndarray, j: int) -> int:
         """The row at which the step of pass j begins."""
         return self._rows(rows, j)[0]
-
-    def add_place(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
-        """Adjoint of `place`."""
-        r, after = self._rows(rows_adj, j)
-        add_between(rows_adj[r], rows_adj[after], share, adjoint)
-
-    def add_rate(self, rows_adj: np.ndarray, j: int, adjoint: np.ndarray) -> None:
-        """Adjoint of `rate`."""
-        r, after = self._rows(rows_adj, j)
-        rows_adj[r] -= adjoint / self.step_length(j)
-        rows_adj[after] += adjoint / self.step_length(j)
 
     # ---- loads: rows of steps, with their values at the beginning and at the end -------------------------------------
 
@@ -135,23 +124,6 @@ class Schedule(metaclass=Public):
         row = rows[self.load_row(rows, j)]
         tension, slack = (between(part[:, 0], part[:, 1], share) for part in (row[0::2], row[1::2]))
         return tension, slack, row[0::2, 2]
-
-    def add_load(self, rows_adj: np.ndarray, j: int, share: float, keyed: bool, adjoint: np.ndarray) -> None:
-        """Adjoint of `load`."""
-        row = rows_adj[self.load_row(rows_adj, j)]
-        if keyed:
-            add_between(row[0::2], row[1::2], share, adjoint)
-        else:
-            row += adjoint
-
-    def add_pressure(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
-        """Adjoint of `pressure`."""
-        row = rows_adj[self.load_row(rows_adj, j)]
-        add_between(row[:, 0], row[:, 1], share, adjoint)
-
-    def add_growth(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
-        """Adjoint of `growth`."""
-        add_between(*rows_adj[self.load_row(rows_adj, j)], share, adjoint)
 
     def _rows(self, rows, j):
         r = min(self.row(j), len(rows) - 1)

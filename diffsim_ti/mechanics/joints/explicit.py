@@ -64,6 +64,9 @@ class JointStage(Stage):
         self.change.offsets = runtime.array(a.vector, a.poses.size)
         self.change.impulse = runtime.array(a.vector, 2 * len(a.obstacles), a.num_vertices)
 
+    def with_buffers(self, way: str, run) -> Stage:
+        return JointStageTangent(self, run) if way == "tangent" else JointStageAdjoint(self, run)
+
     # ---- a pass --------------------------------------------------------------------------------------------------------
 
     def begin(self, at: Passes) -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import add_transposed
 from diffsim_ti.mechanics.joints.twists import by_turns, moved, moved_jvp, on_joints
 from diffsim_ti.mechanics.obstacles.contact_record import SharesAdjoint
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE
@@ -239,7 +240,7 @@ class JointAdjoint(JointSweep):
         self.numbers[2] -= np.where(J.robots.prescribed, 0.0, e * (J.q - J.targets))
         self.numbers[3] -= J.moves * e * J.rate
         schedule = self.ws.solver.schedule
-        schedule.add_pressure(adj.joints, J.j, J.share, J.k * e)
+        add_transposed(adj.joints, lambda rows: schedule.pressure(rows, J.j, J.share), J.k * e)
         adj.joints[schedule.load_row(adj.joints, J.j)][:, 2] += J.laid * e
         (a0, a1), (b0, b1) = J.weights
         by_first, by_second = np.stack([by_x, by_y]), np.stack([by_q_on, by_v_on])

@@ -129,41 +129,29 @@ class ObstaclePotential(ObstacleFunctions):
         """The place where friction takes its normal force from, as `friction_force` has it."""
         return self.rest_before(g, k, i, scene, pass_), let(at(pass_.lag, 0, i))
 
-    @ti.func
-    def lost(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
+    @traced
+    def sliding(self, g, k, i, u, scene, pass_, plan) -> tuple:
+        """What friction of an obstacle reads: all numbers, where its own begin, the place, both velocities."""
+        v, v_obstacle = let(self.velocity(i, u, pass_, plan)), let(self.v_obstacle(g, k, i, scene, pass_))
+        return scene.parameters, let(g.first + k * g.size), self.lagged_at(g, k, i, scene, pass_), v, v_obstacle
+
+    @traced
+    def lost(self, g, k, i, u, scene, pass_, plan):
         """Potential of friction by the velocity [W]."""
-        v, v_obstacle, first = (
-            self.velocity(i, u, pass_, plan),
-            self.v_obstacle(g, k, i, scene, pass_),
-            g.first + k * g.size,
-        )
-        return g.force.dissipation(scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle)
+        return g.force.dissipation(*self.sliding(g, k, i, u, scene, pass_, plan))
 
     @ti.func
     def push(self, g: A, k, i, u, scene: A, pass_: A):
         return self.force(g, k, i, self.rest_now(g, k, i, scene, pass_), u, self.vector(0), scene)
 
-    @ti.func
-    def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
-        v, v_obstacle, first = (
-            self.velocity(i, u, pass_, plan),
-            self.v_obstacle(g, k, i, scene, pass_),
-            g.first + k * g.size,
-        )
-        return g.force.friction_force(scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle)
+    @traced
+    def drag(self, g, k, i, u, scene, pass_, plan):
+        return g.force.friction_force(*self.sliding(g, k, i, u, scene, pass_, plan))
 
-    @ti.func
-    def drag_product(self, g: A, k, i, u, w, scene: A, pass_: A, plan: A):
+    @traced
+    def drag_product(self, g, k, i, u, w, scene, pass_, plan):
         """Change of `drag` for a change w of the displacement."""
-        v, v_obstacle, first = (
-            self.velocity(i, u, pass_, plan),
-            self.v_obstacle(g, k, i, scene, pass_),
-            g.first + k * g.size,
-        )
-        dv = plan.per_gamma * w
-        return g.force.friction_product(
-            scene.parameters, first, self.lagged_at(g, k, i, scene, pass_), v, v_obstacle, dv
-        )
+        return g.force.friction_product(*self.sliding(g, k, i, u, scene, pass_, plan), let(plan.per_gamma * w))
 
     # ---- barrier and friction; `rough`: whether friction counts -------------------------------------------------------
 
@@ -216,27 +204,17 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
-        first, dv = g.first + k * g.size, plan.per_gamma * (du - tangent.lag[1, i])
-        v, v_obstacle = self.velocity(i, u, pass_, plan), self.v_obstacle(g, k, i, scene, pass_)
-        moved, dv_obstacle = (
-            self.lagged_jvp(g, k, i, scene, pass_, tangent),
-            self.obstacle_velocity_jvp(g, k, i, scene, pass_, tangent),
-        )
-        f = g.force.friction_force_jvp(
-            scene.parameters,
-            first,
-            self.lagged_at(g, k, i, scene, pass_),
-            v,
-            v_obstacle,
-            tangent.parameters,
-            moved,
-            dv,
-            dv_obstacle,
-        )
-        f = self.on_area(g, i, f, scene)
+        f = self.on_area(g, i, self.drag_change(g, k, i, u, du, scene, pass_, tangent, plan), scene)
         if ti.static(g.force.per_area):
             f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
         return f
+
+    @traced
+    def drag_change(self, g, k, i, u, du, scene, pass_, tangent, plan):
+        """The same on one square metre."""
+        moved, dv = self.lagged_jvp(g, k, i, scene, pass_, tangent), let(plan.per_gamma * (du - at(tangent.lag, 1, i)))
+        changes = tangent.parameters, moved, dv, self.obstacle_velocity_jvp(g, k, i, scene, pass_, tangent)
+        return g.force.friction_force_jvp(*self.sliding(g, k, i, u, scene, pass_, plan), *changes)
 
     @traced
     def lagged_jvp(self, g, k, i, scene, pass_, tangent):

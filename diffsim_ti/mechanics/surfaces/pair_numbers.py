@@ -29,11 +29,8 @@ class PairNumbers:
         """Of pairs of the list by number, and their corners: contact (obstacle_corners.py), the area that its stiffness is
         multiplied by, and where stiffness, width, friction speed and coefficient stand, -1 without friction."""
         row = self.row_of[self.label[corners[:, 0]], self.label[corners[:, 2]]]
-        mu, contact, area = (
-            np.where(row >= 0, self.first_mu + row, -1),
-            np.zeros(len(corners), int),
-            np.ones(len(corners)),
-        )
+        mu, contact = np.where(row >= 0, self.first_mu + row, -1), np.zeros(len(corners), int)
+        area = np.ones(len(corners))
         if self.kinematic:
             contact = self.kinematic.numbers[corners[:, [0, 2]]].max(1)
             area = whole(self.pairs.list.area)[pairs].astype(float)

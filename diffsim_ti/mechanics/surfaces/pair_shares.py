@@ -38,10 +38,8 @@ class PairShares:
         if not all_pairs:
             gap = whole(inner.plane)[:count, 3]
             own &= ~(gap > gap.dtype.type(inner.contacts.widths[number]))
-        pushes, out = (
-            runtime.fetch(inner.corner)[: 4 * count].reshape(-1, 4, 3)[own],
-            np.zeros((surface.num_vertices, 3)),
-        )
+        pushes = runtime.fetch(inner.corner)[: 4 * count].reshape(-1, 4, 3)[own]
+        out = np.zeros((surface.num_vertices, 3))
         np.add.at(out, corners[own], pushes.astype(np.float64))
         return self.pairs.matrix.T @ out
 

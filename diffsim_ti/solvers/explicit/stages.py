@@ -2,30 +2,9 @@
 
 from contextlib import nullcontext
 
-from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import VolumeConstraintAdjoint, VolumeConstraintTangent
-from diffsim_ti.mechanics.chambers.volume_constraints import VolumeConstraints
-from diffsim_ti.mechanics.constraints import HeldRelations
-from diffsim_ti.mechanics.joints.explicit import JointStage, JointStageAdjoint, JointStageTangent
-from diffsim_ti.mechanics.reduced.projected_sets import ProjectedAdjoint, ProjectedSets, ProjectedTangent
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.contact_stage import PairContact
 from diffsim_ti.mechanics.surfaces.nearby_contact import NearbyContact
-
-# stages whose tangents and adjoints have buffers: what makes these of them for a run
-BUFFERED = dict(
-    tangent={
-        VolumeConstraints: VolumeConstraintTangent,
-        HeldRelations: VolumeConstraintTangent,
-        ProjectedSets: ProjectedTangent,
-        JointStage: JointStageTangent,
-    },
-    adjoint={
-        VolumeConstraints: VolumeConstraintAdjoint,
-        HeldRelations: VolumeConstraintAdjoint,
-        ProjectedSets: ProjectedAdjoint,
-        JointStage: JointStageAdjoint,
-    },
-)
 
 
 class KickDrift(Stage):
@@ -69,9 +48,3 @@ def _contact_of(pairs, damping: float, bodies) -> Stage | None:
     if not pairs:
         return None
     return NearbyContact(make) if pairs.nearby and pairs.nearby.many else make()
-
-
-def with_buffers(way: str, stages: list[Stage], run) -> list:
-    """The same with the buffers that a tangent or an adjoint has for them."""
-    makers = BUFFERED[way]
-    return [makers[type(stage)](stage, run) if type(stage) in makers else stage for stage in stages]

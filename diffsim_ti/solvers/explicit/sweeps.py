@@ -12,7 +12,6 @@ from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.stress.law_state import LawFrames
 from diffsim_ti.mechanics.workspace import FrameArrays
 from diffsim_ti.runtime.slots import copy_slot
-from diffsim_ti.solvers.explicit.stages import with_buffers
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
 
 STEPS = [name for name in OF_STEPS if name != "path"]
@@ -41,7 +40,7 @@ class ExplicitAdjoint:
         self._arrays |= self._of_bodies
         vars(self).update(self._arrays)
         self.impulses = ImpulseRecord(workspace, workspace.impulses.wanted) if workspace.impulses else None
-        self.stages = with_buffers("adjoint", workspace.stages, self)
+        self.stages = [stage.with_buffers("adjoint", self) for stage in workspace.stages]
         self.joints = next((stage for stage in self.stages if isinstance(stage, JointStageAdjoint)), None)
 
     def fits(self, workspace) -> bool:
@@ -195,7 +194,7 @@ class ExplicitTangent:
         if self.z is not None:
             runtime.fill(self.z, 0)
         self.rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
-        self.stages = with_buffers("tangent", workspace.stages, self)
+        self.stages = [stage.with_buffers("tangent", self) for stage in workspace.stages]
         self.joints = next((stage.joints for stage in self.stages if isinstance(stage, JointStageTangent)), None)
         self.offsets = (
             runtime.array(a.vector, a.poses.size) if self.features.led else None

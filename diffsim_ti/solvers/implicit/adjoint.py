@@ -10,8 +10,9 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.blas_threads import one_blas_thread
+from diffsim_ti.differentiation.arrays import add_transposed
 from diffsim_ti.inputs import Derived
-from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import ChamberRecord
+from diffsim_ti.mechanics.chambers.volume_constraints import ChamberRecord
 from diffsim_ti.mechanics.joints.sweeps import JointAdjoint
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, SharesAdjoint
 from diffsim_ti.mechanics.stress.law_state import LawFrames
@@ -112,7 +113,7 @@ class ImplicitAdjoint(RecordedPasses):
     def _pull_back_growth(self, j: int) -> None:
         """The adjoint of growth by tetrahedra in pass j goes to its step."""
         by_blocks = self.ws.arrays.from_growth_blocks(runtime.fetch(self.numbers.growths).astype(np.float64))
-        self.ws.growth_vjp(self.growth, j, self.stage, by_blocks[0].sum(0))
+        add_transposed(self.growth, lambda rows: self.ws.growth_of(rows, j, self.stage), by_blocks[0].sum(0))
         runtime.fill(self.numbers.growths, 0)
 
     def _pull_back_law(self, j: int, slot: int) -> None:
@@ -249,8 +250,8 @@ class ImplicitAdjoint(RecordedPasses):
         schedule = ws.solver.schedule
         place = p + pull / s.c0
         u_adj[held] += (1 - 1 / s.c0) * pull
-        schedule.add_place(self.motion, j, schedule.end(j), place)
-        schedule.add_rate(self.motion, j, q)
+        add_transposed(self.motion, lambda rows: schedule.place(rows, j, schedule.end(j)), place)
+        add_transposed(self.motion, lambda rows: schedule.rate(rows, j), q)
         self.anchor += place
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:

@@ -148,11 +148,8 @@ class Multigrid(Preconditioner):
         """(matrices of all levels, ways from each to the one before) where the potential stands, turned back by frames."""
         potential, free = self.potential, self.free
         a, mesh = potential.arrays, potential.arrays.mesh
-        hosts, x, R = (
-            potential.hosts.matrices(potential.held_at),
-            a.values.rest + potential.held_at,
-            self.frames.matrices(),
-        )
+        hosts, R = potential.hosts.matrices(potential.held_at), self.frames.matrices()
+        x = a.values.rest + potential.held_at
         potential.blocks()
         matrix, diagonal = assemble(potential, self.mass, free, [*more, *(own for own, _ in hosts)])
         if self._ties is not None:

@@ -4,6 +4,7 @@ from functools import cached_property
 
 import numpy as np
 
+from diffsim_ti.differentiation.arrays import add_transposed
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, Multipliers
 from diffsim_ti.mechanics.constraints import ConstraintForce
@@ -75,11 +76,6 @@ class PrescribedInPasses(Workspace):
     def growth_of(self, rows: np.ndarray, j: int, stage: Stage) -> np.ndarray:
         """What tetrahedra have grown by in pass j, of rows (steps, 2, m); linear in these."""
         return self.load_share(j, stage) * self.solver.schedule.growth(rows, j, self.share_at_stage(j, stage))
-
-    def growth_vjp(self, rows_adj: np.ndarray, j: int, stage: Stage, adjoint: np.ndarray) -> None:
-        """Add the adjoint of rows for that of `growth_of`."""
-        by = self.load_share(j, stage) * adjoint
-        self.solver.schedule.add_growth(rows_adj, j, self.share_at_stage(j, stage), by)
 
     def grow(self, j: int, stage: Stage) -> None:
         """Set what tetrahedra have grown by in pass j."""
@@ -174,7 +170,8 @@ class PrescribedInPasses(Workspace):
     def add_loads(self, rows_adj: np.ndarray, j: int, stage: Stage, by_vertices: np.ndarray) -> None:
         """Adjoint of `_add_forces`."""
         share, keyed = self.share_at_stage(j, stage), self.dead_loads.keyed
-        self.solver.schedule.add_load(rows_adj, j, share, keyed, by_vertices[self.dead_loads.acts_at])
+        read = lambda rows: self.solver.schedule.load(rows, j, share, keyed)  # noqa: E731
+        add_transposed(rows_adj, read, by_vertices[self.dead_loads.acts_at])
 
     def applied_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
         """Given forces on each vertex in pass j [N], from rows of them or of their tangent, without weight."""

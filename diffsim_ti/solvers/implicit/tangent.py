@@ -7,7 +7,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.common.blas_threads import one_blas_thread
 from diffsim_ti.inputs import Derived
-from diffsim_ti.mechanics.chambers.volume_constraint_derivatives import ChamberRecord
+from diffsim_ti.mechanics.chambers.volume_constraints import ChamberRecord
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.joints.sweeps import JointTangent
 from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
