@@ -97,9 +97,9 @@ class PairKernels(ListedPair):
     @ti.func
     def product(self, kind: A, p, scene: A, at: A, plan: A):
         h1, h2, h3, numbers = self.vec3(0), self.vec3(0), self.vec3(0), self.vec4(0)
-        wanted = plan.has_planes == 0 or self.is_active(p, scene)
+        wanted = True
         if ti.static(self.mixed):
-            wanted = wanted and (plan.only < 0 or plan.only == self.contact_of(p, scene))
+            wanted = plan.only < 0 or plan.only == self.contact_of(p, scene)
         if wanted:
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
@@ -133,13 +133,10 @@ class PairKernels(ListedPair):
 
     @cached_property
     def products(self) -> Kernel:
-        """Change of the forces for changes w of the positions (and of rest shape, stiffness and width).
-
-        has_planes: the planes are those of `forces` at the same place, and spare pairs beyond the width the work.
-        """
+        """Change of the forces for changes w of the positions (and of rest shape, stiffness and width)."""
         at = dict(u="vectors2", w="vectors2", rest_dot="vectors", out="vectors")
         at |= dict(numbers_dot="vectors") if self.mixed else {}
-        numbers = dict(by_rest="int", has_planes="int", d_stiffness="float", d_width="float")
+        numbers = dict(by_rest="int", d_stiffness="float", d_width="float")
         numbers |= dict(only="int") if self.mixed else {}
         return self.kernel("products", self.all_products, at, dict(numbers="vectors"), **numbers)
 
