@@ -18,7 +18,7 @@ from diffsim_ti.terms.obstacles import barrier
 A = ti.template()
 MOST_PLANES = 50  # that part a pair on its way
 RUN = 16  # pairs of a list that one thread looks through
-ACTING = dict(acting="ints", acting_corner="ints")
+ACTING = dict(acting="ints", acting_corner="ints", nearest="vectors", inverse="vectors")
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,13 @@ class HessianKernels(ListedPair):
 
     @cached_property
     def pair(self) -> PairKernels:
-        return kernels_of(PairKernels, self.precision, self.first, self.parallel)
+        return kernels_of(PairKernels, self.precision, self.first, self.parallel, True)
+
+    @ti.func
+    def nearest_of(self, p, scene: A, y1, y2, y3):
+        """(weights of the corners, r) that `place` has found of pair p."""
+        w = scene.nearest[p]
+        return w, w[1] * y1 + w[2] * y2 + w[3] * y3
 
     def _on_acting(self, name: str, body, at: dict, **numbers) -> Kernel:
         return self.kernel(name, body, at, ACTING, num_runs="int", **numbers)
@@ -106,7 +112,7 @@ class HessianKernels(ListedPair):
     def stiffness_along(self, kind: A, p, y1, y2, y3, scene: A, plan: A):
         """(weights of the corners, n, m phi''): the convex part of a pair's Hessian is m phi'' (w n)(w n)^T."""
         stiffness, width = self.numbers(p, scene)
-        w, r, _ = self.nearest(kind, y1, y2, y3)
+        w, r = self.nearest_of(p, scene, y1, y2, y3)
         length, k = ti.sqrt(r.norm_sqr()), ti.cast(0, self.fp)
         d = length - self.radius_of(p, scene)
         if d < width:
@@ -124,8 +130,25 @@ class HessianKernels(ListedPair):
         dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
         stiffness, width = self.numbers(p, scene)
         scale, radius, none = self.scale_of(kind, p, scene, plan), self.radius_of(p, scene), ti.cast(0, self.fp)
-        h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp(
-            kind, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, none, none, none
+        w, r = self.nearest_of(p, scene, y1, y2, y3)
+        h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp_at(
+            kind,
+            w,
+            r,
+            three(scene.inverse[p]),
+            y1,
+            y2,
+            y3,
+            dy1,
+            dy2,
+            dy3,
+            scale,
+            stiffness,
+            width,
+            radius,
+            none,
+            none,
+            none,
         )
         self.store(p, scene, h1, h2, h3)
 

@@ -22,6 +22,7 @@ class ImplicitPairs(SurfacePairs):
 
     friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
+    least_slack = 0.5  # lists are then seldom made anew within a pass
     blocked: np.ndarray | None = None  # corners of the pair that stopped the last march
     _ahead: np.ndarray | float = 0.0  # how far vertices are expected to go in a pass [m]
     asks = False  # whether the host has to look at the way of a step
@@ -54,6 +55,7 @@ class ImplicitPairs(SurfacePairs):
         count, take = self.list.count, self.list.buffers.take
         self.acting, self.acting_corner = take("acting", ti.i32, count), take("acting corners", ti.i32, 4 * count)
         self.share = take("shares", self.kernels.fp, count)
+        self.nearest, self.inverse = (take(name, self.kernels.vec4, count) for name in ("nearest", "inverses"))
         self.sizes |= dict(num_runs=-(-count // RUN), lost=0.5 * self.least_width)
         self.make_room()
 

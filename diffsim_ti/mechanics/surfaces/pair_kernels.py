@@ -17,7 +17,12 @@ A = ti.template()
 
 @dataclass(frozen=True)
 class PairKernels(ListedPair):
-    """Forces at u[slot], products of their derivatives, and adjoints of stiffness, width and rest shape."""
+    """Forces at u[slot], products of their derivatives, and adjoints of stiffness, width and rest shape.
+
+    keeps: whether forces leave the weights of what is nearest, and G (proximity.py).
+    """
+
+    keeps: bool = False
 
     # ---- planes that part pairs --------------------------------------------------------------------------------------
 
@@ -61,7 +66,10 @@ class PairKernels(ListedPair):
         # the plane of the pass before spares most pairs the search; the margin is for rounding
         if not d > ti.cast(MARGIN, self.fp) * width or plan.exact > 0:
             scale = self.scale_of(kind, p, scene, plan)
-            energy, n, d, g1, g2, g3 = self.gradient(kind, y1, y2, y3, scale, stiffness, width, radius)
+            w, r, g = self.nearest(kind, y1, y2, y3)
+            energy, n, d, g1, g2, g3 = self.gradient_at(kind, w, r, y1, y2, y3, scale, stiffness, width, radius)
+            if ti.static(self.keeps):
+                scene.nearest[p], scene.inverse[p] = w, self.four(g)
         scene.plane[p] = self.vec4(n[0], n[1], n[2], d)
         scene.energy[p] = energy
         if not d > width:

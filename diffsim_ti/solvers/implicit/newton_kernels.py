@@ -158,30 +158,35 @@ class NewtonKernels:
         return self._kernel("bound", self.shorten, out=dict(found=self.values))
 
     @ti.func
-    def go_ahead(self, cg: A, newton: A, at: A, plan: A):
+    def go_ahead(self, cg: A, newton: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
-            newton.next[0, i] = at.u[0, i] + newton.step[0, i] * ti.cast(cg.state[0, LONGEST], PRECISIONS[self.scene])
+            share = cg.state[0, FRACTION]
+            if cg.state[0, FRESH] == 1:
+                share = cg.state[0, LONGEST]
+            newton.next[0, i] = self.cg.to(PRECISIONS[self.scene], newton.u[i] + newton.d[i] * share)
 
     @cached_property
     def lead(self) -> Kernel:
-        """Where the longest step along a direction leads."""
-        kind = f"vectors2_{self.scene}"
-        return self._kernel("lead", self.go_ahead, newton=dict(step=kind, next=kind), at=dict(u=kind))
+        """Where the longest step along a new direction leads, or what is tried next along the same."""
+        own = dict(u="vectors", d="vectors", next=f"vectors2_{self.scene}")
+        return self._kernel("lead", self.go_ahead, newton=own)
 
     @ti.func
     def ask(self, cg: A, near: A, plan: A):
         ti.loop_config(serialize=True)
         for _ in range(1):
             if cg.state[0, PHASE] == TRY and near.flags[0] > 0:
-                cg.state[0, PHASE], cg.state[0, FRESH] = ti.cast(plan.phase, self.fp), ti.cast(0, self.fp)
+                cg.state[0, PHASE] = ti.cast(ASTRAY, self.fp)
+                if cg.state[0, FRESH] == 1:
+                    cg.state[0, PHASE] = ti.cast(WAY, self.fp)
                 cg.state[0, ACCEPTED] = ti.cast(0, self.fp)
 
     @cached_property
     def halt(self) -> Kernel:
         """A phase of the host's where the list of pairs does not hold."""
         arrays = dict(cg=dict(state="scalars2"), near=dict(flags="ints"))
-        return Kernel("halt", self.ask, self.vectors, arrays, dict(phase="int"))
+        return Kernel("halt", self.ask, self.vectors, arrays, {})
 
     @ti.func
     def go(self, cg: A, newton: A, at: A, plan: A):

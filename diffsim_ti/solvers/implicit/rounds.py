@@ -75,7 +75,7 @@ class Rounds:
         of_potential = dict(scene=a, pass_=potential, at=potential, out=potential)
         one = lambda kernel, records: [(kernel, records, None)]  # noqa: E731
         tries, judges, updates, solves, fresh = (one(kernel, own) for kernel in kernels.wanted)
-        direction, residual, near, place = one(kernels.direction, own), [], [], []
+        direction, residual, holds, near, place = one(kernels.direction, own), [], [], [], []
         if a.contacts and not potential.joints:
             of_way = dict(scene=a, way=way, at=potential, out=detection.found)
             direction += one(detection.kernels.shares, of_way) + one(kernels.bound, own)
@@ -85,14 +85,12 @@ class Rounds:
                 residual += one(potential.kernels.contact_blocks, of_potential | dict(out=barriers))
         if pairs:
             of_pairs, u = own | dict(near=pairs.inner, out=SimpleNamespace(found=pairs.inner.share)), potential.u
-            halts = [(kernels.halt, of_pairs, dict(phase=phase)) for phase in (nk.WAY, nk.ASTRAY)]
-            near = [*one(kernels.lead, own), *pairs.holding(self.next), halts[0], *pairs.closing(u, way.step)]
-            near += [(kernels.bound, of_pairs, self._of_pairs)]
-            place = [*pairs.holding(u), halts[1], *pairs.placing(u)]
+            holds = [*one(kernels.lead, own), *pairs.holding(self.next), *one(kernels.halt, of_pairs)]
+            near, place = [*pairs.closing(u, way.step), (kernels.bound, of_pairs, self._of_pairs)], pairs.placing(u)
             residual += pairs.adding_blocks(u, barriers.blocks)
         move, energy = one(kernels.move, own), one(potential.kernels.energy, of_potential)
         compare, judge = one(kernels.choose, own), one(kernels.judge, own)
-        first, trial = [*tries, *direction], [*move, *place, *energy, *compare]
+        first, trial = [*tries, *direction, *holds], [*move, *place, *energy, *compare]
         groups = [first, [*fresh, *near], [*tries, *trial]] if pairs else [[*first, *trial]]
         groups.append([*judges, *residual, *judge])
         update, hard = ([], None) if beside or self.several else preconditioner.updating()
@@ -104,7 +102,7 @@ class Rounds:
             groups.append([*solves, *cg.parts(False, potential.multiplying())[1:]])
             self._trial = Repeated("newton", groups, cg.parallel, vectorized=True)
         elif beside or pairs or self.several or runs_on_cpu() or not cg.is_one_kernel:
-            self._steps = [self._in_turn(group) for group in (direction, near, move, place, compare, judge)]
+            self._steps = [self._in_turn(group) for group in (direction, holds, near, move, place, compare, judge)]
         else:
             self._trial, self._residual = (Repeated(f"newton{k}", [own], True) for k, own in enumerate(groups))
 
@@ -366,17 +364,20 @@ class Rounds:
         """Energies of a trial, of a new direction or along the same."""
         if self._steps is None:
             return self._trial(1, **numbers)
-        (direct, near, move, place, compare, _), phases = self._steps, self.state[:, nk.PHASE]
+        (direct, holds, near, move, place, compare, _), phases = self._steps, self.state[:, nk.PHASE]
         tried = (nk.BASE <= phases) & (phases <= nk.TRY) | (phases == nk.SOLVE)
         phase = phases[tried].max()
         if phase == nk.SOLVE:
             direct(1, **numbers)
             if (self.potential.joints and self.contact) or (self.pairs and self.pairs.asks):
                 self._shorten()
-            elif near:
+        if holds:
+            holds(1, **numbers)
+            self._receive()
+            if self.state[0, nk.PHASE] > nk.SOLVE:
+                return
+            if self.state[0, nk.FRESH] == 1:
                 near(1, **numbers)
-                if runtime.fetch(self.cg.state)[0, nk.PHASE] != nk.TRY:
-                    return
         move(1, **numbers)
         self.potential.only(tried)
         if self.beside:
@@ -398,7 +399,7 @@ class Rounds:
             if potential.surface_friction and self.state[0, nk.PHASE] == nk.TRY:
                 self.pairs.launch(self.pairs.closing(potential.u, self.detection.way.step))  # says what is turned
             share = min(share, self.pairs.safe_share(u, step, share, placed=True))
-        numbers = {nk.CUTS: cuts + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share)}
+        numbers = {nk.CUTS: cuts + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share), nk.FRESH: 0}
         self._set(numbers | {nk.PHASE: nk.TRY if share > newton.shortest else nk.TROUBLE})
 
     def _beside(self, phase: int) -> dict:
