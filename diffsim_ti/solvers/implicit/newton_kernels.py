@@ -246,7 +246,7 @@ class NewtonKernels:
         c = self.cg.add_up(cg.part, 6, b, plan)
         value, size = cg.part[0, c] + cg.state[b, BESIDE], cg.part[1, c] + cg.state[b, BESIDE_PARTS]
         cg.state[b, E_TRIED], cg.state[b, PARTS_TRIED], cg.state[b, DOUBTED] = value, size, ti.cast(0, self.fp)
-        cg.state[b, ACCEPTED] = ti.cast(0, self.fp)
+        cg.state[b, ACCEPTED], cg.state[b, FRESH] = ti.cast(0, self.fp), ti.cast(0, self.fp)
         change = value - cg.state[b, E] + cg.part[4, c] + cg.state[b, BESIDE_CHANGE]
         flat = cg.part[2, c] > 0
         if cg.state[b, PHASE] == BASE:
