@@ -356,12 +356,14 @@ class CurvedPairs:
     def energies(self) -> np.ndarray:
         return self.inner.energies()
 
-    def holding(self, u) -> Parts:
-        return [self._refining(u, 0, self.inner.next, "given"), *self.inner.holding(self.inner.next)]
+    def holding(self, u, w) -> Parts:
+        there, step = self.inner.next, self.inner.step
+        refining = self._refining(u, 0, there, "given"), self._refining(w, 0, step, "unmoved")
+        return [*refining, *self.inner.holding(there, step)]
 
-    def closing(self, u, w) -> Parts:
+    def turning(self, u, w) -> Parts:
         step = self.inner.step
-        return [self._refining(w, 0, step, "unmoved"), *self.inner.closing(self._u, step)]
+        return [self._refining(w, 0, step, "unmoved"), *self.inner.turning(self._u, step)] if self.friction else []
 
     def multiplying(self, u, w, convex: bool) -> Parts:
         refining = self._refining(w, 0, self._w, "unmoved")

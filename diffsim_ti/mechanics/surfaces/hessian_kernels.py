@@ -229,14 +229,37 @@ class HessianKernels(ListedPair):
         return closing
 
     @ti.func
+    def flag(self, kind: A, p, scene: A, at: A, plan: A):
+        if not self.first_share(kind, p, scene, at) >= plan.most:
+            scene.flags[2] = 1
+
+    @ti.func
+    def flag_all(self, scene: A, at: A, plan: A):
+        self.each_pair(self.flag, scene, at, plan)
+
+    @cached_property
+    def clear(self) -> Kernel:
+        """flags[2]: some pair is not kept apart by its plane, from where `place` has been, on all of the step w."""
+        return self.kernel("clear", self.flag_all, dict(w="vectors2"), dict(flags="ints"), most="float")
+
+    @ti.func
+    def first_share(self, kind: A, p, scene: A, at: A):
+        """The share of the step w up to which the plane of a pair keeps as much of its gap as `share` says."""
+        plane = scene.plane[p]
+        return (plane[3] - self.least_gap(p, scene)) / self.closing(kind, three(plane), p, scene, at)
+
+    @ti.func
+    def least_gap(self, p, scene: A):
+        half = ti.cast(0.5, self.fp) * self.width(p, scene)
+        return ti.min(ti.cast(1 - SAFE, self.fp) * scene.plane[p][3], half)
+
+    @ti.func
     def share(self, kind: A, p, scene: A, at: A, plan: A):
         """The share of the step w, if below `most`, after which the pair has closed all but 1 - SAFE of its gap, or half of
         the width if that is less, and half as much again: planes that part it on the way say how far it may go on.
         Li, Kaufman, Jiang 2021, Codimensional Incremental Potential Contact, doi:10.1145/3450626.3459767, algorithm 1."""
-        plane, one = scene.plane[p], ti.cast(1, self.fp)
-        radius, half = self.radius_of(p, scene), ti.cast(0.5, self.fp) * self.width(p, scene)
-        least = ti.min(ti.cast(1 - SAFE, self.fp) * plane[3], half)
-        share = (plane[3] - least) / self.closing(kind, three(plane), p, scene, at)
+        one, radius, least = ti.cast(1, self.fp), self.radius_of(p, scene), self.least_gap(p, scene)
+        share = self.first_share(kind, p, scene, at)
         goes_on = share < plan.most
         if goes_on:
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)

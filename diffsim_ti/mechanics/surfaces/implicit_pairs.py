@@ -92,15 +92,14 @@ class ImplicitPairs(SurfacePairs):
         """Of each pair, and of each pair's friction [J]."""
         return runtime.fetch(self.energy)[: self.num_energies].astype(np.float64)
 
-    def holding(self, u) -> Parts:
-        """What finds whether the list holds at u[0]: flags[0] is 1 where it does not."""
-        return [self.prepared(self.motion.holds, dict(u=u))]
+    def holding(self, u, w) -> Parts:
+        """What finds whether the list holds at u[0], else flags[0] is 1; and whether planes keep all pairs apart on the step
+        w[0] from where `place` has been, else flags[2] is 1."""
+        return [self.prepared(self.motion.holds, dict(u=u)), self.prepared(self.hessian.clear, dict(w=w))]
 
-    def closing(self, u, w) -> Parts:
-        """What finds the `share` of each pair of the step w[0] from u[0], where `place` has been, if the list holds on all
-        of it; and which friction turns round."""
-        own = self.friction.turning(u, w) if self.friction else []
-        return [*own, self.prepared(self.hessian.shares, dict(u=u, w=w))]
+    def turning(self, u, w) -> Parts:
+        """What finds which friction a step w[0] from u[0] turns round."""
+        return self.friction.turning(u, w) if self.friction else []
 
     def multiplying(self, u, w, convex: bool) -> Parts:
         """Change of the forces of contact and friction for changes w[0] of the positions, to the last corners of

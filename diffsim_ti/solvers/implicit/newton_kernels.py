@@ -24,8 +24,8 @@ A = ti.template()
 (SOLVED, SCALE, INDEFINITE, LONGEST, BEST, MEASURE, TO_LOWER) = range(RECOUNTS + 1, RECOUNTS + 8)
 COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
 # phases: it is done, no step is found, rounds are used up; energies where rises are measured from, and of one; where a solve
-# starts, a trial of the line search, its residual, the preconditioner, conjugate gradients; the list of pairs does not hold
-# on all of a direction, or at what is tried
+# starts, a trial of the line search, its residual, the preconditioner, conjugate gradients; the host says how far along a
+# direction surfaces stay apart, makes the list of pairs anew
 DONE, TROUBLE, MANY, BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE, WAY, ASTRAY = range(12)
 WAITS = 4  # of STOPPED: conjugate gradients have not begun
 BY_WORK, BY_RESIDUAL = 1, 2  # of MEASURE where there is no potential: work or |R| is lower, |R| is
@@ -145,16 +145,13 @@ class NewtonKernels:
         ti.loop_config(serialize=self.cg.one_by_one)
         for b in range(plan.systems):
             if cg.state[b, FRESH] == 1:
-                if cg.state[b, FRACTION] == 1 and cg.state[b, LONGEST] < 1:
-                    cg.state[b, CUTS] = cg.state[b, CUTS] + ti.cast(1, self.fp)
                 cg.state[b, FRACTION] = ti.min(cg.state[b, FRACTION], cg.state[b, LONGEST])
-                if ti.static(self.pairs):
-                    if not cg.state[b, FRACTION] > cg.state[b, SHORTEST]:
-                        cg.state[b, PHASE] = ti.cast(TROUBLE, self.fp)
+                if cg.state[b, FRACTION] < 1:
+                    cg.state[b, CUTS] = cg.state[b, CUTS] + ti.cast(1, self.fp)
 
     @cached_property
     def bound(self) -> Kernel:
-        """The longest step before an obstacle, of what each vertex may go, or before surfaces meet, of each pair."""
+        """The longest step before an obstacle, of what each vertex may go."""
         return self._kernel("bound", self.shorten, out=dict(found=self.values))
 
     @ti.func
@@ -176,15 +173,17 @@ class NewtonKernels:
     def ask(self, cg: A, near: A, plan: A):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            if cg.state[0, PHASE] == TRY and near.flags[0] > 0:
-                cg.state[0, PHASE] = ti.cast(ASTRAY, self.fp)
-                if cg.state[0, FRESH] == 1:
-                    cg.state[0, PHASE] = ti.cast(WAY, self.fp)
+            away, meets = near.flags[0] > 0, near.flags[2] > 0
+            if cg.state[0, PHASE] == TRY:
                 cg.state[0, ACCEPTED] = ti.cast(0, self.fp)
+                if cg.state[0, FRESH] == 1 and (away or meets):
+                    cg.state[0, PHASE] = ti.cast(WAY, self.fp)
+                elif away:
+                    cg.state[0, PHASE] = ti.cast(ASTRAY, self.fp)
 
     @cached_property
     def halt(self) -> Kernel:
-        """A phase of the host's where the list of pairs does not hold."""
+        """A phase of the host's where the list of pairs does not hold, or surfaces may meet."""
         arrays = dict(cg=dict(state="scalars2"), near=dict(flags="ints"))
         return Kernel("halt", self.ask, self.vectors, arrays, {})
 

@@ -2,7 +2,6 @@
 
 import weakref
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -55,7 +54,7 @@ class Rounds:
         self.J, self._filled = runtime.array(a.fp, points), {}
         self.sizes = dict(chunks=cg.chunks, length=cg.length, nodes=n, count=detection.count, systems=cg.systems)
         self.sizes |= dict(points=points, points_length=-(-(points // cg.systems) // (cg.chunks // cg.systems)))
-        self._always, self._of_pairs = self.sizes | dict(kept=detection.kept), dict(self.sizes)
+        self._always = self.sizes | dict(kept=detection.kept)
         self.next = runtime.array(a.vector, 1, n) if self.pairs else None  # where the longest step leads
         self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small
         self.whole &= potential.kernels.blocks.variables <= self.short and not (self.beside or self.several)
@@ -84,14 +83,14 @@ class Rounds:
             if self.contact:
                 residual += one(potential.kernels.contact_blocks, of_potential | dict(out=barriers))
         if pairs:
-            of_pairs, u = own | dict(near=pairs.inner, out=SimpleNamespace(found=pairs.inner.share)), potential.u
-            holds = [*one(kernels.lead, own), *pairs.holding(self.next), *one(kernels.halt, of_pairs)]
-            near, place = [*pairs.closing(u, way.step), (kernels.bound, of_pairs, self._of_pairs)], pairs.placing(u)
+            u, step, halt = potential.u, way.step, one(kernels.halt, dict(cg=cg, near=pairs.inner))
+            holds = [*one(kernels.lead, own), *pairs.holding(self.next, step), *halt]
+            near, place = pairs.turning(u, step), pairs.placing(u)
             residual += pairs.adding_blocks(u, barriers.blocks)
         move, energy = one(kernels.move, own), one(potential.kernels.energy, of_potential)
         compare, judge = one(kernels.choose, own), one(kernels.judge, own)
         first, trial = [*tries, *direction, *holds], [*move, *place, *energy, *compare]
-        groups = [first, [*fresh, *near], [*tries, *trial]] if pairs else [[*first, *trial]]
+        groups = [first, [*fresh, *near], [*tries, *trial]] if near else [[*first, *trial]]
         groups.append([*judges, *residual, *judge])
         update, hard = ([], None) if beside or self.several else preconditioner.updating()
         update = [*update, (kernels.ready, dict(cg=cg, body=hard), None)] if update else []
@@ -112,10 +111,8 @@ class Rounds:
         if pairs:
             if pairs.version != self._version:
                 self._bind()
-            count, self._of_pairs["count"] = pairs.inner.num_energies, pairs.list.count
-            pairs.inner.sizes["most"] = most
+            count, pairs.inner.sizes["most"] = pairs.inner.num_energies, most
             numbers |= dict(energies=count, energies_length=-(-count // self.cg.chunks))
-            self._of_pairs |= numbers | dict(count=pairs.list.count)
         return numbers
 
     def _serve(self, times: int, rounding: float) -> None:
@@ -376,7 +373,7 @@ class Rounds:
             self._receive()
             if self.state[0, nk.PHASE] > nk.SOLVE:
                 return
-            if self.state[0, nk.FRESH] == 1:
+            if near and self.state[0, nk.FRESH] == 1:
                 near(1, **numbers)
         move(1, **numbers)
         self.potential.only(tried)
@@ -396,8 +393,7 @@ class Rounds:
         if potential.joints:
             share = newton.collisions(u, step, longest)[0]
         if self.pairs:
-            if potential.surface_friction and self.state[0, nk.PHASE] == nk.TRY:
-                self.pairs.launch(self.pairs.closing(potential.u, self.detection.way.step))  # says what is turned
+            self.pairs.launch(self.pairs.turning(potential.u, self.detection.way.step))
             share = min(share, self.pairs.safe_share(u, step, share, placed=True))
         numbers = {nk.CUTS: cuts + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share), nk.FRESH: 0}
         self._set(numbers | {nk.PHASE: nk.TRY if share > newton.shortest else nk.TROUBLE})
