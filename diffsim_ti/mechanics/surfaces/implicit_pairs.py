@@ -126,6 +126,13 @@ class ImplicitPairs(SurfacePairs):
         here = self._holds(u)
         holds = holds and here
         placed = placed and holds
+        if holds:  # `next` is at u
+            if not placed:
+                self.forces(self.next, 0, self.a.corner, exact=True)
+            self.run(self.hessian.clear, dict(w=self.step), most=most)
+            if not runtime.look(self.flags)[2]:
+                return most
+            placed = True
         for _ in range(self.longest_march):
             unlisted, old = np.inf, here and not holds
             if not holds:
