@@ -1,7 +1,7 @@
 """Kernels over the pairs of a surface for Newton's method: forces, the Hessian and its convex part, safe shares of a step.
 
-A list has many more pairs than are nearer than their width. `place` says which these are, and products and diagonals go
-over them alone, in order. They read the planes that it left at the same displacement.
+A list has many more pairs than are nearer than their width. `place` says which these are, and all else reads what it left
+at the same displacement.
 """
 
 from dataclasses import dataclass
@@ -11,22 +11,21 @@ import taichi as ti
 
 from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, SAFE, ListedPair, between, three
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
-from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
+from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE
 from diffsim_ti.runtime import Kernel, kernels_of
 from diffsim_ti.terms.obstacles import barrier
 
 A = ti.template()
 MOST_PLANES = 50  # that part a pair on its way
-RUN = 16  # pairs of a list that one thread looks through
-ACTING = dict(acting="ints", acting_corner="ints", nearest="vectors", inverse="vectors")
+ACTING = dict(acting="ints", nearest="vectors", inverse="vectors")
 
 
 @dataclass(frozen=True)
 class HessianKernels(ListedPair):
     """Forces at u[slot], and products and diagonals of the Hessian there.
 
-    acting: of each RUN of pairs those that are nearer than the width, then -1; acting_corner: of each row of `corner_of`
-    those of these pairs, then -1.
+    acting: of each row of `corner_of` those of pairs that are nearer than the width, then -1; nearest, inverse: of these
+    pairs the weights of the corners, and G (proximity.py).
     """
 
     @cached_property
@@ -39,23 +38,11 @@ class HessianKernels(ListedPair):
         w = scene.nearest[p]
         return w, w[1] * y1 + w[2] * y2 + w[3] * y3
 
-    def _on_acting(self, name: str, body, at: dict, **numbers) -> Kernel:
-        return self.kernel(name, body, at, ACTING, num_runs="int", **numbers)
-
     # ---- forces ------------------------------------------------------------------------------------------------------
 
     @ti.func
     def place_all(self, scene: A, at: A, plan: A):
         self.each_pair(self.pair.force, scene, at, plan)
-        ti.loop_config(serialize=not self.parallel)
-        for c in range(plan.num_runs):
-            k, end = RUN * c, ti.min(RUN * (c + 1), plan.num_pairs)
-            for p in range(RUN * c, end):
-                if self.is_active(p, scene):
-                    scene.acting[k] = p
-                    k += 1
-            if k < end:
-                scene.acting[k] = -1
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             total, k, end = self.vec4(0), scene.row[s], scene.row[s + 1]
@@ -65,48 +52,28 @@ class HessianKernels(ListedPair):
                     corner = scene.corner_of[m]
                     if self.is_active(corner >> 2, scene):
                         total += scene.corner[corner]
-                        scene.acting_corner[k] = corner
+                        scene.acting[k] = corner
                         k += 1
             if k < end:
-                scene.acting_corner[k] = -1
+                scene.acting[k] = -1
             at.out[plan.first_out + s] = total
 
     @cached_property
     def place(self) -> Kernel:
-        """As `forces` of PairKernels; and which pairs act."""
-        own, at = ACTING | dict(energy="scalars", touched="ints"), dict(u="vectors2", out="vectors")
-        return self.kernel("place", self.place_all, at, own, num_runs="int", exact="int")
+        """As `forces` of PairKernels; and which corners are of pairs that act."""
+        own = ACTING | dict(energy="scalars", touched="ints")
+        return self.kernel("place", self.place_all, dict(u="vectors2", out="vectors"), own, exact="int")
 
     @ti.func
-    def each_acting(self, act: A, scene: A, at: A, plan: A):
-        """act(kind, p, scene, at, plan) of every pair that acts."""
-        ti.loop_config(serialize=not self.parallel)
-        for c in range(plan.num_runs):  # of both kinds: each loop takes time to start
-            k, end = RUN * c, ti.min(RUN * (c + 1), plan.num_pairs)
-            while k < end:
-                p = scene.acting[k]
-                k += 1
-                if p < 0:
-                    k = end
-                elif p < plan.num_vt:
-                    act(VERTEX_TRIANGLE, p, scene, at, plan)
-                else:
-                    act(EDGE_EDGE, p, scene, at, plan)
-
-    @ti.func
-    def sum_acting(self, scene: A, at: A, plan: A):
-        """What they have stored for each surface vertex."""
+    def sum_corners(self, scene: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            total, k, end = self.vec4(0), scene.row[s], scene.row[s + 1]
-            while k < end:
-                corner = scene.acting_corner[k]
-                k += 1
-                if corner < 0:
-                    k = end
-                else:
-                    total += scene.corner[corner]
-            at.out[plan.first_out + s] = total
+            total = self.vec4(0)
+            for k in range(scene.row[s], scene.row[s + 1]):
+                if scene.acting[k] < 0:
+                    break
+                total += scene.corner[scene.acting[k]]
+            out[plan.first_out + s] = total
 
     @ti.func
     def stiffness_along(self, kind: A, p, y1, y2, y3, scene: A, plan: A):
@@ -126,96 +93,91 @@ class HessianKernels(ListedPair):
 
     @ti.func
     def product(self, kind: A, p, scene: A, at: A, plan: A):
-        y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
-        dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
-        stiffness, width = self.numbers(p, scene)
-        scale, radius, none = self.scale_of(kind, p, scene, plan), self.radius_of(p, scene), ti.cast(0, self.fp)
-        w, r = self.nearest_of(p, scene, y1, y2, y3)
-        h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp_at(
-            kind,
-            w,
-            r,
-            three(scene.inverse[p]),
-            y1,
-            y2,
-            y3,
-            dy1,
-            dy2,
-            dy3,
-            scale,
-            stiffness,
-            width,
-            radius,
-            none,
-            none,
-            none,
-        )
-        self.store(p, scene, h1, h2, h3)
-
-    @ti.func
-    def all_exact(self, scene: A, at: A, plan: A):
-        self.each_acting(self.product, scene, at, plan)
-        self.sum_acting(scene, at, plan)
+        if self.is_active(p, scene):
+            y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
+            dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
+            stiffness, width = self.numbers(p, scene)
+            scale, radius, none = self.scale_of(kind, p, scene, plan), self.radius_of(p, scene), ti.cast(0, self.fp)
+            w, r = self.nearest_of(p, scene, y1, y2, y3)
+            h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp(
+                kind,
+                w,
+                r,
+                three(scene.inverse[p]),
+                y1,
+                y2,
+                y3,
+                dy1,
+                dy2,
+                dy3,
+                scale,
+                stiffness,
+                width,
+                radius,
+                none,
+                none,
+                none,
+            )
+            self.store(p, scene, h1, h2, h3)
 
     @cached_property
     def products(self) -> Kernel:
         """Change of the forces for changes w of the positions."""
-        return self._on_acting("pair_products", self.all_exact, dict(u="vectors2", w="vectors2", out="vectors"))
+        at = dict(u="vectors2", w="vectors2", out="vectors")
+        return self.kernel("pair_products", self.all_products, at, ACTING)
 
     @ti.func
     def convex_product(self, kind: A, p, scene: A, at: A, plan: A):
-        y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
-        dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
-        w, n, k = self.stiffness_along(kind, p, y1, y2, y3, scene, plan)
-        pull = k * (w[1] * n.dot(dy1) + w[2] * n.dot(dy2) + w[3] * n.dot(dy3)) * n
-        self.store(p, scene, w[1] * pull, w[2] * pull, w[3] * pull)
+        if self.is_active(p, scene):
+            y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
+            dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
+            w, n, k = self.stiffness_along(kind, p, y1, y2, y3, scene, plan)
+            pull = k * (w[1] * n.dot(dy1) + w[2] * n.dot(dy2) + w[3] * n.dot(dy3)) * n
+            self.store(p, scene, w[1] * pull, w[2] * pull, w[3] * pull)
 
     @ti.func
     def all_convex(self, scene: A, at: A, plan: A):
-        self.each_acting(self.convex_product, scene, at, plan)
-        self.sum_acting(scene, at, plan)
+        self.each_pair(self.convex_product, scene, at, plan)
+        self.sum_corners(scene, at.out, plan)
 
     @cached_property
     def convex_products(self) -> Kernel:
         """The same of the convex part of the energy alone."""
-        return self._on_acting("convex_products", self.all_convex, dict(u="vectors2", w="vectors2", out="vectors"))
+        at = dict(u="vectors2", w="vectors2", out="vectors")
+        return self.kernel("convex_products", self.all_convex, at, ACTING)
 
     # ---- diagonal ----------------------------------------------------------------------------------------------------
 
     @ti.func
     def root(self, kind: A, p, scene: A, at: A, plan: A):
         """Of each corner, the vector c with c c^T its diagonal block of the convex part."""
-        y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
-        w, n, k = self.stiffness_along(kind, p, y1, y2, y3, scene, plan)
-        for a in ti.static(range(4)):
-            scene.corner[4 * p + a] = self.four(w[a] * ti.sqrt(k) * n)
+        if self.is_active(p, scene):
+            y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
+            w, n, k = self.stiffness_along(kind, p, y1, y2, y3, scene, plan)
+            for a in ti.static(range(4)):
+                scene.corner[4 * p + a] = self.four(w[a] * ti.sqrt(k) * n)
 
     @ti.func
     def add_blocks(self, scene: A, at: A, plan: A):
-        self.each_acting(self.root, scene, at, plan)
+        self.each_pair(self.root, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            x, y, z, k, end = self.vec4(0), self.vec4(0), self.vec4(0), scene.row[s], scene.row[s + 1]
-            while k < end:
-                corner = scene.acting_corner[k]
-                k += 1
-                if corner < 0:
-                    k = end
-                else:
-                    c = scene.corner[corner]
-                    x, y, z = x + c[0] * c, y + c[1] * c, z + c[2] * c
-            if plan.anew > 0:
-                at.out[0, scene.surface[s]], at.out[1, scene.surface[s]], at.out[2, scene.surface[s]] = x, y, z
-            else:
-                at.out[0, scene.surface[s]] += x
-                at.out[1, scene.surface[s]] += y
-                at.out[2, scene.surface[s]] += z
+            for d in ti.static(range(3)):
+                column = self.vec4(0)
+                for k in range(scene.row[s], scene.row[s + 1]):
+                    if scene.acting[k] < 0:
+                        break
+                    c = scene.corner[scene.acting[k]]
+                    column += c[d] * c
+                if plan.anew == 0:
+                    column += at.out[d, scene.surface[s]]
+                at.out[d, scene.surface[s]] = column
 
     @cached_property
     def blocks(self) -> Kernel:
         """Adds the 3x3 diagonal blocks of the convex part to rows 0..2 of `out`, one column of each vertex; or puts them
         there `anew`."""
-        return self._on_acting("pair_blocks", self.add_blocks, dict(u="vectors2", out="vectors2"), anew="int")
+        return self.kernel("pair_blocks", self.add_blocks, dict(u="vectors2", out="vectors2"), ACTING, anew="int")
 
     # ---- how far a step may go ---------------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import Parts
-from diffsim_ti.mechanics.surfaces.hessian_kernels import RUN, HessianKernels
+from diffsim_ti.mechanics.surfaces.hessian_kernels import HessianKernels
 from diffsim_ti.mechanics.surfaces.lagged_friction import LaggedFriction
 from diffsim_ti.mechanics.surfaces.listed_pair import SAFE
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs, Tunnelling
@@ -53,10 +53,9 @@ class ImplicitPairs(SurfacePairs):
     def build(self, u, slot: int, wanted=0.0, needed=0.0) -> None:
         super().build(u, slot, wanted, needed)
         count, take = self.list.count, self.list.buffers.take
-        self.acting, self.acting_corner = take("acting", ti.i32, count), take("acting corners", ti.i32, 4 * count)
-        self.share = take("shares", self.kernels.fp, count)
+        self.acting, self.share = take("acting", ti.i32, 4 * count), take("shares", self.kernels.fp, count)
         self.nearest, self.inverse = (take(name, self.kernels.vec4, count) for name in ("nearest", "inverses"))
-        self.sizes |= dict(num_runs=-(-count // RUN), lost=0.5 * self.least_width)
+        self.sizes["lost"] = 0.5 * self.least_width
         self.make_room()
 
     def make_room(self) -> None:

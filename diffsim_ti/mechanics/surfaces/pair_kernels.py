@@ -67,7 +67,7 @@ class PairKernels(ListedPair):
         if not d > ti.cast(MARGIN, self.fp) * width or plan.exact > 0:
             scale = self.scale_of(kind, p, scene, plan)
             w, r, g = self.nearest(kind, y1, y2, y3)
-            energy, n, d, g1, g2, g3 = self.gradient_at(kind, w, r, y1, y2, y3, scale, stiffness, width, radius)
+            energy, n, d, g1, g2, g3 = self.gradient(kind, w, r, y1, y2, y3, scale, stiffness, width, radius)
             if ti.static(self.keeps):
                 scene.nearest[p], scene.inverse[p] = w, self.four(g)
         scene.plane[p] = self.vec4(n[0], n[1], n[2], d)
@@ -122,8 +122,9 @@ class PairKernels(ListedPair):
             d_stiffness, d_width, d_radius = self.changes_of_numbers(p, scene, at, plan)
             dk, dw = self.numbers_jvp(p, scene, d_stiffness, d_width, d_rest)
             radius = self.radius_of(p, scene)
+            w, r, g = self.nearest(kind, y1, y2, y3)
             h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp(
-                kind, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, dk, dw, d_radius
+                kind, w, r, g, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, dk, dw, d_radius
             )
             by_k, by_W, by_D = self.numbers_vjp(p, scene, by_stiffness, by_width)
             numbers = self.vec4(0 - by_k, 0 - by_W, 0 - by_D, 0 - by_radius)  # the force is minus the gradient

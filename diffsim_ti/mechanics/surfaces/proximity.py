@@ -198,18 +198,11 @@ class Pair:
         return m, slope, curvature
 
     @ti.func
-    def gradient(self, kind: A, y1, y2, y3, scale, stiffness, width, radius):
-        """(energy, n, d, g1, g2, g3): gradient of the energy by corners 1 to 3; corner 0 balances them.
+    def gradient(self, kind: A, w, r, y1, y2, y3, scale, stiffness, width, radius):
+        """(energy, n, d, g1, g2, g3): gradient of the energy by corners 1 to 3; corner 0 balances them; w, r: `nearest`.
 
         d = |r| - radius, n = r / |r|. scale: 1 / sqrt(threshold of |a x b|^2), not used for vertex and triangle.
         """
-        w, r, g = self.nearest(kind, y1, y2, y3)
-        energy, n, d, g1, g2, g3 = self.gradient_at(kind, w, r, y1, y2, y3, scale, stiffness, width, radius)
-        return energy, n, d, g1, g2, g3
-
-    @ti.func
-    def gradient_at(self, kind: A, w, r, y1, y2, y3, scale, stiffness, width, radius):
-        """The same, what is nearest being known."""
         length = ti.sqrt(r.norm_sqr())
         d, n = length - radius, r / ti.max(length, ti.cast(self.tiny, self.fp))
         energy, g1, g2, g3 = ti.cast(0, self.fp), self.vec3(0), self.vec3(0), self.vec3(0)
@@ -230,18 +223,6 @@ class Pair:
 
     @ti.func
     def gradient_jvp(
-        self, kind: A, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, d_stiffness, d_width, d_radius
-    ):
-        """(h1, h2, h3, by_stiffness, by_width, by_radius): change of the gradient of corners 1 to 3 (0 balances them) for
-        changes of corners, stiffness, width and radius; and the products of dy with the gradient's derivatives by these."""
-        w, r, g = self.nearest(kind, y1, y2, y3)
-        h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp_at(
-            kind, w, r, g, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, d_stiffness, d_width, d_radius
-        )
-        return h1, h2, h3, by_stiffness, by_width, by_radius
-
-    @ti.func
-    def gradient_jvp_at(
         self,
         kind: A,
         w,
@@ -261,7 +242,8 @@ class Pair:
         d_width,
         d_radius,
     ):
-        """The same, what is nearest being known."""
+        """(h1, h2, h3, by_stiffness, by_width, by_radius): change of the gradient of corners 1 to 3 (0 balances them) for
+        changes of corners, stiffness, width and radius; and the products of dy with the gradient's derivatives by these."""
         length = ti.sqrt(r.norm_sqr())
         d = length - radius
         h1, h2, h3 = self.vec3(0), self.vec3(0), self.vec3(0)

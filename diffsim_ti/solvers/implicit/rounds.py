@@ -251,7 +251,7 @@ class Rounds:
             if phases[0] == nk.WAY:
                 self._shorten()
             elif phases[0] == nk.ASTRAY:
-                self.pairs.reach(self.potential.u)
+                self.pairs.reach(self.next)
                 self._set({nk.PHASE: nk.TRY})
             solves = nk.SOLVE in phases
             if solves and (odd := self._odd()).any():
