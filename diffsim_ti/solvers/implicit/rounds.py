@@ -368,6 +368,8 @@ class Rounds:
             direct(1, **numbers)
             if (self.potential.joints and self.contact) or (self.pairs and self.pairs.asks):
                 self._shorten()
+                if self.pairs:  # which may have other arrays now
+                    return
         if holds:
             holds(1, **numbers)
             self._receive()
