@@ -566,9 +566,11 @@ def _hangs(run: Run) -> str | None:
 
 @scene("mat on knives")
 def knives(meshes: Meshes) -> Posed:
-    """Nine single triangles on edge, whose slopes rise to one side and to the other in turn, above the ground. Newton's method
-    ends where that of the paper does, or a round or two later: there at steps below 0.01 l h [m], l the diagonal of the
-    scene."""
+    """Nine single triangles on edge, whose slopes rise to one side and to the other in turn, above the ground.
+
+    Newton's method ends where that of the paper does, or a round or two later: there at steps below 0.01 l h [m], l the
+    diagonal of the scene.
+    """
     up, down = ([[x, 0, z], [x, 1, z], [x, 0, -0.4 - z]] for x, z in ((0, -0.7), (0, 0.3)))
     corners = np.array([np.add(down if k % 2 else up, [0.1 * k, -0.1, 0]) for k in range(1, 10)])
     blades = Surface(corners.reshape(-1, 3), np.arange(27).reshape(9, 3))

@@ -66,10 +66,6 @@ class Potential:
         """Friction of surfaces on each other (mechanics/surfaces/lagged_friction.py); None without."""
         return self.pairs.friction if self.pairs else None
 
-    def _on_host(self) -> list:
-        """What acts on vertices from the host: host forces with an energy, and friction of surfaces."""
-        return [part for part in (self.hosts, self.surface_friction) if part]
-
     @property
     def _records(self) -> dict:
         return dict(scene=self.arrays, pass_=self, at=self, out=self)
@@ -112,11 +108,11 @@ class Potential:
         runtime.fill(self.u, u[None])
         return self.arrive()
 
-    def arrive(self, on_way: bool = False) -> np.ndarray:
-        """The same of a displacement that is on the device; on_way: of the last step whose safe share pairs said."""
+    def arrive(self, pairs: bool = True) -> np.ndarray:
+        """The same of a displacement that is on the device; pairs: theirs, too."""
         self.held_at = runtime.fetch_row(self.u, 0)
-        if self.pairs:
-            self.pairs.place(self.u, on_way)
+        if self.pairs and pairs:
+            self.pairs.place(self.u)
         if self.rigid:
             self.rigid.place(self.held_at)
         if self.joints:
@@ -170,23 +166,21 @@ class Potential:
         """(energy [J], J at each point)."""
         self.launch("energy", lanes=False)
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
-        return elastic.sum() + np.concatenate([contact, self.energies_beside()]).sum(), J
+        of_pairs = self.pairs.energies() if self.pairs else np.zeros(0)
+        return elastic.sum() + np.concatenate([contact, of_pairs, self.energies_beside()]).sum(), J
 
     def energies_beside(self) -> np.ndarray:
-        """Those of pairs, from the host and of joints [J]."""
-        own = [self.pairs.energies()] if self.pairs else []
-        own += [part.energies(self.held_at) for part in self._on_host()]
-        return np.concatenate([np.zeros(0), *own, *([self.joints.energies()] if self.joints else [])])
+        """Those from the host and of joints [J]."""
+        own = [part.energies() for part in (self.joints,) if part]
+        return np.concatenate([np.zeros(0), self.hosts.energies(self.held_at), *own])
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(forces -dE/du [N], sum of the sizes of the forces that meet at each vertex)."""
         if self.pairs:
-            self.pairs.forces(self.u, 0, self.arrays.corner)
+            self.pairs.launch(self.pairs.placing(self.u))
         self.launch("forces")
         forces, sizes = runtime.fetch_row(self.y, 0), runtime.fetch(self.size).astype(np.float64)
-        for part in self._on_host():
-            forces, sizes = forces + part.forces(self.held_at), sizes + part.sizes(self.held_at)
-        return forces, sizes
+        return forces + self.hosts.forces(self.held_at), sizes + self.hosts.sizes(self.held_at)
 
     def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
         """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
@@ -217,10 +211,9 @@ class Potential:
         a = self.arrays
         self.launch("blocks", out=self.block_arrays)
         if self.pairs:
-            self.pairs.add_blocks(self.u, self.block_arrays.blocks)
+            self.pairs.launch(self.pairs.adding_blocks(self.u, self.block_arrays.blocks))
         blocks = np.swapaxes(runtime.fetch(self.block_arrays.blocks).astype(np.float64), 0, 1)
-        for part in self._on_host():
-            blocks = blocks + part.blocks(self.held_at)
+        blocks = blocks + self.hosts.blocks(self.held_at)
         if a.points > 1:
             blocks = blocks + self._element_blocks()
         return blocks if a.patches is None else blocks + self.coupling.diagonal(self.patch_gradients())
@@ -298,7 +291,7 @@ class Potential:
 
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact and of host forces in `blocks`; None without."""
-        on_host = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None
+        on_host = self.hosts.blocks(self.held_at) if self.hosts else None
         if not (self.arrays.contacts or self.pairs):
             return on_host
         self._find_contact_blocks()
@@ -308,15 +301,15 @@ class Potential:
     def put_contact_blocks(self) -> None:
         """All of them, on the device."""
         self._find_contact_blocks()
-        for part in self._on_host():
-            blocks = np.swapaxes(part.blocks(self.held_at), 0, 1)
+        if self.hosts:
+            blocks = np.swapaxes(self.hosts.blocks(self.held_at), 0, 1)
             runtime.fill(self.barriers.blocks, runtime.fetch(self.barriers.blocks) + blocks)
 
     def _find_contact_blocks(self) -> None:
         """Those of obstacles at vertices and of pairs."""
         self.launch("contact_blocks", lanes=False, out=self.barriers)
         if self.pairs:
-            self.pairs.add_blocks(self.u, self.barriers.blocks)
+            self.pairs.launch(self.pairs.adding_blocks(self.u, self.barriers.blocks))
 
     def obstacle_blocks(self) -> np.ndarray:
         """The part of obstacles at vertices in `blocks`."""

@@ -86,7 +86,6 @@ class BoxKernels:
 
     precision: str
     parallel: bool
-    size: int
 
     fp, vector = number_type, vector_type
 
@@ -100,23 +99,23 @@ class BoxKernels:
         return scene.rest[i] + scene.u[plan.slot, i]
 
     @ti.func
-    def slack_of(self, p, scene: A, tree: A):
+    def slack_of(self, p, scene: A, tree: A, plan: A):
         """Largest slacks of the corners of primitive p, towards its own body and others, the number of the body, and what
         its reach is larger by."""
-        s = scene.place[tree.corners[self.size * p]]
+        s = scene.place[tree.corners[plan.size * p]]
         own, other = scene.slack[s][0], scene.slack[s][1]
-        for k in ti.static(range(1, self.size)):
-            slack = scene.slack[scene.place[tree.corners[self.size * p + k]]]
+        for k in range(1, plan.size):
+            slack = scene.slack[scene.place[tree.corners[plan.size * p + k]]]
             own, other = ti.max(own, slack[0]), ti.max(other, slack[1])
         return self.vector(own, other, ti.cast(scene.body[s], self.fp), scene.slack[s][2])
 
     @ti.func
     def box(self, p, scene: A, tree: A, plan: A):
         """Box of primitive p, widened by half the reach, its larger slack, and what rounding takes."""
-        lo, slack = self.at(tree.corners[self.size * p], scene, plan), tree.slacks[p]
+        lo, slack = self.at(tree.corners[plan.size * p], scene, plan), tree.slacks[p]
         hi = lo
-        for k in ti.static(range(1, self.size)):
-            x = self.at(tree.corners[self.size * p + k], scene, plan)
+        for k in range(1, plan.size):
+            x = self.at(tree.corners[plan.size * p + k], scene, plan)
             lo, hi = ti.min(lo, x), ti.max(hi, x)
         wide = ti.cast(MARGIN, self.fp) * (ti.cast(0.5, self.fp) * plan.reach + ti.max(slack[0], slack[1]) + slack[3])
         largest = ti.max(ti.abs(lo), ti.abs(hi))
@@ -131,7 +130,7 @@ class BoxKernels:
             low, high = self.vector(ti.cast(1e30, self.fp)), self.vector(ti.cast(-1e30, self.fp))
             for m in range(GROUP * k, ti.min(GROUP * (k + 1), plan.count)):
                 p = tree.order[m]
-                tree.slacks[p] = self.slack_of(p, scene, tree)
+                tree.slacks[p] = self.slack_of(p, scene, tree, plan)
                 lo, hi = self.box(p, scene, tree, plan)
                 tree.items[2 * m], tree.items[2 * m + 1] = lo, hi
                 low, high = ti.min(low, lo), ti.max(high, hi)
@@ -157,7 +156,7 @@ class BoxKernels:
     def refit(self) -> Kernel:
         """Slacks of primitives from those of vertices, and boxes of all nodes where the vertices are now."""
         scene = dict(rest="vectors", u="vectors2", place="ints", body="ints", slack="vectors")
-        numbers = dict.fromkeys(("slot", "count", "leaves", "subtrees", "roots"), "int") | dict(reach="float")
+        numbers = dict.fromkeys(("slot", "size", "count", "leaves", "subtrees", "roots"), "int") | dict(reach="float")
         return Kernel("refit", self.fit_boxes, self.precision, dict(scene=scene, tree=TREE), numbers)
 
 
@@ -169,7 +168,7 @@ class BoxTree:
     def __init__(self, corners: np.ndarray, precision: str, parallel: bool, launch):
         self.count, self.size = corners.shape
         self.launch, self._host = launch, corners
-        self.kernels = kernels_of(BoxKernels, precision, parallel, self.size)
+        self.kernels = kernels_of(BoxKernels, precision, parallel)
         self.groups = -(-self.count // GROUP)
         self.leaves = 1 << max(self.groups - 1, 1).bit_length()
         self.corners, self.order = runtime.upload(corners.ravel(), ti.i32), runtime.array(ti.i32, self.count)
@@ -198,4 +197,4 @@ class BoxTree:
         if not runtime.runs_on_cpu():
             subtrees = max(1, self.leaves // SUBTREES)
             roots = max(1, subtrees // SUBTREES)
-        return dict(count=self.count, leaves=self.leaves, subtrees=subtrees, roots=roots)
+        return dict(size=self.size, count=self.count, leaves=self.leaves, subtrees=subtrees, roots=roots)

@@ -13,6 +13,7 @@ from diffsim_ti.runtime import Kernel, kernels_of
 
 A = ti.template()
 BLOCK = 256  # numbers that one thread sums
+Parts = list[tuple]  # kernels to launch one after the other: (kernel, records, numbers)
 
 
 def branches(count: int) -> dict[str, int]:

@@ -15,40 +15,28 @@ class CurvedLaggedFriction:
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, presses: bool) -> None:
         """With obstacles where the pass begins; their corners have x = g - v / per_gamma, g where forces are taken."""
-        self.began = u, x, per_gamma, presses
-        self.given, there = 0.0, self.C @ x
+        self.began, self.x = (u, x, per_gamma, presses), self.C @ x
+        self.given, obstacles = np.zeros_like(self.x), self.pairs.obstacles
+        self.lost = obstacles.velocities() / per_gamma if obstacles else None
+        self.inner.begin(self.pairs.spread(u), self.x, per_gamma, presses)
+        self.follow()
+
+    def follow(self) -> None:
+        """Obstacles are elsewhere."""
         if self.pairs.obstacles:
-            obstacles, first = self.pairs.obstacles, self.pairs.finer.mesh.first
-            self.given = np.zeros_like(there)
-            self.given[first:] = obstacles.displacements_at(obstacles.rows)
-            there[first:] = self.given[first:] - obstacles.velocities() / per_gamma
-        self.inner.begin(self.pairs.spread(u), there, per_gamma, presses)
+            first = self.pairs.finer.mesh.first
+            self.given[first:] = self.pairs.obstacles.displacements
+            self.x[first:] = self.given[first:] - self.lost
+            self.inner.lag(self.x)
 
     def without(self):
         return self.inner.without()
 
-    def bounded(self, which):
-        return self.inner.bounded(which)
-
-    def turns(self, u: np.ndarray, there: np.ndarray) -> np.ndarray:
-        return self.inner.turns(self._fine(u), self._fine(there))
-
     def _fine(self, u: np.ndarray) -> np.ndarray:
         return self.C @ u + self.given
 
-    def energies(self, u: np.ndarray) -> np.ndarray:
-        return self.inner.energies(self._fine(u))
-
     def forces(self, u: np.ndarray, only: int | None = None) -> np.ndarray:
         return self.C.T @ self.inner.forces(self._fine(u), only)
-
-    def sizes(self, u: np.ndarray) -> np.ndarray:
-        return abs(self.C).T @ self.inner.sizes(self._fine(u))
-
-    def blocks(self, u: np.ndarray) -> np.ndarray:
-        """Those of points by squares of what nodes have of them."""
-        of_points = self.inner.blocks(self._fine(u))
-        return (self.C.power(2).T @ of_points.reshape(-1, 9)).reshape(-1, 3, 3)
 
     def jvp(self, u, du, dx, du_begin, numbers, poses_dot=None, only: int | None = None) -> np.ndarray:
         """poses_dot: changes of the rows of poses, None: zero."""

@@ -10,6 +10,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.buffers import Parts
 from diffsim_ti.mechanics.surfaces.curved_friction import CurvedLaggedFriction
 from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleMotion, SurfaceWithObstacles
@@ -155,6 +156,7 @@ class CurvedPairs:
         self.to_corners, self.num_corners = _rows(of_corners.tocsr(), fp), len(arrays.mesh.surface_vertices)
         self._u, self._w, self._blocks = (runtime.array(vector, k, surface.num_vertices) for k in (1, 1, 3))
         self._rest_dot = runtime.array(vector, surface.num_vertices)
+        self.inner.sizes["anew"] = 1
         # cleared where arrays of the list are others
         self._launch, self.launch = self.inner.list.launch, self.inner.launch
         self.friction = CurvedLaggedFriction(self) if self.inner.friction else None
@@ -181,7 +183,7 @@ class CurvedPairs:
             self.inner.begin(self.spread(u), self.matrix @ ahead)
             if friction and friction.began:
                 self.friction.begin(*friction.began)
-        self.obstacles.follow(obstacles.rows, obstacles.m)
+        self.follow(obstacles.rows, obstacles.m)
 
     def is_covered(self, *places: np.ndarray, to=None, anew: bool = False, more: float = 0.0) -> bool:
         """Whether they are there; which, where not, `nearby` knows then."""
@@ -244,6 +246,8 @@ class CurvedPairs:
         """Obstacles are where the rows number m of poses say (state/obstacle_poses.py)."""
         if self.obstacles:
             self.obstacles.follow(rows, m)
+            if self.friction and self.friction.began:
+                self.friction.follow()
 
     def _add_corners(self) -> None:
         """Add what the points' corners say of obstacles, to their adjoints."""
@@ -329,24 +333,47 @@ class CurvedPairs:
         if self.nearby:
             self._began = u.copy(), ahead.copy(), self.obstacles.rows.copy()
 
-    def place(self, u, on_way: bool = False) -> None:
-        fine = self.fine(u, 0) if on_way else self._covered(u)
-        self.inner.place(fine, on_way)
+    @property
+    def asks(self) -> bool:
+        """Whether others than those that are there may come near on the way of a step."""
+        return bool(self.nearby and self.nearby.many)
+
+    @property
+    def version(self) -> tuple:
+        return self.inner.version
+
+    def place(self, u) -> None:
+        self.inner.place(self._covered(u))
         self._gather(self.a.corner)
+
+    def reach(self, u) -> None:
+        self.inner.reach(self._covered(u))
+
+    def placing(self, u) -> Parts:
+        own = self.inner.placing(self._u)
+        return [self._refining(u, 0, self._u, "given"), *own, self._gathering(self.a.corner)]
 
     def energies(self) -> np.ndarray:
         return self.inner.energies()
 
-    def multiplying(self, u, w, convex: bool) -> tuple:
-        refining = self._refining(w, 0, self._w, "unmoved")
-        return refining, *self.inner.multiplying(self.fine(u, 0), self._w, convex), self._gathering(self.a.corner)
+    def holding(self, u, w) -> Parts:
+        there, step = self.inner.next, self.inner.step
+        refining = self._refining(u, 0, there, "given"), self._refining(w, 0, step, "unmoved")
+        return [*refining, *self.inner.holding(there, step)]
 
-    def add_blocks(self, u, out) -> None:
+    def turning(self, u, w) -> Parts:
+        step = self.inner.step
+        return [self._refining(w, 0, step, "unmoved"), *self.inner.turning(self._u, step)] if self.friction else []
+
+    def multiplying(self, u, w, convex: bool) -> Parts:
+        refining = self._refining(w, 0, self._w, "unmoved")
+        return [refining, *self.inner.multiplying(self.fine(u, 0), self._w, convex), self._gathering(self.a.corner)]
+
+    def adding_blocks(self, u, out) -> Parts:
         """Those of points by squares of what nodes have of them, without what two points of a node have in common."""
-        runtime.fill(self._blocks, 0)
-        self.inner.add_blocks(self.fine(u, 0), self._blocks)
         at = SimpleNamespace(source=self._blocks, target=out)
-        self._launch(self.kernels.add_blocks, rows=self.up, at=at)(count=self.a.num_vertices)
+        add = self.kernels.add_blocks, dict(rows=self.up, at=at), dict(count=self.a.num_vertices)
+        return [*self.inner.adding_blocks(self.fine(u, 0), self._blocks), add]
 
     def _step(self, step: np.ndarray, to) -> np.ndarray:
         return self.spread(

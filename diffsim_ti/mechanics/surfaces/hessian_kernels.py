@@ -1,7 +1,7 @@
-"""Kernels over the pairs of a surface for Newton's method: the Hessian's convex part, and safe shares of a step.
+"""Kernels over the pairs of a surface for Newton's method: forces, the Hessian and its convex part, safe shares of a step.
 
-They read the planes that `forces` (pair_kernels.py) left at the same displacement: a pair that its plane keeps beyond the
-width has no part in the Hessian.
+A list has many more pairs than are nearer than their width. `place` says which these are, and all else reads what it left
+at the same displacement.
 """
 
 from dataclasses import dataclass
@@ -10,23 +10,76 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, SAFE, ListedPair, between, three
+from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, kernels_of
 from diffsim_ti.terms.obstacles import barrier
 
 A = ti.template()
 MOST_PLANES = 50  # that part a pair on its way
+ACTING = dict(acting="ints", nearest="vectors", inverse="vectors")
 
 
 @dataclass(frozen=True)
 class HessianKernels(ListedPair):
-    """Products and diagonal of the convex part of the Hessian at u[slot]."""
+    """Forces at u[slot], and products and diagonals of the Hessian there.
+
+    acting: of each row of `corner_of` those of pairs that are nearer than the width, then -1; nearest, inverse: of these
+    pairs the weights of the corners, and G (proximity.py).
+    """
+
+    @cached_property
+    def pair(self) -> PairKernels:
+        return kernels_of(PairKernels, self.precision, self.first, self.parallel, True)
+
+    @ti.func
+    def nearest_of(self, p, scene: A, y1, y2, y3):
+        """(weights of the corners, r) that `place` has found of pair p."""
+        w = scene.nearest[p]
+        return w, w[1] * y1 + w[2] * y2 + w[3] * y3
+
+    # ---- forces ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def place_all(self, scene: A, at: A, plan: A):
+        self.each_pair(self.pair.force, scene, at, plan)
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
+            total, k, end = self.vec4(0), scene.row[s], scene.row[s + 1]
+            if scene.touched[s] > 0:
+                scene.touched[s] = 0
+                for m in range(scene.row[s], end):
+                    corner = scene.corner_of[m]
+                    if self.is_active(corner >> 2, scene):
+                        total += scene.corner[corner]
+                        scene.acting[k] = corner
+                        k += 1
+            if k < end:
+                scene.acting[k] = -1
+            at.out[plan.first_out + s] = total
+
+    @cached_property
+    def place(self) -> Kernel:
+        """As `forces` of PairKernels; and which corners are of pairs that act."""
+        own = ACTING | dict(energy="scalars", touched="ints")
+        return self.kernel("place", self.place_all, dict(u="vectors2", out="vectors"), own, exact="int")
+
+    @ti.func
+    def sum_corners(self, scene: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
+            total = self.vec4(0)
+            for k in range(scene.row[s], scene.row[s + 1]):
+                if scene.acting[k] < 0:
+                    break
+                total += scene.corner[scene.acting[k]]
+            out[plan.first_out + s] = total
 
     @ti.func
     def stiffness_along(self, kind: A, p, y1, y2, y3, scene: A, plan: A):
         """(weights of the corners, n, m phi''): the convex part of a pair's Hessian is m phi'' (w n)(w n)^T."""
         stiffness, width = self.numbers(p, scene)
-        w, r, _ = self.nearest(kind, y1, y2, y3)
+        w, r = self.nearest_of(p, scene, y1, y2, y3)
         length, k = ti.sqrt(r.norm_sqr()), ti.cast(0, self.fp)
         d = length - self.radius_of(p, scene)
         if d < width:
@@ -40,34 +93,69 @@ class HessianKernels(ListedPair):
 
     @ti.func
     def product(self, kind: A, p, scene: A, at: A, plan: A):
-        h1, h2, h3 = self.vec3(0), self.vec3(0), self.vec3(0)
+        if self.is_active(p, scene):
+            y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
+            dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
+            stiffness, width = self.numbers(p, scene)
+            scale, radius, none = self.scale_of(kind, p, scene, plan), self.radius_of(p, scene), ti.cast(0, self.fp)
+            w, r = self.nearest_of(p, scene, y1, y2, y3)
+            h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp(
+                kind,
+                w,
+                r,
+                three(scene.inverse[p]),
+                y1,
+                y2,
+                y3,
+                dy1,
+                dy2,
+                dy3,
+                scale,
+                stiffness,
+                width,
+                radius,
+                none,
+                none,
+                none,
+            )
+            self.store(p, scene, h1, h2, h3)
+
+    @cached_property
+    def products(self) -> Kernel:
+        """Change of the forces for changes w of the positions."""
+        at = dict(u="vectors2", w="vectors2", out="vectors")
+        return self.kernel("pair_products", self.all_products, at, ACTING)
+
+    @ti.func
+    def convex_product(self, kind: A, p, scene: A, at: A, plan: A):
         if self.is_active(p, scene):
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
             w, n, k = self.stiffness_along(kind, p, y1, y2, y3, scene, plan)
             pull = k * (w[1] * n.dot(dy1) + w[2] * n.dot(dy2) + w[3] * n.dot(dy3)) * n
-            h1, h2, h3 = w[1] * pull, w[2] * pull, w[3] * pull
-        self.store(p, scene, h1, h2, h3)
+            self.store(p, scene, w[1] * pull, w[2] * pull, w[3] * pull)
+
+    @ti.func
+    def all_convex(self, scene: A, at: A, plan: A):
+        self.each_pair(self.convex_product, scene, at, plan)
+        self.sum_corners(scene, at.out, plan)
 
     @cached_property
-    def products(self) -> Kernel:
-        """Change of the forces for changes w of the positions, of the convex part of the energy alone."""
+    def convex_products(self) -> Kernel:
+        """The same of the convex part of the energy alone."""
         at = dict(u="vectors2", w="vectors2", out="vectors")
-        return self.kernel("convex_products", self.all_products, at)
+        return self.kernel("convex_products", self.all_convex, at, ACTING)
 
     # ---- diagonal ----------------------------------------------------------------------------------------------------
 
     @ti.func
     def root(self, kind: A, p, scene: A, at: A, plan: A):
         """Of each corner, the vector c with c c^T its diagonal block of the convex part."""
-        c = (self.vec4(0), self.vec4(0), self.vec4(0), self.vec4(0))
         if self.is_active(p, scene):
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             w, n, k = self.stiffness_along(kind, p, y1, y2, y3, scene, plan)
             for a in ti.static(range(4)):
-                c[a] += self.four(w[a] * ti.sqrt(k) * n)
-        for a in ti.static(range(4)):
-            scene.corner[4 * p + a] = c[a]
+                scene.corner[4 * p + a] = self.four(w[a] * ti.sqrt(k) * n)
 
     @ti.func
     def add_blocks(self, scene: A, at: A, plan: A):
@@ -77,14 +165,19 @@ class HessianKernels(ListedPair):
             for d in ti.static(range(3)):
                 column = self.vec4(0)
                 for k in range(scene.row[s], scene.row[s + 1]):
-                    c = scene.corner[scene.corner_of[k]]
+                    if scene.acting[k] < 0:
+                        break
+                    c = scene.corner[scene.acting[k]]
                     column += c[d] * c
-                at.out[d, scene.surface[s]] += column
+                if plan.anew == 0:
+                    column += at.out[d, scene.surface[s]]
+                at.out[d, scene.surface[s]] = column
 
     @cached_property
     def blocks(self) -> Kernel:
-        """Adds the 3x3 diagonal blocks of the convex part to rows 0..2 of `out`, one column of each vertex."""
-        return self.kernel("blocks", self.add_blocks, dict(u="vectors2", out="vectors2"))
+        """Adds the 3x3 diagonal blocks of the convex part to rows 0..2 of `out`, one column of each vertex; or puts them
+        there `anew`."""
+        return self.kernel("pair_blocks", self.add_blocks, dict(u="vectors2", out="vectors2"), ACTING, anew="int")
 
     # ---- how far a step may go ---------------------------------------------------------------------------------------
 
@@ -98,14 +191,37 @@ class HessianKernels(ListedPair):
         return closing
 
     @ti.func
+    def flag(self, kind: A, p, scene: A, at: A, plan: A):
+        if not self.first_share(kind, p, scene, at) >= plan.most:
+            scene.flags[2] = 1
+
+    @ti.func
+    def flag_all(self, scene: A, at: A, plan: A):
+        self.each_pair(self.flag, scene, at, plan)
+
+    @cached_property
+    def clear(self) -> Kernel:
+        """flags[2]: some pair is not kept apart by its plane, from where `place` has been, on all of the step w."""
+        return self.kernel("clear", self.flag_all, dict(w="vectors2"), dict(flags="ints"), most="float")
+
+    @ti.func
+    def first_share(self, kind: A, p, scene: A, at: A):
+        """The share of the step w up to which the plane of a pair keeps as much of its gap as `share` says."""
+        plane = scene.plane[p]
+        return (plane[3] - self.least_gap(p, scene)) / self.closing(kind, three(plane), p, scene, at)
+
+    @ti.func
+    def least_gap(self, p, scene: A):
+        half = ti.cast(0.5, self.fp) * self.width(p, scene)
+        return ti.min(ti.cast(1 - SAFE, self.fp) * scene.plane[p][3], half)
+
+    @ti.func
     def share(self, kind: A, p, scene: A, at: A, plan: A):
         """The share of the step w, if below `most`, after which the pair has closed all but 1 - SAFE of its gap, or half of
-        the width if that is less, and half as much again, to out: planes that part it on the way say how far it may go on.
+        the width if that is less, and half as much again: planes that part it on the way say how far it may go on.
         Li, Kaufman, Jiang 2021, Codimensional Incremental Potential Contact, doi:10.1145/3450626.3459767, algorithm 1."""
-        plane, one = scene.plane[p], ti.cast(1, self.fp)
-        radius, half = self.radius_of(p, scene), ti.cast(0.5, self.fp) * self.width(p, scene)
-        least = ti.min(ti.cast(1 - SAFE, self.fp) * plane[3], half)
-        share = (plane[3] - least) / self.closing(kind, three(plane), p, scene, at)
+        one, radius, least = ti.cast(1, self.fp), self.radius_of(p, scene), self.least_gap(p, scene)
+        share = self.first_share(kind, p, scene, at)
         goes_on = share < plan.most
         if goes_on:
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
@@ -119,7 +235,7 @@ class HessianKernels(ListedPair):
                     if goes_on:
                         share += room / self.closing(kind, (one / length) * r, p, scene, at)
                         goes_on = share < plan.most
-        at.out[p] = share
+        scene.share[p] = share
 
     @ti.func
     def all_shares(self, scene: A, at: A, plan: A):
@@ -127,4 +243,6 @@ class HessianKernels(ListedPair):
 
     @cached_property
     def shares(self) -> Kernel:
-        return self.kernel("shares", self.all_shares, dict(u="vectors2", w="vectors2", out="scalars"), most="float")
+        """`share` of every pair, from where `place` has been."""
+        at = dict(u="vectors2", w="vectors2")
+        return self.kernel("shares", self.all_shares, at, dict(share="scalars"), most="float")

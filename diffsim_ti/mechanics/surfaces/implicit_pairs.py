@@ -1,15 +1,13 @@
 """Contact of a surface with itself in implicit solvers: Hessian, and how far a step may go."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.surfaces.buffers import put, whole
+from diffsim_ti.mechanics.surfaces.buffers import Parts
 from diffsim_ti.mechanics.surfaces.hessian_kernels import HessianKernels
 from diffsim_ti.mechanics.surfaces.lagged_friction import LaggedFriction
-from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, SAFE
+from diffsim_ti.mechanics.surfaces.listed_pair import SAFE
 from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs, Tunnelling
 from diffsim_ti.runtime import kernels_of
 
@@ -18,21 +16,51 @@ class ImplicitPairs(SurfacePairs):
     """Pairs of a scene in Newton's method, where displacements come in tries, not in passes.
 
     After `place`, the list, the planes, the energies and the last corners of `arrays.corner` are those of that place.
-    Products and diagonals go over the pairs alone that are nearer there than their width, in order: a list has many more.
+    Lists of (kernel, records, numbers) are for rounds of Newton's method (solvers/implicit/rounds.py), too, and hold good
+    until `version` is another; numbers follow the list.
     """
 
     friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
+    least_slack = 0.5  # lists are then seldom made anew within a pass
     blocked: np.ndarray | None = None  # corners of the pair that stopped the last march
     _ahead: np.ndarray | float = 0.0  # how far vertices are expected to go in a pass [m]
-    _holds_on_way = False  # whether the list holds on all of the last step that was asked for its safe share
+    asks = False  # whether the host has to look at the way of a step
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)
         self.hessian = kernels_of(HessianKernels, arrays.precision, self.first, parallel)
+        self.forces_kernel = self.hessian.place
         self.step = runtime.array(self.kernels.vec4, 1, arrays.num_vertices)
         self.next = runtime.array(self.kernels.vec4, 1, arrays.num_vertices)
-        self._places, self._acting = runtime.fetch(self.list.place), None
+        self.sizes |= dict(slot=0, exact=0, most=1.0, anew=0, **self.sizes_of_motion)
+
+    @property
+    def inner(self) -> "ImplicitPairs":
+        """What has the list (curved_pairs.py)."""
+        return self
+
+    @property
+    def version(self) -> tuple:
+        """Of the arrays."""
+        return self.list, self.list.buffers.renewals
+
+    @property
+    def num_energies(self) -> int:
+        """Of `energy`: those of pairs, and of friction behind them."""
+        return self.list.count + (self.friction.count if self.friction else 0)
+
+    def build(self, u, slot: int, wanted=0.0, needed=0.0) -> None:
+        super().build(u, slot, wanted, needed)
+        count, take = self.list.count, self.list.buffers.take
+        self.acting, self.share = take("acting", ti.i32, 4 * count), take("shares", self.kernels.fp, count)
+        self.nearest, self.inverse = (take(name, self.kernels.vec4, count) for name in ("nearest", "inverses"))
+        self.sizes["lost"] = 0.5 * self.least_width
+        self.make_room()
+
+    def make_room(self) -> None:
+        """For the energies of friction."""
+        self.energy = self.list.buffers.take("energies", self.kernels.fp, self.num_energies)
 
     def begin(self, u: np.ndarray, ahead: np.ndarray | None = None) -> None:
         """A new pass from u: from here on all is a function of u, and of how far `ahead` [m] it is expected to go, whatever
@@ -43,62 +71,47 @@ class ImplicitPairs(SurfacePairs):
         runtime.fill(self.next, u[None])
         self.build(self.next, 0, wanted=self._ahead)
 
-    def place(self, u, on_way: bool = False) -> None:
-        """Go to the displacements u[0]; on_way: of the last step that was asked for its safe share."""
-        if not (on_way and self._holds_on_way):
-            self.ensure(u, 0)
-        self.forces(u, 0, self.a.corner)
-        self._acting = None
+    def place(self, u) -> None:
+        """Go to the displacements u[0]."""
         if self.friction:
-            self.friction.leave()
+            self.friction.settle()
+        self.reach(u)
+        self.launch(self.placing(u))
 
-    def _of_acting(self) -> tuple[SimpleNamespace, dict]:
-        """What takes the place of the list in kernels, with their numbers: the pairs that act where `place` has been."""
-        if self._acting is None:
-            k, count = self.list, self.list.count
-            gaps, at_rest = (whole(x)[:count, 3] for x in (self.plane, self.rest_plane))
-            widest = self.contacts.widths.max() if self.kinematic else self.width
-            own = np.flatnonzero(gaps <= MARGIN * np.minimum(widest, 0.5 * at_rest))
-            corners, num_vt = whole(k.pairs)[: 4 * count].reshape(-1, 4)[own], int(np.searchsorted(own, k.num_vt))
-            meets = self._places[corners.ravel()]
-            counts = np.bincount(meets, minlength=k.num_surface)
-            parts = dict(
-                pairs=(ti.i32, corners.ravel()),
-                row=(ti.i32, np.concatenate([[0], np.cumsum(counts)])),
-                corner_of=(ti.i32, np.argsort(meets, kind="stable")),
-                scale=(self.kernels.fp, whole(k.scale)[own[num_vt:] - k.num_vt]),
-                plane=(self.kernels.vec4, whole(self.plane)[own]),
-                rest_plane=(self.kernels.vec4, whole(self.rest_plane)[own]),
-            )
-            if self.kinematic:
-                parts["area"] = self.kernels.fp, whole(k.area)[own]
-            arrays = {name: k.buffers.take(f"acting {name}", kind, len(x)) for name, (kind, x) in parts.items()}
-            for name, (_, x) in parts.items():
-                put(arrays[name], x)
-            self._acting = SimpleNamespace(**arrays), dict(num_vt=num_vt, num_pairs=len(own))
-        return self._acting
+    def reach(self, u) -> None:
+        """Have a list that holds at u[0]."""
+        self.ensure(u, 0)
 
-    def _of_those_acting(self, kernel, at: dict, **numbers) -> tuple:
-        """A kernel of pairs on those that act."""
-        acting, sizes = self._of_acting()
-        return self.prepared(kernel, at, acting, slot=0, **numbers, **sizes)
+    def placing(self, u) -> Parts:
+        """What finds energies and forces of contact and friction at u[0], where the list holds."""
+        own = [self.prepared(self.hessian.place, dict(u=u, out=self.a.corner))]
+        return own + (self.friction.measuring(u) if self.friction else [])
 
     def energies(self) -> np.ndarray:
-        """Energy of each pair [J]."""
-        return runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
+        """Of each pair, and of each pair's friction [J]."""
+        return runtime.fetch(self.energy)[: self.num_energies].astype(np.float64)
 
-    def multiplying(self, u, w, convex: bool) -> list[tuple]:
+    def holding(self, u, w) -> Parts:
+        """What finds whether the list holds at u[0], else flags[0] is 1; and whether planes keep all pairs apart on the step
+        w[0] from where `place` has been, else flags[2] is 1."""
+        return [self.prepared(self.motion.holds, dict(u=u)), self.prepared(self.hessian.clear, dict(w=w))]
+
+    def turning(self, u, w) -> Parts:
+        """What finds which friction a step w[0] from u[0] turns round."""
+        return self.friction.turning(u, w) if self.friction else []
+
+    def multiplying(self, u, w, convex: bool) -> Parts:
         """Change of the forces of contact and friction for changes w[0] of the positions, to the last corners of
-        `arrays.corner`, as [(kernel, records, numbers)]; convex: the convex part of contact alone."""
-        kernel, at, numbers = self.hessian.products, dict(u=u, w=w, out=self.a.corner), {}
-        if not convex:
-            kernel, (at, numbers) = self.kernels.products, self._of_product(u, w, self.a.corner, has_planes=True)
-        friction = self.friction.multiplying(u, w, self.a.corner) if self.friction else []
-        return [self._of_those_acting(kernel, at, **numbers), *friction]
+        `arrays.corner`; convex: the convex part of contact alone."""
+        kernel = self.hessian.convex_products if convex else self.hessian.products
+        friction = self.friction.multiplying(w) if self.friction else []
+        return [self.prepared(kernel, dict(u=u, w=w, out=self.a.corner)), *friction]
 
-    def add_blocks(self, u, out) -> None:
-        """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (mechanics/energy/kernels.py)."""
-        self.launch([self._of_those_acting(self.hessian.blocks, dict(u=u, out=out))])
+    def adding_blocks(self, u, out) -> Parts:
+        """What adds the diagonal blocks of the Hessian's convex part and of friction's to rows 0..2 of `out`
+        (mechanics/energy/kernels.py); where sizes say `anew`, puts them there."""
+        friction = self.friction.adding_blocks(out) if self.friction else []
+        return [self.prepared(self.hessian.blocks, dict(u=u, out=out)), *friction]
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, placed: bool = False) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the
@@ -110,8 +123,15 @@ class ImplicitPairs(SurfacePairs):
         runtime.fill(self.step, step[None])
         share, self.blocked, holds = 0.0, None, self._holds(u + most * step)
         here = self._holds(u)
-        self._holds_on_way = holds = holds and here
+        holds = holds and here
         placed = placed and holds
+        if holds:  # `next` is at u
+            if not placed:
+                self.forces(self.next, 0, self.a.corner, exact=True)
+            self.run(self.hessian.clear, dict(w=self.step), most=most)
+            if not runtime.look(self.flags)[2]:
+                return most
+            placed = True
         for _ in range(self.longest_march):
             unlisted, old = np.inf, here and not holds
             if not holds:
@@ -143,9 +163,8 @@ class ImplicitPairs(SurfacePairs):
 
     def _shares(self, most: float) -> np.ndarray:
         """Of the step from `next` on, of each pair, where `forces` were exact."""
-        out = self.list.buffers.take("shares", self.kernels.fp, self.list.count)
-        self.run(self.hessian.shares, dict(u=self.next, w=self.step, out=out), slot=0, most=most)
-        return runtime.fetch(out)[: self.list.count].astype(np.float64)
+        self.run(self.hessian.shares, dict(u=self.next, w=self.step), slot=0, most=most)
+        return runtime.fetch(self.share)[: self.list.count].astype(np.float64)
 
     def is_collision_free(self, u: np.ndarray, step: np.ndarray) -> bool:
         """Whether no two primitives meet on the motion from u to u + step; narrow gaps may pass for closed."""

@@ -7,11 +7,11 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.surfaces.buffers import whole
+from diffsim_ti.mechanics.surfaces.buffers import Parts, put, whole
 from diffsim_ti.mechanics.surfaces.friction_kernels import FrictionKernels
 from diffsim_ti.mechanics.surfaces.friction_product import FrictionProduct
 from diffsim_ti.runtime import kernels_of
-from diffsim_ti.terms.obstacles.friction import ARRAYS, dissipated, slip
+from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
 from diffsim_ti.terms.self_contact import SelfContact
 
 TINY = 1e-300
@@ -41,8 +41,7 @@ class LaggedFriction:
         self.L, self.x, self.per_gamma = np.zeros(0), np.zeros((self.a.num_vertices, 3)), 1.0
         self.by_speed, self.u_begin = np.zeros(len(self.speeds_at)), None
         self.contact = np.zeros(0, int)  # its number of each pair
-        self._product, self._is_put = FrictionProduct(pairs), False
-        self._bounded = False  # of each pair whether its stiffness is that of `bounded`
+        self._product, self._at = FrictionProduct(pairs), None  # where forces were last found
 
     def take(self, *names: str, scalar: bool = False) -> None:
         """Arrays of all pairs of the list, by name."""
@@ -52,7 +51,7 @@ class LaggedFriction:
 
     def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, presses: bool) -> None:
         """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above; presses: whether anything does there."""
-        self.u_begin, self.x, self.per_gamma = u, x, per_gamma
+        self.u_begin, self.per_gamma = u, per_gamma
         self._measure_here()
         pressing, count = whole(self.own.pressing), self.pairs.list.count
         self.pressed = pressed = np.flatnonzero(presses & (pressing[:count, 3] > 0))
@@ -61,39 +60,38 @@ class LaggedFriction:
         self.n, self.L = pressing[:, :3], pressing[:, 3]
         surface = self.pairs.kinematic
         self.contact = surface.numbers[self.corners[:, [0, 2]]].max(1) if surface else np.zeros(len(pressed), int)
-        self._product.begin(self.corners, self.w)
-        self._is_put = False
+        self._product.begin(self.corners, self.w, pressing, self.speed, per_gamma)
+        self.pairs.make_room()
+        self.lag(x)
 
-    def leave(self) -> None:
-        """The displacement changes: so does the stiffness."""
-        self._is_put = False
+    def lag(self, x: np.ndarray) -> None:
+        """Velocities are measured from x."""
+        self.x = x
+        runtime.fill(self._product.of.origin, x)
 
-    def turns(self, u: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Whether each pair slides at u, and there the other way or so much slower that its stiffness at u, which is none
-        along the motion, says little of the way."""
-        t, after = self._sliding(u)[2], self._sliding(there)[2]
-        square = (t * t).sum(1)
-        return (square > (0.5 * self.speed) ** 2) & ((t * after).sum(1) < 0.3 * square)
+    @property
+    def count(self) -> int:
+        """Of pairs that press."""
+        return len(self.corners)
 
-    @contextmanager
-    def bounded(self, which):
-        """The stiffness of some pairs is that of a paraboloid above their energy, which touches it at u: f / |t| across n.
-        Directions then go too far less often. Lange, Hunter, Yang 2000, Optimization Transfer Using Surrogate Objective
-        Functions, doi:10.1080/10618600.2000.10474858."""
-        self._bounded, self._is_put = which, False
-        try:
-            yield
-        finally:
-            self._bounded, self._is_put = False, False
+    def settle(self) -> None:
+        """No friction is turned round."""
+        runtime.fill(self._product.of.turned, 0)
 
     @contextmanager
     def without(self):
         """As if nothing pressed."""
-        self.L, pressing, self._is_put = np.zeros_like(self.L), self.L, False
         try:
+            self._press(0 * self.L)
             yield
         finally:
-            self.L, self._is_put = pressing, False
+            self._press(self.L)
+
+    def _press(self, load: np.ndarray) -> None:
+        """With other mu N, where forces were last found."""
+        put(self._product.of.pressing, np.column_stack([self.n, load]))
+        if self._at is not None:
+            self.pairs.launch(self.pairs.placing(self._at))
 
     def _measure_here(self) -> None:
         pairs = self.pairs
@@ -127,10 +125,6 @@ class LaggedFriction:
         """Pairs of a contact, or all."""
         return slice(None) if only is None else self.contact == only
 
-    def energies(self, u: np.ndarray) -> np.ndarray:
-        """Of each pair [J]: what sliding so would dissipate."""
-        return self.L / self.per_gamma * dissipated(self._sliding(u)[3], self.speed, ARRAYS)
-
     def _pulls(self, u: np.ndarray) -> np.ndarray:
         _, _, t, _, _, kappa, _ = self._sliding(u)
         return (-self.L * kappa)[:, None] * t
@@ -139,29 +133,21 @@ class LaggedFriction:
         """[N]; only: of the pairs of one contact."""
         return self._scatter(self.w[:, :, None] * self._pulls(u)[:, None], only)
 
-    def sizes(self, u: np.ndarray) -> np.ndarray:
-        """Sum of the sizes of the forces that meet at each vertex [N]."""
-        return self._scatter(np.abs(self.w) * np.linalg.norm(self._pulls(u), axis=1)[:, None])
+    # ---- in kernels (friction_product.py), as of ImplicitPairs -------------------------------------------------------
 
-    def _stiffness(self, u: np.ndarray) -> np.ndarray:
-        """The matrix L d(f t / |t|) / dt / gamma of each pair [N/m]."""
-        _, _, _, _, e, kappa, slope = self._sliding(u)
-        out = kappa[:, None, None] * (np.eye(3) - self.n[:, :, None] * self.n[:, None])
-        out += np.where(self._bounded, 0.0, slope - kappa)[:, None, None] * e[:, :, None] * e[:, None]
-        return (self.per_gamma * self.L)[:, None, None] * out
+    def measuring(self, u) -> Parts:
+        self._at = u
+        own = self._product
+        return own.part(own.kernels.measure, u=u, out=self.a.corner, energy=self.pairs.energy)
 
-    def multiplying(self, u, w, out) -> list[tuple]:
-        """What adds the change of the forces at u[0] for changes w[0] of the positions to the last corners of `out`."""
-        if not (self._product.count or self._product.always):
-            return []
-        if not self._is_put:
-            self._product.put(self._stiffness(runtime.fetch_row(u, 0)))
-            self._is_put = True
-        return [self._product.part(w, out)]
+    def turning(self, u, w) -> Parts:
+        return self._product.part(self._product.kernels.compare, u=u, w=w)
 
-    def blocks(self, u: np.ndarray) -> np.ndarray:
-        """3x3 diagonal blocks of d2E/du2 [N/m]."""
-        return self._scatter((self.w**2)[:, :, None, None] * self._stiffness(u)[:, None])
+    def multiplying(self, w) -> Parts:
+        return self._product.part(self._product.kernels.products, w=w, out=self.a.corner)
+
+    def adding_blocks(self, out) -> Parts:
+        return self._product.part(self._product.kernels.blocks, out=out)
 
     # ---- derivatives -------------------------------------------------------------------------------------------------
 

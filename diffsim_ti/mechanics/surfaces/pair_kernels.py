@@ -17,7 +17,12 @@ A = ti.template()
 
 @dataclass(frozen=True)
 class PairKernels(ListedPair):
-    """Forces at u[slot], products of their derivatives, and adjoints of stiffness, width and rest shape."""
+    """Forces at u[slot], products of their derivatives, and adjoints of stiffness, width and rest shape.
+
+    keeps: whether forces leave the weights of what is nearest, and G (proximity.py).
+    """
+
+    keeps: bool = False
 
     # ---- planes that part pairs --------------------------------------------------------------------------------------
 
@@ -61,7 +66,10 @@ class PairKernels(ListedPair):
         # the plane of the pass before spares most pairs the search; the margin is for rounding
         if not d > ti.cast(MARGIN, self.fp) * width or plan.exact > 0:
             scale = self.scale_of(kind, p, scene, plan)
-            energy, n, d, g1, g2, g3 = self.gradient(kind, y1, y2, y3, scale, stiffness, width, radius)
+            w, r, g = self.nearest(kind, y1, y2, y3)
+            energy, n, d, g1, g2, g3 = self.gradient(kind, w, r, y1, y2, y3, scale, stiffness, width, radius)
+            if ti.static(self.keeps):
+                scene.nearest[p], scene.inverse[p] = w, self.four(g)
         scene.plane[p] = self.vec4(n[0], n[1], n[2], d)
         scene.energy[p] = energy
         if not d > width:
@@ -97,9 +105,9 @@ class PairKernels(ListedPair):
     @ti.func
     def product(self, kind: A, p, scene: A, at: A, plan: A):
         h1, h2, h3, numbers = self.vec3(0), self.vec3(0), self.vec3(0), self.vec4(0)
-        wanted = plan.has_planes == 0 or self.is_active(p, scene)
+        wanted = True
         if ti.static(self.mixed):
-            wanted = wanted and (plan.only < 0 or plan.only == self.contact_of(p, scene))
+            wanted = plan.only < 0 or plan.only == self.contact_of(p, scene)
         if wanted:
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
@@ -114,8 +122,9 @@ class PairKernels(ListedPair):
             d_stiffness, d_width, d_radius = self.changes_of_numbers(p, scene, at, plan)
             dk, dw = self.numbers_jvp(p, scene, d_stiffness, d_width, d_rest)
             radius = self.radius_of(p, scene)
+            w, r, g = self.nearest(kind, y1, y2, y3)
             h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp(
-                kind, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, dk, dw, d_radius
+                kind, w, r, g, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, dk, dw, d_radius
             )
             by_k, by_W, by_D = self.numbers_vjp(p, scene, by_stiffness, by_width)
             numbers = self.vec4(0 - by_k, 0 - by_W, 0 - by_D, 0 - by_radius)  # the force is minus the gradient
@@ -133,13 +142,10 @@ class PairKernels(ListedPair):
 
     @cached_property
     def products(self) -> Kernel:
-        """Change of the forces for changes w of the positions (and of rest shape, stiffness and width).
-
-        has_planes: the planes are those of `forces` at the same place, and spare pairs beyond the width the work.
-        """
+        """Change of the forces for changes w of the positions (and of rest shape, stiffness and width)."""
         at = dict(u="vectors2", w="vectors2", rest_dot="vectors", out="vectors")
         at |= dict(numbers_dot="vectors") if self.mixed else {}
-        numbers = dict(by_rest="int", has_planes="int", d_stiffness="float", d_width="float")
+        numbers = dict(by_rest="int", d_stiffness="float", d_width="float")
         numbers |= dict(only="int") if self.mixed else {}
         return self.kernel("products", self.all_products, at, dict(numbers="vectors"), **numbers)
 

@@ -198,12 +198,11 @@ class Pair:
         return m, slope, curvature
 
     @ti.func
-    def gradient(self, kind: A, y1, y2, y3, scale, stiffness, width, radius):
-        """(energy, n, d, g1, g2, g3): gradient of the energy by corners 1 to 3; corner 0 balances them.
+    def gradient(self, kind: A, w, r, y1, y2, y3, scale, stiffness, width, radius):
+        """(energy, n, d, g1, g2, g3): gradient of the energy by corners 1 to 3; corner 0 balances them; w, r: `nearest`.
 
         d = |r| - radius, n = r / |r|. scale: 1 / sqrt(threshold of |a x b|^2), not used for vertex and triangle.
         """
-        w, r, g = self.nearest(kind, y1, y2, y3)
         length = ti.sqrt(r.norm_sqr())
         d, n = length - radius, r / ti.max(length, ti.cast(self.tiny, self.fp))
         energy, g1, g2, g3 = ti.cast(0, self.fp), self.vec3(0), self.vec3(0), self.vec3(0)
@@ -224,11 +223,27 @@ class Pair:
 
     @ti.func
     def gradient_jvp(
-        self, kind: A, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, d_stiffness, d_width, d_radius
+        self,
+        kind: A,
+        w,
+        r,
+        g,
+        y1,
+        y2,
+        y3,
+        dy1,
+        dy2,
+        dy3,
+        scale,
+        stiffness,
+        width,
+        radius,
+        d_stiffness,
+        d_width,
+        d_radius,
     ):
         """(h1, h2, h3, by_stiffness, by_width, by_radius): change of the gradient of corners 1 to 3 (0 balances them) for
         changes of corners, stiffness, width and radius; and the products of dy with the gradient's derivatives by these."""
-        w, r, g = self.nearest(kind, y1, y2, y3)
         length = ti.sqrt(r.norm_sqr())
         d = length - radius
         h1, h2, h3 = self.vec3(0), self.vec3(0), self.vec3(0)

@@ -65,6 +65,7 @@ class SurfacePairs:
         self.mesh, self.parallel = mesh, parallel
         self.first = MANY if self.kinematic else arrays.parameters_of_self_contact.start
         self.kernels = kernels_of(PairKernels, arrays.precision, self.first, parallel)
+        self.forces_kernel = self.kernels.forces
         self.motion = kernels_of(MotionKernels, arrays.precision, self.first, parallel)
         edges = mesh.edges if self.kinematic else edges_of(mesh.surface_triangles)[0]
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
@@ -78,11 +79,13 @@ class SurfacePairs:
         self.launch = self._launch.run
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
+        self.sizes = dict(num_surface=n, first_out=arrays.first_contact_corner)  # and more, of the present list
         marked = spread(self.body[mesh.surface_vertices], self.markers)
         self.num_bodies, self.marked = len(marked), runtime.upload(marked.ravel(), ti.i32)
         bodies, blocks = branches(self.num_bodies), -(-n // BLOCK)
         upper = branches(blocks)
-        self.sizes_of_sums = dict(body_block=bodies["size"], body_blocks=bodies["number"], blocks=blocks, **upper)
+        self.sizes_of_motion = dict(body_block=bodies["size"], body_blocks=bodies["number"], blocks=blocks, **upper)
+        self.sizes_of_motion |= dict(num_bodies=self.num_bodies, markers=self.markers)
         self.frame = runtime.array(vector, self.num_bodies + 2 + 2 * bodies["number"])
         self.farthest = runtime.array(self.kernels.fp, 1 + blocks + upper["number"])
         self.touched = runtime.array(ti.i32, n)
@@ -171,9 +174,8 @@ class SurfacePairs:
     def prepared(self, kernel, at: dict, *more, **numbers) -> tuple:
         """A kernel of pairs, its records, of the arrays `at` and `more` of the scene, and its numbers."""
         k, a, mine = self.list, self.a, (self.contacts,) if self.kinematic else ()
-        sizes = dict(num_vt=k.num_vt, num_pairs=k.count, num_surface=k.num_surface, first_out=a.first_contact_corner)
         scene = *more, k, self, *mine, SimpleNamespace(rest=a.rest, parameters=a.parameters)
-        return kernel, dict(scene=scene, at=SimpleNamespace(**at)), sizes | numbers
+        return kernel, dict(scene=scene, at=SimpleNamespace(**at)), self.sizes | numbers if numbers else self.sizes
 
     def run(self, kernel, at: dict, *more, **numbers) -> None:
         """Launch a kernel of pairs."""
@@ -190,6 +192,7 @@ class SurfacePairs:
         runtime.fill(self.list.slack, self._slacks(x, wanted, needed))
         self.list.build(self.a.rest, u, slot, self.width)
         count, take = self.list.count, self.list.buffers.take
+        self.sizes |= dict(num_vt=self.list.num_vt, num_pairs=count)
         vector, fp = self.kernels.vec4, self.kernels.fp
         self.corner, self.plane = take("forces", vector, 4 * count), take("planes", vector, count)
         self.energy, self.numbers = take("energies", fp, count), take("numbers", vector, count)
@@ -236,8 +239,7 @@ class SurfacePairs:
 
     def look_at(self, kernel, u, slot: int) -> tuple[bool, bool, bool]:
         """The `flags` of a kernel that follows the motion to u[slot] since the list was made."""
-        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, **self.sizes_of_sums)
-        self.run(kernel, dict(u=u), slot=slot, lost=0.5 * self.least_width, **bodies)
+        self.run(kernel, dict(u=u), slot=slot, lost=0.5 * self.least_width, **self.sizes_of_motion)
         flags = runtime.view(self.flags)
         return tuple(bool(x) for x in (runtime.fetch(self.flags) if flags is None else flags))
 
@@ -266,20 +268,15 @@ class SurfacePairs:
 
     def forces(self, u, slot: int, out, exact: bool = False) -> None:
         """Contact forces at u[slot], to the last corners of `out`."""
-        self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
+        self.run(self.forces_kernel, dict(u=u, out=out), slot=slot, exact=int(exact))
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=None, poses_dot=None, only=None) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of the rest shape and all parameters).
 
         poses_dot: changes of the rows of poses, which only CurvedPairs has; only: of the pairs of one contact.
         """
-        at, numbers = self._of_product(u, w, out, rest_dot, parameters_dot, only)
-        self.run(self.kernels.products, at, slot=slot, **numbers)
-
-    def _of_product(self, u, w, out, rest_dot=None, parameters_dot=None, only=None, has_planes=False) -> tuple:
-        """Arrays and numbers of it; has_planes: `place` has been at u (implicit_pairs.py)."""
         at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
-        numbers = dict(d_stiffness=0.0, d_width=0.0, by_rest=int(rest_dot is not None), has_planes=int(has_planes))
+        numbers = dict(d_stiffness=0.0, d_width=0.0, by_rest=int(rest_dot is not None))
         if self.kinematic:
             self.contacts.load_change(self.a.values.parameters, parameters_dot)
             at |= dict(numbers_dot=self.contacts.numbers_dot)
@@ -287,7 +284,7 @@ class SurfacePairs:
         elif parameters_dot is not None:
             change = parameters_dot[self.a.parameters_of_self_contact][:2]
             numbers |= dict(zip(("d_stiffness", "d_width"), map(float, change)))
-        return at, numbers
+        self.run(self.kernels.products, at, slot=slot, **numbers)
 
     def clear_sums(self) -> None:
         """Begin a reverse sweep."""

@@ -51,7 +51,7 @@ class DeviceCG:
         whole = runs_on_cpu() and not parallel and self.is_one_kernel
         # iterations between looks at the state; on a card as many as seem to be left
         self._look = self.many if whole else 1 if runs_on_cpu() else 0
-        # (with a matrix, convex) -> iterate(times, rounding), numbers of its products, what tells whether arrays are others
+        # (with a matrix, convex) -> iterate(times, rounding), what tells whether arrays are others
         self._iterations, self._served = {}, None
         self._room = -1  # blocks of that matrix
         self._filled: np.ndarray | None = None  # what `mass` holds
@@ -128,15 +128,10 @@ class DeviceCG:
         if self._served and not (more or convex):
             return self._served
         kept, pairs = self._iterations.get((more, convex)), self.potential.pairs
-        if kept is None or pairs:
-            products = self.potential.multiplying(convex)
-            numbers = [own for *_, own in products]
-            bound = len(products), pairs and (pairs.list, pairs.list.buffers.renewals)
-            if kept is None or kept[2] != bound:
-                kept = self._iterations[more, convex] = self._iteration(more, convex, products), numbers, bound
-            for own, now in zip(kept[1], numbers):
-                if own is not None:
-                    own.update(now)
+        version = pairs and pairs.version
+        if kept is None or kept[1] != version:
+            made = self._iteration(more, convex, self.potential.multiplying(convex))
+            kept = self._iterations[more, convex] = made, version
         return kept[0]
 
     def iterate(self, state: np.ndarray, most: int, eps: float, more: bool = False, convex: bool = False) -> None:

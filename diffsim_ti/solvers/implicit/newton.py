@@ -13,7 +13,6 @@ Kane, Marsden, Ortiz, West 2000, doi:10.1002/1097-0207(20001210)49:10<1295::AID-
 """
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -115,7 +114,7 @@ class Newton:
         """
         self.report = report = NewtonReport()
         self.reports.append(report)
-        self.indefinite = self.turning = False  # the latter: pairs whose friction a direction has turned round
+        self.indefinite = False
         self.pose((mass, inertial, loads))
         u = self.potential.place(start)
         if self.volumes:
@@ -227,11 +226,8 @@ class Newton:
         return R * self.free, np.sqrt(sizes**2 + (self.loads**2 + inertia**2 * self.moves).sum(1))
 
     def step(self, u, R, forcing):
-        """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by. Friction that
-        the direction before turned round is bounded (mechanics/surfaces/lagged_friction.py)."""
-        friction = self.potential.surface_friction
-        with friction.bounded(self.turning) if friction else nullcontext():
-            direction, R = self._direction_of(u, R, forcing)
+        """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by."""
+        direction, R = self._direction_of(u, R, forcing)
         direction, joints = cleaned(linear_of(self.free), direction), self.potential.joints
         return joints.extended(direction) if joints else direction, R
 
@@ -282,6 +278,7 @@ class Newton:
 
     def _downhill(self):
         """A direction of negative curvature, found by solving for something random, and a slope for its search."""
+        self.potential.place(self.potential.held_at)  # with the stiffness of friction as it is
         probe = np.random.default_rng(0).standard_normal((len(self.moves), 3)) * self.free
         A = self.operator()
         self.preconditioner.update(self.potential.held_at)

@@ -24,8 +24,9 @@ A = ti.template()
 (SOLVED, SCALE, INDEFINITE, LONGEST, BEST, MEASURE, TO_LOWER) = range(RECOUNTS + 1, RECOUNTS + 8)
 COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
 # phases: it is done, no step is found, rounds are used up; energies where rises are measured from, and of one; where a solve
-# starts, a trial of the line search, its residual, the preconditioner, conjugate gradients
-DONE, TROUBLE, MANY, BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE = range(10)
+# starts, a trial of the line search, its residual, the preconditioner, conjugate gradients; the host says how far along a
+# direction surfaces stay apart, makes the list of pairs anew
+DONE, TROUBLE, MANY, BASE, PROBE, START, TRY, JUDGE, UPDATE, SOLVE, WAY, ASTRAY = range(12)
 WAITS = 4  # of STOPPED: conjugate gradients have not begun
 BY_WORK, BY_RESIDUAL = 1, 2  # of MEASURE where there is no potential: work or |R| is lower, |R| is
 LONGEST_STEP = 64.0  # along an indefinite direction, which is doubled while Phi falls, for its length says little
@@ -35,7 +36,7 @@ LONGEST_STEP = 64.0  # along an indefinite direction, which is doubled while Phi
 class NewtonKernels:
     """scene: precision of displacements and energies; vectors: of all else; guided: whether vertices are fixed in some
     directions only; contact: whether there is contact; beside: whether the host says the residual; several: whether there
-    are several bodies, each with its row of `state` (cg_kernels.py)."""
+    are several bodies, each with its row of `state` (cg_kernels.py); pairs: whether there are pairs of surfaces."""
 
     scene: str
     vectors: str
@@ -44,10 +45,16 @@ class NewtonKernels:
     contact: bool
     beside: bool
     several: bool = False
+    pairs: bool = False
 
     @property
     def fp(self):
         return PRECISIONS[self.vectors]
+
+    @property
+    def values(self) -> str:
+        """The kind of arrays of numbers of the scene."""
+        return "singles" if self.scene == "f32" else "doubles"
 
     @cached_property
     def cg(self) -> CGKernels:
@@ -56,6 +63,7 @@ class NewtonKernels:
     def _kernel(self, name: str, function, **arrays) -> Kernel:
         cg = dict(part="scalars2", state="scalars2") | arrays.pop("cg", {})
         sizes = ("chunks", "length", "nodes", "points", "points_length", "count", "systems")
+        sizes += ("energies", "energies_length") if self.pairs else ()
         return Kernel(name, function, self.vectors, dict(cg=cg) | arrays, dict.fromkeys(sizes, "int"))
 
     @ti.func
@@ -79,12 +87,16 @@ class NewtonKernels:
     def is_solved(self, cg: A, plan: A):
         return cg.state[0, STOPPED] == 0 and cg.state[0, COUNT] < cg.state[0, LIMIT]
 
+    @ti.func
+    def is_fresh(self, cg: A, plan: A):
+        return cg.state[0, PHASE] == TRY and cg.state[0, FRESH] == 1
+
     @cached_property
     def wanted(self) -> list[Kernel]:
         """Whether something is tried, whether it may be taken, whether the preconditioner is to follow, whether conjugate
-        gradients go on, for `Repeated`."""
+        gradients go on, whether a direction is new, for `Repeated`."""
         own = dict(cg=dict(state="scalars2"))
-        asks = self.is_trial, self.is_judged, self.is_updated, self.is_solved
+        asks = self.is_trial, self.is_judged, self.is_updated, self.is_solved, self.is_fresh
         return [Kernel(function.__name__, function, self.vectors, own, {}) for function in asks]
 
     # ---- line search -------------------------------------------------------------------------------------------------
@@ -140,8 +152,40 @@ class NewtonKernels:
     @cached_property
     def bound(self) -> Kernel:
         """The longest step before an obstacle, of what each vertex may go."""
-        found = "singles" if self.scene == "f32" else "doubles"
-        return self._kernel("bound", self.shorten, out=dict(found=found))
+        return self._kernel("bound", self.shorten, out=dict(found=self.values))
+
+    @ti.func
+    def go_ahead(self, cg: A, newton: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.nodes):
+            share = cg.state[0, FRACTION]
+            if cg.state[0, FRESH] == 1:
+                share = cg.state[0, LONGEST]
+            newton.next[0, i] = self.cg.to(PRECISIONS[self.scene], newton.u[i] + newton.d[i] * share)
+
+    @cached_property
+    def lead(self) -> Kernel:
+        """Where the longest step along a new direction leads, or what is tried next along the same."""
+        own = dict(u="vectors", d="vectors", next=f"vectors2_{self.scene}")
+        return self._kernel("lead", self.go_ahead, newton=own)
+
+    @ti.func
+    def ask(self, cg: A, near: A, plan: A):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            away, meets = near.flags[0] > 0, near.flags[2] > 0
+            if cg.state[0, PHASE] == TRY:
+                cg.state[0, ACCEPTED] = ti.cast(0, self.fp)
+                if cg.state[0, FRESH] == 1 and (away or meets):
+                    cg.state[0, PHASE] = ti.cast(WAY, self.fp)
+                elif away:
+                    cg.state[0, PHASE] = ti.cast(ASTRAY, self.fp)
+
+    @cached_property
+    def halt(self) -> Kernel:
+        """A phase of the host's where the list of pairs does not hold, or surfaces may meet."""
+        arrays = dict(cg=dict(state="scalars2"), near=dict(flags="ints"))
+        return Kernel("halt", self.ask, self.vectors, arrays, {})
 
     @ti.func
     def go(self, cg: A, newton: A, at: A, plan: A):
@@ -177,6 +221,12 @@ class NewtonKernels:
             if not J > least or (cg.state[b, PHASE] == PROBE and not J < most):
                 flat += ti.cast(cg.state[b, PHASE] != PROBE or newton.J[k] > 0, self.fp)
             turned += ti.cast(not J > 0, self.fp)
+        if ti.static(self.pairs):
+            first, last = self.cg.span(c, plan.energies_length, plan.energies, plan)
+            for k in range(first, last):
+                e = ti.cast(at.energy[k], self.fp)
+                value += e
+                size += ti.abs(e)
         begin, end = self.cg.span(c, plan.length, plan.nodes, plan)
         for i in range(begin, end):
             e, u = ti.cast(at.contact[i], self.fp), self.cg.to(self.fp, at.u[0, i])
@@ -195,7 +245,7 @@ class NewtonKernels:
         c = self.cg.add_up(cg.part, 6, b, plan)
         value, size = cg.part[0, c] + cg.state[b, BESIDE], cg.part[1, c] + cg.state[b, BESIDE_PARTS]
         cg.state[b, E_TRIED], cg.state[b, PARTS_TRIED], cg.state[b, DOUBTED] = value, size, ti.cast(0, self.fp)
-        cg.state[b, ACCEPTED] = ti.cast(0, self.fp)
+        cg.state[b, ACCEPTED], cg.state[b, FRESH] = ti.cast(0, self.fp), ti.cast(0, self.fp)
         change = value - cg.state[b, E] + cg.part[4, c] + cg.state[b, BESIDE_CHANGE]
         flat = cg.part[2, c] > 0
         if cg.state[b, PHASE] == BASE:
@@ -267,9 +317,9 @@ class NewtonKernels:
     @cached_property
     def choose(self) -> Kernel:
         """Whether what is tried is taken, its energies being there."""
-        values = "singles" if self.scene == "f32" else "doubles"
-        own = dict(u="vectors", inertial="vectors", loads="vectors", stiffness="scalars", J=values)
-        at = dict(u=f"vectors2_{self.scene}", elastic=values, contact=values, J=values)
+        own = dict(u="vectors", inertial="vectors", loads="vectors", stiffness="scalars", J=self.values)
+        at = dict.fromkeys(("elastic", "contact", "J", *(["energy"] if self.pairs else [])), self.values)
+        at |= dict(u=f"vectors2_{self.scene}")
         return self._kernel("choose", self.compare, cg=dict(mass="scalars"), newton=own, at=at)
 
     # ---- residual ----------------------------------------------------------------------------------------------------
@@ -403,7 +453,7 @@ class NewtonKernels:
     @cached_property
     def judge(self) -> Kernel:
         """R where something is tried, its forces being there; if that is taken, what the round solves: r = R / |R|."""
-        cg, values = dict(free="scalars", r="vectors2"), "singles" if self.scene == "f32" else "doubles"
+        cg, values = dict(free="scalars", r="vectors2"), self.values
         own = dict.fromkeys(("far", "stiffness"), "scalars") | dict.fromkeys(("u", "d", "R"), "vectors")
         own |= {} if self.several else dict(history="scalars")
         own, at = own | dict(J=values), dict(u=f"vectors2_{self.scene}", J=values)

@@ -86,8 +86,9 @@ class BlockJacobi(Preconditioner):
         body = SimpleNamespace(hard=runtime.array(ti.i32, n), mass=runtime.array(kind, n), least=runtime.array(kind, n))
         runtime.fill(body.mass, self.mass[:, 0])
         runtime.fill(body.least, np.broadcast_to(self.least, (n, 1))[:, 0])
-        blocks = p.kernels.blocks, dict(scene=a, pass_=p, at=p, out=p.block_arrays), None
-        return [blocks, (kernels.invert, dict(cg=solver, body=body, out=p.block_arrays), None)], body
+        own, pairs = [(p.kernels.blocks, dict(scene=a, pass_=p, at=p, out=p.block_arrays), None)], p.pairs
+        own += pairs.adding_blocks(p.u, p.block_arrays.blocks) if pairs else []
+        return [*own, (kernels.invert, dict(cg=solver, body=body, out=p.block_arrays), None)], body
 
     def _inverted(self, D: np.ndarray) -> np.ndarray:
         least = np.broadcast_to(self.least, (len(D), 1))

@@ -2,7 +2,6 @@
 
 import weakref
 from collections.abc import Callable
-from contextlib import nullcontext
 
 import numpy as np
 
@@ -26,9 +25,10 @@ class Rounds:
     those of conjugate gradients; of small bodies on the processor they are one kernel, and a solve is a launch or few. What
     comes next is a number on the device, `PHASE`; of what crosses to the host there are a few numbers a round.
 
-    The host solves where something is unusual in a linear system (`Newton.step`), and takes part between the launches where
-    there is something `beside` the kernels: pairs of surfaces, of which it keeps the list, forces of its own, masses that
-    are no diagonal, volumes, joints of robots, sets that move by few numbers. It adds energies and work, and says R.
+    The host solves where something is unusual in a linear system (`Newton.step`), makes the list of pairs of surfaces anew
+    where that does not hold, and takes part between the launches where there is something `beside` the kernels: forces of
+    its own, masses that are no diagonal, volumes, joints of robots, sets that move by few numbers. It adds energies and
+    work, and says R.
 
     `state` has a row of numbers for each body of a batch (batch/joined_newton.py), else one. Bodies are in the same phases
     but where one halves its step more often than another.
@@ -45,55 +45,83 @@ class Rounds:
         self.cg, a, n = preconditioner.solver, potential.arrays, potential.arrays.num_vertices
         cg, points, free = self.cg, potential.J.shape[0], preconditioner.free
         reduced, consistent = isinstance(free, FreeBodies), isinstance(newton.mass, ConsistentMass)
-        by_host, self.several = newton.others or potential.joints or reduced, cg.several
-        self.beside = beside = bool(by_host or potential.pairs or potential.hosts or consistent)
+        by_host, self.several, self.pairs = newton.others or potential.joints or reduced, cg.several, potential.pairs
+        self.beside = bool(by_host or potential.hosts or consistent)
         self.solves_on_host = newton.system() is None
-        self.contact = contact = bool(a.contacts or potential.pairs or potential.hosts)
+        self.contact = bool(a.contacts or self.pairs or potential.hosts)
         slides = isinstance(free, FreeDirections) and not potential.joints  # whose directions are the host's
-        how = a.precision, cg.precision, cg.parallel, slides
-        kernels = kernels_of(NewtonKernels, *how, contact, beside, self.several)
+        how = a.precision, cg.precision, cg.parallel, slides, self.contact, self.beside, self.several, bool(self.pairs)
+        self._kernels = kernels_of(NewtonKernels, *how)
         fp, vector = runtime.PRECISIONS[cg.precision], runtime.array_types(cg.precision)["vectors"].dtype
         self.u, self.d, self.R, self.inertial, self.loads = (runtime.array(vector, n) for _ in range(5))
         self.far, self.stiffness, self.history = (runtime.array(fp, k) for k in (n, n, self.most_rounds + 1))
         self.J, self._filled = runtime.array(a.fp, points), {}
         self.sizes = dict(chunks=cg.chunks, length=cg.length, nodes=n, count=detection.count, systems=cg.systems)
         self.sizes |= dict(points=points, points_length=-(-(points // cg.systems) // (cg.chunks // cg.systems)))
-        way, barriers = (detection.way, potential.barriers) if contact else (None, None)
-        own = dict(cg=cg, at=potential, newton=(self, way), out=detection.found, barriers=barriers)
+        self._always = self.sizes | dict(kept=detection.kept)
+        self.next = runtime.array(a.vector, 1, n) if self.pairs else None  # where the longest step leads
+        self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small
+        self.whole &= potential.kernels.blocks.variables <= self.short and not (self.beside or self.several)
+        self.whole &= not (self.pairs and self.pairs.asks)
+        self._bind()
+        if self.whole:
+            cg.serve(self._serve)
+
+    def _bind(self) -> None:
+        """Kernels to the arrays that are there, of which pairs may have others now and then."""
+        potential, detection, preconditioner, pairs = self.potential, self.detection, self.preconditioner, self.pairs
+        kernels, cg, a, beside = self._kernels, self.cg, potential.arrays, self.beside
+        self._version = pairs and pairs.version
+        way, barriers = (detection.way, potential.barriers) if self.contact else (None, None)
+        at = (pairs.inner, potential) if pairs else potential
+        own = dict(cg=cg, at=at, newton=(self, way), out=detection.found, barriers=barriers)
         of_potential = dict(scene=a, pass_=potential, at=potential, out=potential)
-        tries, judges, updates, solves = kernels.wanted
-        direction, residual = [(kernels.direction, own)], []
+        one = lambda kernel, records: [(kernel, records, None)]  # noqa: E731
+        tries, judges, updates, solves, fresh = (one(kernel, own) for kernel in kernels.wanted)
+        direction, residual, holds, near, place = one(kernels.direction, own), [], [], [], []
         if a.contacts and not potential.joints:
             of_way = dict(scene=a, way=way, at=potential, out=detection.found)
-            direction += [(detection.kernels.shares, of_way), (kernels.bound, own)]
+            direction += one(detection.kernels.shares, of_way) + one(kernels.bound, own)
         if not beside:
-            residual.append((potential.kernels.forces, of_potential))
-            if contact:
-                residual.append((potential.kernels.contact_blocks, of_potential | dict(out=barriers)))
-        energy, move = (potential.kernels.energy, of_potential), [(kernels.move, own)]
-        compare, judge = [(kernels.choose, own)], [(kernels.judge, own)]
-        groups = [[(tries, own), *direction, *move, energy, *compare], [(judges, own), *residual, *judge]]
-        direction, move, compare, judge, *groups = (
-            [(*part, None) for part in group] for group in (direction, move, compare, judge, *groups)
-        )
+            residual += one(potential.kernels.forces, of_potential)
+            if self.contact:
+                residual += one(potential.kernels.contact_blocks, of_potential | dict(out=barriers))
+        if pairs:
+            u, step, halt = potential.u, way.step, one(kernels.halt, dict(cg=cg, near=pairs.inner))
+            holds = [*one(kernels.lead, own), *pairs.holding(self.next, step), *halt]
+            near, place = pairs.turning(u, step), pairs.placing(u)
+            residual += pairs.adding_blocks(u, barriers.blocks)
+        move, energy = one(kernels.move, own), one(potential.kernels.energy, of_potential)
+        compare, judge = one(kernels.choose, own), one(kernels.judge, own)
+        first, trial = [*tries, *direction, *holds], [*move, *place, *energy, *compare]
+        groups = [first, [*fresh, *near], [*tries, *trial]] if near else [[*first, *trial]]
+        groups.append([*judges, *residual, *judge])
         update, hard = ([], None) if beside or self.several else preconditioner.updating()
         update = [*update, (kernels.ready, dict(cg=cg, body=hard), None)] if update else []
-        self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small
-        self.whole &= potential.kernels.blocks.variables <= self.short and not (beside or self.several)
-        self._always, self._update = self.sizes | dict(kept=detection.kept), self._in_turn(update)
-        if self.whole:
-            groups += [[(updates, own, None), *update]] if update else []
-            groups.append([(solves, own, None), *cg.parts(False, potential.multiplying())[1:]])
+        self._update = self._in_turn(update)
         self._trial = self._residual = self._steps = self._more = None
         if self.whole:
+            groups += [[*updates, *update]] if update else []
+            groups.append([*solves, *cg.parts(False, potential.multiplying())[1:]])
             self._trial = Repeated("newton", groups, cg.parallel, vectorized=True)
-        elif beside or self.several or runs_on_cpu() or not cg.is_one_kernel:
-            self._steps = [self._in_turn(group) for group in (direction, move, compare, judge)]
+        elif beside or pairs or self.several or runs_on_cpu() or not cg.is_one_kernel:
+            self._steps = [self._in_turn(group) for group in (direction, holds, near, move, place, compare, judge)]
         else:
             self._trial, self._residual = (Repeated(f"newton{k}", [own], True) for k, own in enumerate(groups))
-        if self.whole:
-            launch, always = self._trial, self._always | dict(most=1.0)
-            cg.serve(lambda times, rounding: launch(times, **always, **potential.sizes(), rounding=rounding))
+
+    def _numbers(self, most: float) -> dict:
+        """Those of a launch, of kernels that are bound to the arrays that are there; most: the longest step."""
+        numbers, pairs = self._always | self.potential.sizes() | dict(most=most), self.pairs
+        if pairs:
+            if pairs.version != self._version:
+                self._bind()
+            count, pairs.inner.sizes["most"] = pairs.inner.num_energies, most
+            numbers |= dict(energies=count, energies_length=-(-count // self.cg.chunks))
+        return numbers
+
+    def _serve(self, times: int, rounding: float) -> None:
+        """Iterations of conjugate gradients."""
+        self._trial(times, **self._numbers(1.0), rounding=rounding)
 
     def _in_turn(self, parts: list) -> Callable | None:
         """Kernels that are launched one by one, as others launch them, so that they are compiled once."""
@@ -220,11 +248,15 @@ class Rounds:
     def advance(self) -> None:
         """From one phase to the next until it is over."""
         served = False
-        numbers = self._always | self.potential.sizes() | dict(rounding=10 * self.newton.eps)
         if nk.START in self.state[:, nk.PHASE]:
             self.preconditioner.follow(self.potential.held_at)
         self._send()
         while max(phases := self.state[:, nk.PHASE].tolist()) > nk.MANY:
+            if phases[0] == nk.WAY:
+                self._shorten()
+            elif phases[0] == nk.ASTRAY:
+                self.pairs.reach(self.next)
+                self._set({nk.PHASE: nk.TRY})
             solves = nk.SOLVE in phases
             if solves and (odd := self._odd()).any():
                 self._solve(odd)
@@ -239,7 +271,8 @@ class Rounds:
                 self._follow()
                 served = False
                 continue
-            numbers["most"] = nk.LONGEST_STEP if self.state[:, nk.INDEFINITE].any() else 1.0
+            numbers = self._numbers(nk.LONGEST_STEP if self.state[:, nk.INDEFINITE].any() else 1.0)
+            numbers["rounding"] = 10 * self.newton.eps
             # a card goes on before the host has looked, but not to conjugate gradients
             ahead = not (self.whole or self._steps or solves) and phases[0] >= nk.START
             if self.whole:
@@ -294,11 +327,9 @@ class Rounds:
 
     def _iterate(self) -> None:
         """Conjugate gradients until they stop."""
-        friction, more = self.potential.surface_friction, self._more is not None
-        with friction.bounded(self.newton.turning) if friction else nullcontext():
-            while np.any(on := (self.state[:, STOPPED] == 0) & ~self._odd()):
-                self.cg.iterate(self.state[on], int(self.state[on, LIMIT].max()), self.newton.eps, more)
-                self._receive()
+        while np.any(on := (self.state[:, STOPPED] == 0) & ~self._odd()):
+            self.cg.iterate(self.state[on], int(self.state[on, LIMIT].max()), self.newton.eps, self._more is not None)
+            self._receive()
 
     def _solve(self, odd: np.ndarray) -> None:
         """The host's direction; of several bodies what is left to those that are odd."""
@@ -334,34 +365,44 @@ class Rounds:
         """Energies of a trial, of a new direction or along the same."""
         if self._steps is None:
             return self._trial(1, **numbers)
-        (direct, move, compare, _), phases = self._steps, self.state[:, nk.PHASE]
+        (direct, holds, near, move, place, compare, _), phases = self._steps, self.state[:, nk.PHASE]
         tried = (nk.BASE <= phases) & (phases <= nk.TRY) | (phases == nk.SOLVE)
         phase = phases[tried].max()
         if phase == nk.SOLVE:
             direct(1, **numbers)
-            if self.potential.pairs or (self.potential.joints and self.contact):
+            if (self.potential.joints and self.contact) or (self.pairs and self.pairs.asks):
                 self._shorten()
+                if self.pairs:  # which may have other arrays now
+                    return
+        if holds:
+            holds(1, **numbers)
+            self._receive()
+            if self.state[0, nk.PHASE] > nk.SOLVE:
+                return
+            if near and self.state[0, nk.FRESH] == 1:
+                near(1, **numbers)
         move(1, **numbers)
         self.potential.only(tried)
         if self.beside:
             self._set(self._beside(phase))
+        if place:
+            place(1, **numbers)
         self.potential.launch("energy", lanes=False)
         compare(1, **numbers)
 
     def _shorten(self) -> None:
         """Not farther along a new direction than to where surfaces meet, or links that give way."""
-        potential, newton, u = self.potential, self.newton, self._base
         self._receive()
+        potential, newton, u = self.potential, self.newton, self._here()
         step, cuts = runtime.fetch_row(self.detection.way.step, 0), self.state[0, nk.CUTS]
         share = longest = float(self.state[0, nk.LONGEST])
         if potential.joints:
             share = newton.collisions(u, step, longest)[0]
-        if potential.pairs:
-            share = min(share, potential.pairs.safe_share(u, step, share, placed=True))
-        if potential.surface_friction:
-            newton.turning = potential.surface_friction.turns(u, u + step)
-        numbers = {nk.CUTS: cuts + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share)}
-        self._set(numbers | ({} if share > newton.shortest else {nk.PHASE: nk.TROUBLE}))
+        if self.pairs:
+            self.pairs.launch(self.pairs.turning(potential.u, self.detection.way.step))
+            share = min(share, self.pairs.safe_share(u, step, share, placed=True))
+        numbers = {nk.CUTS: cuts + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share), nk.FRESH: 0}
+        self._set(numbers | {nk.PHASE: nk.TRY if share > newton.shortest else nk.TROUBLE})
 
     def _beside(self, phase: int) -> dict:
         """What the host adds to the energies where something is tried, and to their change on the way there."""
@@ -372,7 +413,7 @@ class Rounds:
             met = not newton.is_free(base, there - base)
             u = potential.place(there)
         else:
-            u = potential.arrive(on_way=True) if moved else potential.held_at
+            u = potential.arrive(pairs=False) if moved else potential.held_at
         if (newton.rigid or potential.joints) and phase == nk.START:
             places = (
                 newton.rigid.rounding.ravel() if newton.rigid else STRAINS * potential.joints.digits.max(initial=0.0)
@@ -412,4 +453,4 @@ class Rounds:
             potential.launch("forces")
         if self.contact:
             potential.put_contact_blocks()
-        self._steps[3](1, **numbers)
+        self._steps[-1](1, **numbers)

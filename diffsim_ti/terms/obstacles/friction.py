@@ -56,10 +56,14 @@ def slip(speed, c, eps, g: ti.template()):
 slip_in_kernels = ti.func(slip)
 
 
-def dissipated(speed, eps, m):
-    """Integral of f(s / eps) over s, eps (y^2 - y^3 / 3) for y = s / eps < 1, s - eps / 3 beyond; m: ARRAYS or a graph."""
+def dissipated(speed, eps, m: ti.template()):
+    """Integral of f(s / eps) over s, eps (y^2 - y^3 / 3) for y = s / eps < 1, s - eps / 3 beyond; m: ARRAYS, KERNELS or a
+    graph."""
     low = m.minimum(speed, eps)
     return low * low / eps * (1 - low / (eps * 3)) + (speed - low)
+
+
+dissipated_in_kernels = ti.func(dissipated)
 
 
 def normal_force(g, n, push):
