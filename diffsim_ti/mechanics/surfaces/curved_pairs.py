@@ -206,7 +206,8 @@ class CurvedPairs:
         return what[2]
 
     def _covered(self, u):
-        """Displacements of the finer surface, from u[0], with all that is near, for which `inner` may be made anew."""
+        """Displacements of the finer surface, from u[0], with all that is near; to be asked for before `inner`, which may be
+        made anew."""
         if self.nearby:
             self.cover(runtime.fetch_row(u, 0))
         return self.fine(u, 0)
@@ -343,11 +344,13 @@ class CurvedPairs:
         return self.inner.version
 
     def place(self, u) -> None:
-        self.inner.place(self._covered(u))
+        fine = self._covered(u)
+        self.inner.place(fine)
         self._gather(self.a.corner)
 
     def reach(self, u) -> None:
-        self.inner.reach(self._covered(u))
+        fine = self._covered(u)
+        self.inner.reach(fine)
 
     def placing(self, u) -> Parts:
         own = self.inner.placing(self._u)
