@@ -365,8 +365,10 @@ class CurvedPairs:
         return [*refining, *self.inner.holding(there, step)]
 
     def turning(self, u, w) -> Parts:
-        step = self.inner.step
-        return [self._refining(w, 0, step, "unmoved"), *self.inner.turning(self._u, step)] if self.friction else []
+        if not self.friction:
+            return []
+        refining = self._refining(u, 0, self._u, "given"), self._refining(w, 0, self.inner.step, "unmoved")
+        return [*refining, *self.inner.turning(self._u, self.inner.step)]
 
     def multiplying(self, u, w, convex: bool) -> Parts:
         refining = self._refining(w, 0, self._w, "unmoved")
