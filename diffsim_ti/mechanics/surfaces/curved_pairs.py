@@ -206,7 +206,8 @@ class CurvedPairs:
         return what[2]
 
     def _covered(self, u):
-        """Displacements of the finer surface, from u[0], with all that is near, for which `inner` may be made anew."""
+        """Displacements of the finer surface, from u[0], with all that is near; to be asked for before `inner`, which may be
+        made anew."""
         if self.nearby:
             self.cover(runtime.fetch_row(u, 0))
         return self.fine(u, 0)
@@ -343,11 +344,13 @@ class CurvedPairs:
         return self.inner.version
 
     def place(self, u) -> None:
-        self.inner.place(self._covered(u))
+        fine = self._covered(u)
+        self.inner.place(fine)
         self._gather(self.a.corner)
 
     def reach(self, u) -> None:
-        self.inner.reach(self._covered(u))
+        fine = self._covered(u)
+        self.inner.reach(fine)
 
     def placing(self, u) -> Parts:
         own = self.inner.placing(self._u)
@@ -362,8 +365,10 @@ class CurvedPairs:
         return [*refining, *self.inner.holding(there, step)]
 
     def turning(self, u, w) -> Parts:
-        step = self.inner.step
-        return [self._refining(w, 0, step, "unmoved"), *self.inner.turning(self._u, step)] if self.friction else []
+        if not self.friction:
+            return []
+        refining = self._refining(u, 0, self._u, "given"), self._refining(w, 0, self.inner.step, "unmoved")
+        return [*refining, *self.inner.turning(self._u, self.inner.step)]
 
     def multiplying(self, u, w, convex: bool) -> Parts:
         refining = self._refining(w, 0, self._w, "unmoved")

@@ -121,7 +121,8 @@ class Rounds:
 
     def _serve(self, times: int, rounding: float) -> None:
         """Iterations of conjugate gradients."""
-        self._trial(times, **self._numbers(1.0), rounding=rounding)
+        numbers = self._numbers(1.0)  # which may bind anew what is launched
+        self._trial(times, **numbers, rounding=rounding)
 
     def _in_turn(self, parts: list) -> Callable | None:
         """Kernels that are launched one by one, as others launch them, so that they are compiled once."""
@@ -254,9 +255,11 @@ class Rounds:
         while max(phases := self.state[:, nk.PHASE].tolist()) > nk.MANY:
             if phases[0] == nk.WAY:
                 self._shorten()
-            elif phases[0] == nk.ASTRAY:
+                continue
+            if phases[0] == nk.ASTRAY:
                 self.pairs.reach(self.next)
                 self._set({nk.PHASE: nk.TRY})
+                continue
             solves = nk.SOLVE in phases
             if solves and (odd := self._odd()).any():
                 self._solve(odd)
@@ -365,7 +368,7 @@ class Rounds:
         """Energies of a trial, of a new direction or along the same."""
         if self._steps is None:
             return self._trial(1, **numbers)
-        (direct, holds, near, move, place, compare, _), phases = self._steps, self.state[:, nk.PHASE]
+        (direct, holds, near, move, *_), phases = self._steps, self.state[:, nk.PHASE]
         tried = (nk.BASE <= phases) & (phases <= nk.TRY) | (phases == nk.SOLVE)
         phase = phases[tried].max()
         if phase == nk.SOLVE:
@@ -385,6 +388,8 @@ class Rounds:
         self.potential.only(tried)
         if self.beside:
             self._set(self._beside(phase))
+            numbers |= self._numbers(numbers["most"])
+        *_, place, compare, _ = self._steps
         if place:
             place(1, **numbers)
         self.potential.launch("energy", lanes=False)
@@ -399,8 +404,8 @@ class Rounds:
         if potential.joints:
             share = newton.collisions(u, step, longest)[0]
         if self.pairs:
-            self.pairs.launch(self.pairs.turning(potential.u, self.detection.way.step))
             share = min(share, self.pairs.safe_share(u, step, share, placed=True))
+            self.pairs.launch(self.pairs.turning(potential.u, self.detection.way.step))
         numbers = {nk.CUTS: cuts + (share < 1 <= longest), nk.LONGEST: share, nk.FRACTION: min(1.0, share), nk.FRESH: 0}
         self._set(numbers | {nk.PHASE: nk.TRY if share > newton.shortest else nk.TROUBLE})
 
@@ -411,9 +416,10 @@ class Rounds:
         if moved and newton.rigid:  # which may turn on another way than the step that was looked at
             there = newton.rigid.nearest(runtime.fetch_row(potential.u, 0))
             met = not newton.is_free(base, there - base)
-            u = potential.place(there)
-        else:
-            u = potential.arrive(pairs=False) if moved else potential.held_at
+            runtime.fill(potential.u, there[None])
+            if self.pairs:
+                self.pairs.reach(potential.u)
+        u = potential.arrive(pairs=False) if moved else potential.held_at
         if (newton.rigid or potential.joints) and phase == nk.START:
             places = (
                 newton.rigid.rounding.ravel() if newton.rigid else STRAINS * potential.joints.digits.max(initial=0.0)
