@@ -114,7 +114,8 @@ def test_a_mat_falls_on_knives(monkeypatch):
         warnings.simplefilter("error")
         found = contact_corpus.run("mat", posed, 6)
     assert found.error is None and found.done == 6 and found.intersections == found.turned == 0
-    assert len(lists) < 0.5 * sum(found.rounds)
+    of_starts = 3 * found.done  # where a step begins, and on the ways that inertia and velocities lead
+    assert len(lists) - of_starts < 0.5 * sum(found.rounds)
 
 
 def test_pins_come_in_few_parts_of_a_step():
