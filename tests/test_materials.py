@@ -498,6 +498,20 @@ def test_coefficient_derivatives_are_exact(material, numbers, uniform):
     assert left == pytest.approx(right, rel=1e-13)
 
 
+def test_a_check_of_ones_own_reads_plain_numbers_where_derivatives_are_taken():
+    class Stiff(SmithNeoHookean):
+        def check(self, values):
+            super().check(values)
+            if values["youngs_modulus"].min() < 1e3:
+                raise ValueError("too soft")
+
+    x = np.full(3, E), np.full(3, NU)
+    found, told = (Coefficients(kind(E, NU)).vjp(x, (np.ones((3, 2)),)) for kind in (Stiff, SmithNeoHookean))
+    np.testing.assert_array_equal(found, told)
+    with pytest.raises(ValueError, match="too soft"):
+        Coefficients(Stiff(E, NU)).jvp((np.full(3, 1.0), x[1]), x)
+
+
 def test_smith_constants_are_the_published_conversion():
     mu, lam = moduli.lame(E, NU)
     m, l = SmithNeoHookean(E, NU).coefficients({"youngs_modulus": np.array(E), "poissons_ratio": np.array(NU)})

@@ -239,7 +239,9 @@ def reverse_of_all(adjoints: Iterable[tuple], leaves: Iterable[Node]) -> list:
 def add_transposed(into: np.ndarray, read: Callable, seed) -> None:
     """Add to the adjoint of x that by read(x), which is linear in x, for the adjoint of the latter."""
     leaf = Recorded(into, zeros=lambda: into)
-    reverse(read(leaf), seed, [leaf])
+    (found,) = reverse(read(leaf), seed, [leaf])
+    if found is not None and found is not into:
+        into += found
 
 
 def _add(known: dict, own: set, node: Node, more) -> None:

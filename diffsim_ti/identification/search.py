@@ -150,7 +150,8 @@ class LevenbergMarquardt:
         before, self.size = self.size, float(self.gradient @ solve @ self.gradient)
         share = FORCING[1] if before is None else float(np.clip(self.size / before, *FORCING))
         operator = LinearOperator((problem.size, problem.size), product, dtype=np.float64)
-        return cg(operator, -self.gradient, rtol=share, maxiter=100, M=solve)[0]
+        left = share * np.linalg.norm(self.gradient)
+        return cg(operator, -self.gradient, atol=left, maxiter=100, M=solve)[0]
 
     def limited(self, step: np.ndarray) -> np.ndarray:
         """A step that changes no logarithm and no bounded number by more than LONGEST."""

@@ -175,7 +175,7 @@ class Material(metaclass=Public):
 
     def lame(self, values: dict) -> tuple[np.ndarray, np.ndarray]:
         """Small-strain (mu, lam) [Pa], each shape () or (num_tetrahedra,)."""
-        self.check(values)
+        self.check({name: value_of(x) for name, x in values.items()})
         if self.to_lame is not None:
             p = self.coefficients(values) @ self.to_lame.T
             return p[..., 0], p[..., 1]
@@ -200,7 +200,7 @@ class Material(metaclass=Public):
 
     def coefficients(self, values: dict) -> np.ndarray:
         """The law's coefficients [Pa]: shape (K,) if all values are uniform, else (num_tetrahedra, K)."""
-        self.check(values)
+        self.check({name: value_of(x) for name, x in values.items()})
         return self._coefficients(values)
 
     def _coefficients(self, values: dict) -> np.ndarray:

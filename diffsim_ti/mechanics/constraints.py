@@ -182,10 +182,11 @@ class HeldRelations(VolumeConstraints):
         return u
 
     def gradients(self, of, x):
-        """c, of all relations and vertices."""
-        each = zip(self._at, self._own_numbers)
-        parts = [summed_at(at, of.parameters[own][: 3 * len(at)].reshape(-1, 3), len(self.nodes)) for at, own in each]
-        return np.stack(parts)
+        """c, of all relations and vertices, found once of the numbers of a pass."""
+        if not hasattr(of, "c"):
+            given = [of.parameters[own][: 3 * len(at)] for at, own in zip(self._at, self._own_numbers)]
+            of.c = np.stack([summed_at(at, c.reshape(-1, 3), len(self.nodes)) for at, c in zip(self._at, given)])
+        return of.c
 
     def volumes(self, of, x, G=None):
         return along(self.gradients(of, x), x)

@@ -22,7 +22,8 @@ from diffsim_ti.runtime.slots import VertexRows
 class Correction:
     """A stage (mechanics/stage.py) of the vertices `nodes`, whose vectors have the shape (n, 3).
 
-    `of` has the numbers that it reads: masses and rest positions of the vertices, and the arrays of `Derived` in `reads`.
+    `of` has the numbers that it reads: masses and rest positions of the vertices, and the arrays of `Derived` in `reads`. It
+    is made anew for each pass, and may keep what is found of them once.
     kept: of recorded passes, by the slot they led to: (u*, v*, what the correction found), None where it did nothing.
     work [J] that the stage adds to what passes note of loads.
     """

@@ -156,13 +156,16 @@ class VolumeConstraints(Correction):
     # ---- in passes ---------------------------------------------------------------------------------------------------
 
     def _ways(self, of, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(dV/dx where a pass begins, d)"""
+        """(dV/dx where a pass begins, d), found once of the numbers of a pass."""
+        if hasattr(of, "ways"):
+            return of.ways
         g = self.gradients(of, self.positions(of, u))
         G, inverse = value_of(g), 1 / value_of(of.mass)[:, None]
         eased = lambda by: np.stack([self.freed(inverse * own) for own in by])  # noqa: E731
         d = eased(G)
         by_mass = (lambda dm: -d * (dm[:, None] * inverse), lambda w: -(d * w).sum((0, 2)) * inverse[:, 0])
-        return g, made(d, (g, eased, lambda w: inverse * np.stack(list(map(self.freed, w)))), (of.mass, *by_mass))
+        of.ways = g, made(d, (g, eased, lambda w: inverse * np.stack(list(map(self.freed, w)))), (of.mass, *by_mass))
+        return of.ways
 
     def ends(self, of, at, u, y, v, found=None):
         now, (_, d) = at.now, self._ways(of, u)

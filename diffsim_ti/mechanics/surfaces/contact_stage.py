@@ -494,9 +494,10 @@ class PairContact(Stage):
         for part in one.parts[::-1]:
             e_adj, b_adj = one.solver.back(part, of, e_adj, b_adj, adj)
         self.by_rate += now.alpha_by_rate * adj.alpha + now.decay_by_rate * by_decay
-        for near, where, by in zip(one.near.sets, places, adj.sets):
+        for near, where, own, by in zip(one.near.sets, places, of.sets, adj.sets):
             x = self.sets[near.set]
-            self._add_of_set(x, *x.factors_vjp(near.here, *where, by), at_begin, p)
+            by_places, by_mass = x.factors_vjp(near.here, *where, own, by)
+            self._add_of_set(x, by_places, by_places, by_mass, at_begin, p)
         own = one.nodes < self.num_own
         at_begin[one.nodes[own]] += (adj.x - adj.motion)[: len(own)][own]
         p[one.nodes[own]] += adj.motion[: len(own)][own]
@@ -516,12 +517,13 @@ class PairContact(Stage):
         e, b, by_decay = one.e, one.b, 0.0
         for near, at in zip(one.near.sets, places):
             x, numbers = self.sets[near.set], near.at[len(near.here) :]
-            given = *at[:2], one.v[x.at], e[numbers], b[numbers], decay, at[2]
-            self.by_rest[x.vertices] -= p[x.at]  # displacements are places less these
-            x0, x1, q[x.at], e_adj[numbers], b_adj[numbers], by, m = x.settle_vjp(*given, by_x=p[x.at], by_v=q[x.at])
+            by_x, by_v = p[x.at], q[x.at]
+            by = x.settle_vjp(*at[:2], one.v[x.at], e[numbers], b[numbers], decay, at[2], by_x, by_v)
+            e_adj[numbers], b_adj[numbers], q[x.at] = by.e, by.b, by.v
+            self.by_rest[x.vertices] -= by_x  # displacements are places less these
             p[x.at] = 0
-            self._add_of_set(x, x0, x1, m, at_begin, p)
-            by_decay += by
+            self._add_of_set(x, by.x0, by.x1, by.m, at_begin, p)
+            by_decay += by.decay
         return by_decay
 
     def _add_of_set(self, x: SetInContact, by_x0, by_x1, by_mass, at_begin, p) -> None:
