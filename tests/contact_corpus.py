@@ -335,7 +335,7 @@ def comes_to_rest(run: Run) -> str | None:
 
 
 def _lies(run: Run) -> str | None:
-    """That of the last body, up and down alone: without friction it may slide."""
+    """The same of the last body, up and down alone: without friction it may slide."""
     height = run.body(3)[[-6, -1], :, 1].mean(1)
     speed = abs(float(np.diff(height)[0])) / (5 * run.posed.solver.dt)
     return None if speed < 0.003 * np.sqrt(2 * G) else f"still moves up or down at {speed:.2g} m/s"

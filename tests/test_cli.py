@@ -324,6 +324,14 @@ def test_simulate_says_how_accurate_the_end_is(solver, cube_file, tmp_path, caps
     assert (tmp_path / "cube_accuracy.png").exists() == (solver == "bdf2")  # explicit steps have no shares
 
 
+def test_simulate_lasts_as_long_as_asked_where_frames_are_no_multiples_of_a_step(cube_file, tmp_path, capsys):
+    out = tmp_path / "end.npz"
+    options = ["--duration", 0.03, "--fps", 100, "--dt", 0.004, "--solver", "bdf2", "--fixed", "xmin", "-o", out]
+    printed(capsys, "simulate", cube_file, *options)
+    with np.load(out) as found:
+        assert found["times"][-1] == pytest.approx(0.032)
+
+
 def test_simulate_refuses_an_unstable_step_in_one_line(cube_file, tmp_path, capsys):
     run = ["simulate", str(cube_file), "-o", str(tmp_path), "--dt", "0.03"]
     assert "exceeds the stable step" in fails(capsys, *run)
@@ -337,7 +345,8 @@ def test_errors_are_one_line(cube_file, tmp_path, capsys):
     assert "StableNeoHookean" in fails(capsys, *run, "--material", "Rubber")
     assert "poissons_ratio" in fails(capsys, *run, "--nu", "0.5")
     assert "cpu, cuda, vulkan" in fails(capsys, *run, "--backend", "abacus")
-    assert "longer than a frame, 1 / 30 s" in fails(capsys, *run, "--dt", "0.1")
+    assert "longer than a frame, 0.0333333 s" in fails(capsys, *run, "--dt", "0.1")
+    assert "longer than a frame, 0.01 s" in fails(capsys, *run, "--dt", "0.03", "--duration", "0.01")
     assert "no floor, of which friction would be" in fails(capsys, *run, "--no-ground", "--ground-friction", "0.5")
     assert "name what is by --fixed" in fails(capsys, *run, "--arrows", "reaction")
     assert "precision" in fails(capsys, *run, "--precision", "f16")

@@ -9,8 +9,9 @@ from gradient_fuzz.differences import derivative
 from gradient_fuzz.judge import PASSED, ZERO, judge
 from gradient_fuzz.report import Report, failure_text
 
-# the cheapest of each family of solvers; the command draws all others
-EXPLICIT = (39,)  # left out, as test_every_adjoint.py and test_loads_together.py have the same in explicit steps
+# the cheapest of each family of solvers; the command draws all others. That of explicit steps is left out, as
+# test_every_adjoint.py, test_loads_together.py and test_gradient_faults.py have the same there
+EXPLICIT = (39,)
 IMPLICIT = (52,)
 # Euler, Verlet, BDF2, statics; f32; patches; one launch per pass; self-contact
 OF_EACH_KIND = (34, 47, 60, 81, 93, 212)

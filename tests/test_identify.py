@@ -299,6 +299,12 @@ def test_an_offset_of_time(swing):
     found = identify(fine, data, {"youngs_modulus": 6e4, "time_offset": ds.Unknown(0.0, scale=0.01)})
     assert found.estimates["time_offset"] == pytest.approx(0.033, abs=3 * found.standard_errors["time_offset"])
     assert found.standard_errors["time_offset"] < 1e-3 and found.residuals_fit
+    whole = ds.Measurement("positions", exact.positions[:, MARKERS], 1e-4, MARKERS, exact.times)
+    for scale in (0.01, -0.01):  # which the run holds in place, but not the other
+        unknowns = {"youngs_modulus": 6e4, "time_offset": ds.Unknown(0.0, scale=scale)}
+        found = identify(fine, whole, unknowns, starts=1)
+        assert found.estimates["youngs_modulus"] == pytest.approx(TRUE["youngs_modulus"], rel=1e-3)
+        assert found.converged and "time_offset at the end of what its range, or its run" in found.stopped
 
 
 def test_products_are_transposes_and_derivatives():
@@ -423,6 +429,8 @@ def test_expected_intervals_and_the_best_markers(swing):
     ranked = ds.compare(swing, choices, TRUE)
     assert list(ranked) == ["xmax", "xmin"] and len(ranked["xmin"].unseen) == 2 and not ranked["xmax"].unseen
     assert ranked["xmax"].standard_errors == pytest.approx(foreseen.standard_errors)
+    noise = {"positions": NOISE, "velocities": 100 * NOISE}  # of all choices, each of which takes its own
+    assert len(ds.compare(swing, {"places": "positions", "speeds": "velocities"}, TRUE, noise)) == 2
 
 
 def test_refusals(swing):

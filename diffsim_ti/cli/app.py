@@ -184,6 +184,7 @@ def simulate(
     )
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt, opt.forces_named(arrows or (), scene))
+    frames = max(1, round(duration / run.frame_time))  # which has whole steps
     opt.check_time_it_takes(run, duration)
     setup = time.perf_counter() - begin
     writing, files, _ = run_and_write(run, frames, writers)

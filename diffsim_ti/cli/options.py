@@ -143,8 +143,9 @@ def check_length(duration: float, fps: float, dt: float | None) -> None:
             f"--duration {duration:g} at --fps {fps:g} makes {duration * fps:.3g} frames, more than {MOST_FRAMES:.0e}: "
             "shorten it, or take fewer frames per second"
         )
-    if dt is not None and dt * fps > 1 + 1e-9:
-        raise ValueError(f"--dt {dt:g} s is longer than a frame, 1 / {fps:g} s: take a shorter one, or a smaller --fps")
+    frame = duration / max(1, round(duration * fps))
+    if dt is not None and dt > (1 + 1e-9) * frame:
+        raise ValueError(f"--dt {dt:g} s is longer than a frame, {frame:g} s: take a shorter one, or a smaller --fps")
     if dt is not None and duration / dt > 1e12:
         raise ValueError(
             f"--duration {duration:g} in steps of --dt {dt:g} s takes {duration / dt:.3g} steps, more than 1e12: shorten "

@@ -160,7 +160,7 @@ def _is_far(search: Search, times: float) -> bool:
 def _result(searches: list[Search], search: Search, with_covariance: bool, check_mesh) -> Identification:
     problem, t, residual, stopped = search.problem, search.point.t, search.point.residual, search.stopped
     if ended := [label for label, x, ends in zip(problem.labels, t, problem.reach.T) if x in ends]:
-        stopped = f"{stopped}, with {', '.join(ended)} at the end of what its range lets it reach"
+        stopped = f"{stopped}, with {', '.join(ended)} at the end of what its range, or its run, lets it reach"
     starts = []
     for one in searches:
         ends = dict(start=problem.all_numbers(one.start), numbers=problem.all_numbers(one.point.t))

@@ -78,9 +78,10 @@ class Measurement(metaclass=Public):
             raise ValueError(f"{self.output}: expected values of shape {tuple(shape)}, got {self.values.shape}")
 
     def check_times(self, rollout: Rollout, offset: float) -> None:
-        """Raise ValueError where a time is none of the run."""
+        """Raise ValueError where a time is none of the run, by more than rounding."""
         (first, last), at = rollout.times[[0, -1]], self.times
-        if at is not None and np.any((at + offset < first) | (at + offset > last)):
+        slight = 1e-12 * (last - first)
+        if at is not None and np.any((at + offset < first - slight) | (at + offset > last + slight)):
             moved = f", with time_offset = {offset:g} s," if offset else ""
             raise ValueError(
                 f"{self.output}: times{moved} must lie within those of the run, {first:g} to {last:g} s; got "
@@ -134,11 +135,11 @@ def measurements(data, noise) -> list[Measurement]:
     """The data of one experiment as a list."""
     if isinstance(data, Measurement):
         return [data]
-    if isinstance(data, dict):
+    if isinstance(data, dict) and data:
         if noise is None:
             raise ValueError("identify: data given as {output: values} need noise, a number or {output: deviation}")
         each = noise if isinstance(noise, dict) else dict.fromkeys(data, noise)
-        if set(each) != set(data):
+        if not set(data) <= set(each):  # it may name more, of other experiments
             raise ValueError(f"identify: noise is of {', '.join(each)}, data of {', '.join(data)}: name each of these")
         return [Measurement(k, x, each[k]) for k, x in data.items()]
     out = list(data)

@@ -54,7 +54,7 @@ class Problem:
         ends = np.cumsum([0, *(free.size for free in self.unknowns)])
         self.parts, self.size = [slice(a, b) for a, b in zip(ends, ends[1:])], int(ends[-1])
         self.labels = [f"{f.label}[{i}]" if f.size > 1 else f.label for f in self.unknowns for i in range(f.size)]
-        self.reach = np.concatenate([free.reach() for free in self.unknowns], 1)
+        self.reach = np.concatenate([self._reach(free) for free in self.unknowns], 1)
         self.num_data = sum(int(m.seen.sum()) for given in data for m in given)
         when = [m.when(rollout) for rollout, given in zip(rollouts, data) for m in given]
         self.when, self.counts = np.concatenate([np.zeros(0), *when]), np.ones(())  # whether a datum does
@@ -77,6 +77,21 @@ class Problem:
                         "keep one, or tell them apart by regions (-1 for what is fixed) or experiments"
                     )
             seen[free.input].append(free)
+
+    def _reach(self, free: Free) -> np.ndarray:
+        """The least and the largest t of an unknown; times that an offset is added to stay within those of their runs."""
+        reach = free.reach()
+        if not free.is_offset:
+            return reach
+        timed = [
+            (self.rollouts[k].times, m.times) for k in free.experiments for m in self.data[k] if m.times is not None
+        ]
+        least = max(run[0] - at.min(initial=np.inf) for run, at in timed)
+        most = min(run[-1] - at.max(initial=-np.inf) for run, at in timed)
+        with np.errstate(invalid="ignore", divide="ignore"):  # of what the unknown itself cannot be
+            low, high = free.free(least), free.free(most)
+        low, high = (low, high) if free.slopes(np.zeros(1)) > 0 else (high, low)
+        return np.stack([np.minimum(np.fmax(reach[0], low), 0.0), np.maximum(np.fmin(reach[1], high), 0.0)])
 
     def _of(self, k: int) -> Iterable[tuple[Free, slice]]:
         return [(free, part) for free, part in zip(self.unknowns, self.parts) if k in free.experiments]

@@ -30,7 +30,7 @@ class Unknown(metaclass=Public):
     regions: names of the mesh's sets of tetrahedra, a number for each, what lies in none keeps the scene's value; "each" for
     one per tetrahedron; or whole numbers of the input's shape, equal ones for what changes together, -1 for what is fixed.
     input: its name; default the unknown's own. "time_offset" [s] is added to the times of measurements,
-    which must stay within those of the run.
+    which it keeps within those of the run.
     experiments: indices of the rollouts that it acts in; default all.
     Errors are ValueErrors before any run. Seber, Wild, Nonlinear Regression, 1989, sec. 2.8, on such transformations.
     """
