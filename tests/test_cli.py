@@ -329,7 +329,7 @@ def test_simulate_lasts_as_long_as_asked_where_frames_are_no_multiples_of_a_step
     options = ["--duration", 0.03, "--fps", 100, "--dt", 0.004, "--solver", "bdf2", "--fixed", "xmin", "-o", out]
     printed(capsys, "simulate", cube_file, *options)
     with np.load(out) as found:
-        assert found["times"][-1] == pytest.approx(0.032)
+        assert found["time"][-1] == pytest.approx(0.032)
 
 
 def test_simulate_refuses_an_unstable_step_in_one_line(cube_file, tmp_path, capsys):
