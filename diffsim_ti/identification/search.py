@@ -142,16 +142,18 @@ class LevenbergMarquardt:
             damped = self.hessian + np.diag(damping * np.diag(self.hessian) + LEAST)
             return -np.linalg.solve(damped, self.gradient)
 
-        def product(d):
-            both = problem.transposed(self.search.point, problem.product(self.search.point, d))
-            return self.moves * both + self.prior_hessian @ d + (damping + LEAST) * d
+        root = np.linalg.cholesky(np.linalg.inv(self.prior_hessian + np.eye(problem.size)))  # of residuals
 
-        solve = np.linalg.inv(self.prior_hessian + np.eye(problem.size))
-        before, self.size = self.size, float(self.gradient @ solve @ self.gradient)
+        def product(y):
+            d = root @ y
+            both = problem.transposed(self.search.point, problem.product(self.search.point, d))
+            return root.T @ (self.moves * both + self.prior_hessian @ d + (damping + LEAST) * d)
+
+        right = -(root.T @ self.gradient)
+        before, self.size = self.size, float(right @ right)
         share = FORCING[1] if before is None else float(np.clip(self.size / before, *FORCING))
         operator = LinearOperator((problem.size, problem.size), product, dtype=np.float64)
-        left = share * np.linalg.norm(self.gradient)
-        return cg(operator, -self.gradient, atol=left, maxiter=100, M=solve)[0]
+        return root @ cg(operator, right, atol=share * np.linalg.norm(right), maxiter=100)[0]
 
     def limited(self, step: np.ndarray) -> np.ndarray:
         """A step that changes no logarithm and no bounded number by more than LONGEST."""
