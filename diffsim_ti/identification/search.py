@@ -142,7 +142,8 @@ class LevenbergMarquardt:
             damped = self.hessian + np.diag(damping * np.diag(self.hessian) + LEAST)
             return -np.linalg.solve(damped, self.gradient)
 
-        root = np.linalg.cholesky(np.linalg.inv(self.prior_hessian + np.eye(problem.size)))  # of residuals
+        # residuals r are measured by |root^T r|, as the prior weighs the unknowns
+        root = np.linalg.cholesky(np.linalg.inv(self.prior_hessian + np.eye(problem.size)))
 
         def product(y):
             d = root @ y

@@ -42,11 +42,13 @@ class Correction:
 
     def ends(self, of, at: Passes, u: np.ndarray, y: np.ndarray, v: np.ndarray, found=None) -> tuple:
         """(u', v', what is found) of y = u* and v = v*; found: what it was, where derivatives follow."""
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} corrects displacements: it writes ends(of, at, u, y, v, found)"
+        )
 
     def shown(self, of, at: Passes, u: np.ndarray, v: np.ndarray, found=None) -> tuple:
         """(what a frame shows of v, what is found); found: constant forces of constraint."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} corrects velocities: it writes shown(of, at, u, v, found)")
 
     def note(self, at: Passes, found) -> None:
         """A pass has found this."""

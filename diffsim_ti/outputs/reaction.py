@@ -94,10 +94,8 @@ class Reaction(Output):
         return (num_frames, len(self.vertices), 3) if self.per_vertex else (num_frames, 3)
 
     def value(self, frames: Frames) -> np.ndarray:
-        of, (u, v) = (
-            derived(self.scene, frames),
-            (x.astype(np.float64) for x in (frames.displacements, frames.velocities)),
-        )
+        of = derived(self.scene, frames)
+        u, v = (x.astype(np.float64) for x in (frames.displacements, frames.velocities))
         f, held = self.body.at_frames(of, u, v, self.remembered(frames, self.scene)), []
         for k, step in enumerate(frames.steps):
             x, p = frames.positions[k].astype(np.float64), None

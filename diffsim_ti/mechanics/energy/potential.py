@@ -171,8 +171,8 @@ class Potential:
 
     def energies_beside(self) -> np.ndarray:
         """Those from the host and of joints [J]."""
-        own = [part.energies() for part in (self.joints,) if part]
-        return np.concatenate([np.zeros(0), self.hosts.energies(self.held_at), *own])
+        of_joints = self.joints.energies() if self.joints else np.zeros(0)
+        return np.concatenate([self.hosts.energies(self.held_at), of_joints])
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(forces -dE/du [N], sum of the sizes of the forces that meet at each vertex)."""

@@ -153,12 +153,8 @@ class FrictionProduct:
         self, corners: np.ndarray, weights: np.ndarray, pressing: np.ndarray, speed: np.ndarray, per_gamma
     ) -> None:
         """Four corners and weights, (n, mu N) and the friction speed of each pair."""
-        count, surface, vector, fp = (
-            len(corners),
-            self.pairs.mesh.surface_vertices,
-            self.pairs.kernels.vec4,
-            self.pairs.a.fp,
-        )
+        count, surface = len(corners), self.pairs.mesh.surface_vertices
+        vector, fp = self.pairs.kernels.vec4, self.pairs.a.fp
         at = np.searchsorted(surface, corners.ravel())
         runtime.fill(self.of.row, np.concatenate([[0], np.bincount(at, minlength=len(surface)).cumsum()]))
         own = dict(pairs=(ti.i32, corners.ravel()), corner_of=(ti.i32, at.argsort(kind="stable")))

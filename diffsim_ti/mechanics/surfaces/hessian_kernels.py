@@ -66,6 +66,7 @@ class HessianKernels(ListedPair):
 
     @ti.func
     def sum_corners(self, scene: A, out: A, plan: A):
+        """What the pairs that act have stored for each surface vertex."""
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             total = self.vec4(0)
