@@ -6,6 +6,7 @@ truncate by definition. Prints every failure with the command that repeats it, t
 """
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -15,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from gradient_fuzz.judge import judge  # noqa: E402
 from gradient_fuzz.report import Report, as_json, failure_text  # noqa: E402
+from gradient_fuzz.structures import PER_STRUCTURE  # noqa: E402
 
 import diffsim_ti as ds  # noqa: E402
 
@@ -23,6 +25,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=30.0, help="how long; default 30")
     parser.add_argument("--configurations", type=int, help="how many; default as many as time allows")
+    parser.add_argument("--each", type=int, default=PER_STRUCTURE, help="how many of a structure; default all, 8")
     parser.add_argument("--seed", type=int, default=0, help="the first seed; default 0")
     parser.add_argument("--only", action="store_true", help="only this seed, with every derivative")
     parser.add_argument("--arch", default="cpu", help="where kernels run; default cpu")
@@ -30,8 +33,9 @@ def main() -> int:
     arguments = parser.parse_args()
     ds.init(arguments.arch, "f64")
     end, report = time.monotonic() + 60 * arguments.minutes, Report()
-    last = arguments.seed + (1 if arguments.only else arguments.configurations or sys.maxsize)
-    for seed in range(arguments.seed, last):
+    count = 1 if arguments.only else arguments.configurations
+    seeds = (s for s in itertools.count(arguments.seed) if arguments.only or s % PER_STRUCTURE < arguments.each)
+    for seed in itertools.islice(seeds, count):
         if time.monotonic() > end:
             break
         result = judge(seed)
