@@ -12,6 +12,7 @@ from test_reduced import bar, motions, scene_of
 
 import diffsim_ti as ds
 from diffsim_ti import verify
+from diffsim_ti.mechanics.surfaces import contact_stage
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.terms.obstacles.barrier import beta
 
@@ -346,7 +347,7 @@ def test_a_narrow_obstacle_pushes_a_set(kind):
 
 
 @pytest.mark.parametrize("kind, friction", [("affine", 0.4), ("rigid", 0.0), ("rigid", 0.4), ("functions", 0.0)])
-def test_surfaces_push_a_set(kind, friction):
+def test_surfaces_push_a_set(kind, friction, monkeypatch):
     """Momenta are kept to round-off, angular momentum without friction; gradients know that few numbers share its mass."""
     low = ds.TetrahedralMesh.create_box(2, size=0.1)
     up = ds.TetrahedralMesh.create_box(2, size=0.08, origin=(0.01, 0.104, 0.02)).rotated([0, 1, 0], 0.1)
@@ -378,6 +379,11 @@ def test_surfaces_push_a_set(kind, friction):
     else:
         np.testing.assert_allclose(distances(frames.positions[-1, 8:]), distances(up.vertices), atol=1e-15)
     assert verify.dot_product_test(rollout) <= 1e-12
+    weights = np.random.default_rng(0).standard_normal(frames.positions.shape)
+    gradients = rollout.vjp(frames, weights)
+    monkeypatch.setattr(contact_stage, "CLOSE", 0)
+    for name, again in rollout.vjp(rollout.forward(), weights).items():  # whatever else is near
+        np.testing.assert_array_equal(again, gradients[name], name)
     if kind == "rigid" and friction:
         names = ["density", "rest_positions", "initial_positions", "self_contact_friction"]
         assert ds.check_gradients(rollout, inputs=names, verbose=False).passed

@@ -31,7 +31,7 @@ stops what comes at a width in h: as stiff as the part resolves, and without eff
 be. So surfaces stay apart whatever the stiffness, and what it cannot hold is lost as in an inelastic impact.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -57,6 +57,19 @@ class NearPairs:
     C: object
     free: np.ndarray | None
     sets: list[SimpleNamespace]  # at: nodes, the vertices first, `here` of the set; twist: a node, or None
+
+    def of_own_nodes(self) -> tuple["NearPairs", np.ndarray]:
+        """The same without nodes that no pair reads, where sets are; which nodes are kept."""
+        read, sets = np.unique(self.C[np.unique(self.corners)].indices), []
+        for x in self.sets:
+            here = np.isin(x.at[: len(x.here)], read)
+            if here.any():
+                sets.append(vars(x) | dict(here=x.here[here], at=np.append(x.at[: len(x.here)][here], x.at[len(x.here) :])))
+        kept = np.unique(np.concatenate([read, *(x["at"] for x in sets)]))
+        for x in sets:
+            x |= dict(at=np.searchsorted(kept, x["at"]), twist=x["twist"] and int(np.searchsorted(kept, x["twist"])))
+        free = None if self.free is None else self.free[kept]
+        return replace(self, C=self.C[:, kept].tocsr(), free=free, sets=[SimpleNamespace(**x) for x in sets]), kept
 
     def points(self, nodes: np.ndarray) -> np.ndarray:
         return nodes if self.C is None else self.C @ nodes

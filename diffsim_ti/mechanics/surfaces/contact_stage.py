@@ -31,6 +31,7 @@ MOST_LISTS = 6  # made for one pass
 MOST_TRIES = 12  # at a pass with one list, each with the pairs that came near in the one before
 PASSES = 1.5, 15  # like this one, that a list made for it should hold for, at least and at most
 SHORTEST = 2.0**-14  # share of a pass
+CLOSE = 2  # widths up to which pairs are taken into the set before they are near, so that it is seldom extended
 
 
 class FarFromAll(Exception):
@@ -235,14 +236,13 @@ class PairContact(Stage):
         else:
             self._refuse(at, now)
         if b is not None and recording:
-            one = self.whole.of(near.chosen > 0, start, u, v)
-            one.parts, one.e, one.b = parts, e, b
+            one = self.whole.of(near.chosen > 0, start, u, v, parts, e, b)
         return one, lost
 
     def _extend(self, numbers: np.ndarray, now) -> None:
         """Take more pairs of the list into the set of those that have been near since it was made."""
         inner = self.inner
-        close = whole(inner.plane)[: inner.list.count, 3] < 2 * inner.width  # so that it is seldom extended
+        close = whole(inner.plane)[: inner.list.count, 3] < CLOSE * inner.width
         close[numbers] = True
         if self.set.builds == inner.builds:
             close[self.set.numbers] = True
