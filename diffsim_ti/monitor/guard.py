@@ -198,8 +198,11 @@ class Guard:
     def _advance(self, first: int, last: int, num_passes: int, save_every: int, recording: bool) -> None:
         """The same where all have one length."""
         balance = self.ws.energy_watch if self.ws.solver.explicit else None
+        schedule, bends = self.ws.solver.schedule, self.ws.bending and np.isfinite(self.ws.bending.of_pairs)
         while first < last:
             stop = min(last, first + self.every)
+            if bends:  # looked at after each step, so that what is found does not depend on where segments end
+                stop = min(stop, int(schedule.first(schedule.row(first) + 1)))
             if balance:
                 balance.before(first, num_passes)
             self.mark(first)
