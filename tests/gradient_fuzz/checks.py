@@ -4,7 +4,7 @@ import numpy as np
 
 import diffsim_ti as ds
 from diffsim_ti import verify
-from diffsim_ti.terms import Cable, Chamber, Load
+from diffsim_ti.terms.over_time import GivenOverTime
 
 from . import faces
 from .at_once import scenes_at_once
@@ -111,7 +111,7 @@ class Chain:
             {n for n in ("external_forces",) if n in self.values and self.values[n].ndim == 3},
         )
         for term in scene.terms:
-            if isinstance(term, (Load, Chamber, Cable)):
+            if isinstance(term, GivenOverTime):
                 name = scene.input_names(term)[term.plain]
                 if term.keyed:
                     self.keyed.add(name)
