@@ -187,6 +187,30 @@ def test_a_run_that_finds_faces_bent_through_each_other_has_smaller_triangles_on
     assert simulator.smallest_gap() > 0 and isinstance(simulator.workspace.pairs, CurvedPairs)
 
 
+def test_what_a_run_took_faces_for_goes_with_its_gradient_and_its_state():
+    """After another run whose faces bend more, the gradient is that of the frames; a state has how far they do."""
+    low = ds.TetrahedralMesh.create_box((2, 2, 2), size=0.1)
+    both = ds.TetrahedralMesh.joined({"low": low, "top": low.translated((0.01, 0.102, 0))}).quadratic()
+    velocity = np.zeros((both.num_vertices, 3))
+    velocity[both.vertex_sets["top"]] = [0.1, -1.0, 0.05]
+    scene = scene_of(both, ds.SelfContact(2e3, 0.003), E=5e4, fixed="low_ymin", initial_velocities=velocity)
+    solver = EXPLICIT(scene, dt=2e-3)
+    rollout = ds.Rollout(solver, 3, gradients="youngs_modulus")
+    slow = rollout.forward(initial_velocities=0.1 * velocity)
+    before = rollout.vjp(slow, slow.positions)["youngs_modulus"]
+    fast = rollout.forward()
+    assert rollout.sweep.bend > 0 and rollout.vjp(slow, slow.positions)["youngs_modulus"] == before
+    batch = ds.Batch(solver, 3, scenes=2).forward(initial_velocities=np.stack([velocity, 0.1 * velocity]))
+    np.testing.assert_array_equal(batch.positions, [fast.positions, slow.positions])
+    one, other = ds.Simulator(solver), ds.Simulator(solver)
+    one.run(3)
+    state = {name: x.copy() for name, x in one.state.items()}
+    one.step()
+    other.resume(state)
+    other.step()
+    assert state["bend"] > 0 and np.array_equal(one.positions, other.positions)
+
+
 def rough_balls(precision="f64", friction=0.4, **options) -> ds.Scene:
     contact = ds.SelfContact(2e3, W, friction=friction, friction_speed=5e-3)
     return balls_face_to_face(precision=precision, **options).replace(terms=[contact])
