@@ -293,8 +293,7 @@ class Simulator(metaclass=Public):
         two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps and
         what multigrid has learned there, joint_states of robots with positions and velocities before (joints, 5), what
         steps were given over time, substeps where more were taken than at the start, and how far faces of ten nodes that
-        touch are taken to bend [m]. `np.savez(file,
-        **simulator.state)` keeps it, to the bit."""
+        touch are taken to bend [m]. `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:

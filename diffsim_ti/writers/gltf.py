@@ -18,7 +18,8 @@ class GltfWriter(SurfacesWriter):
 
     Each frame is a morph target, whose weight the animation brings to 1 at the frame's time [s] and leads linearly to the
     next. Places are those of the first frame, of what is far from the origin less a translation (origin.py), and float32
-    differences to it [m]. In glTF y is up: where the scene's gravity acts along z, nodes are turned. A body has one colour: colours of a field cannot move in glTF.
+    differences to it [m]. In glTF y is up: where the scene's gravity acts along z, nodes are turned. A body has one colour:
+    colours of a field cannot move in glTF.
     Khronos Group 2021, glTF 2.0 Specification, sections 3.7.2 (morph targets) and 3.11 (animations).
     """
 
