@@ -11,6 +11,7 @@ from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
+from diffsim_ti.accuracy.replay import Replay
 from diffsim_ti.diff_simulator import TorchSimulator
 from diffsim_ti.mechanics.surfaces import curved_pairs
 from diffsim_ti.mechanics.surfaces.curved_pairs import CurvedPairs
@@ -185,6 +186,34 @@ def test_a_run_that_finds_faces_bent_through_each_other_has_smaller_triangles_on
     simulator.reset()
     simulator.run(1)
     assert simulator.smallest_gap() > 0 and isinstance(simulator.workspace.pairs, CurvedPairs)
+
+
+def test_what_a_run_took_faces_for_goes_with_its_gradient_and_its_state():
+    """After another run whose faces bend more, the gradient is that of the frames; a state has how far they do."""
+    low = ds.TetrahedralMesh.create_box((2, 2, 2), size=0.1)
+    both = ds.TetrahedralMesh.joined({"low": low, "top": low.translated((0.01, 0.102, 0))}).quadratic()
+    velocity = np.zeros((both.num_vertices, 3))
+    velocity[both.vertex_sets["top"]] = [0.1, -1.0, 0.05]
+    scene = scene_of(both, ds.SelfContact(2e3, 0.003), E=5e4, initial_velocities=velocity)
+    solver = EXPLICIT(scene, dt=2e-3)
+    rollout = ds.Rollout(solver, 3, gradients="youngs_modulus")
+    slow = rollout.forward(initial_velocities=0.1 * velocity)
+    before = rollout.vjp(slow, slow.positions)["youngs_modulus"]
+    fast = rollout.forward()
+    assert rollout.sweep.bend > 0 and rollout.vjp(slow, slow.positions)["youngs_modulus"] == before
+    batch = ds.Batch(solver, 3, scenes=2).forward(initial_velocities=np.stack([velocity, 0.1 * velocity]))
+    np.testing.assert_array_equal(batch.positions, [fast.positions, slow.positions])
+    one, other = ds.Simulator(solver), ds.Simulator(solver)
+    one.run(3)
+    state = {name: x.copy() for name, x in one.state.items()}
+    one.step()
+    other.resume(state)
+    other.step()
+    assert state["bend"] > 0 and np.array_equal(one.positions, other.positions)
+    again = ds.Rollout(IMPLICIT(scene, dt=2e-3), 3)
+    Replay(again)  # of estimated errors, whose passes end, too
+    again.forward()
+    assert again.sweep.bend > 0
 
 
 def rough_balls(precision="f64", friction=0.4, **options) -> ds.Scene:

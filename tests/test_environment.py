@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from example_files import EXAMPLES, example
 
+import diffsim_ti as ds
+
 gym = pytest.importorskip("gymnasium")
 TASKS = ["Jumper", "Crawler", "Grasp"]
 
@@ -50,6 +52,17 @@ def test_tasks_pass_gymnasiums_checks(task):
     first = many.step(action)
     many.reset(seed=3)
     np.testing.assert_array_equal(many.step(action)[0], first[0])
+
+
+def test_a_law_that_remembers_is_refused_when_a_task_is_made(jumper):
+    class Relaxing(jumper.SoftJumpers):
+        @staticmethod
+        def make_scene():
+            scene = jumper.SoftJumpers.make_scene()
+            return scene.replace(material=ds.Prony(scene.material, [0.3], [0.02]))
+
+    with pytest.raises(ValueError, match="nor from what a law remembers: take a Simulator for each scene"):
+        Relaxing(1)
 
 
 def test_pads_lift_a_cube():

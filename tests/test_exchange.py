@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import diffsim_ti as ds
 from diffsim_ti.cli import app
@@ -202,7 +203,8 @@ def animated(path) -> list[tuple[np.ndarray, np.ndarray]]:
             times, targets = read(sampler["input"])[:, 0], [read(t["POSITION"]) for t in shape["targets"]]
             weights = read(sampler["output"]).reshape(len(times), len(targets))
             first = first + np.einsum("ft,tni->fni", weights, np.stack(targets))
-        found.append((first, times))
+        turn = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1]))
+        found.append((turn.apply(first.reshape(-1, 3)).reshape(first.shape), times))
     return found
 
 
@@ -231,9 +233,9 @@ def written(tmp_path_factory):
 def test_gltf_moves_as_the_run_does(written):
     folder, places, _ = written
     body, ball, wall = animated(folder / "run.glb")
-    np.testing.assert_allclose(body[0], places, atol=1e-6)
+    np.testing.assert_allclose(body[0], places[..., [0, 2, 1]] * [1, 1, -1], atol=1e-6)  # y is up in glTF
     np.testing.assert_allclose(body[1], [0, 0.02, 0.04, 0.06], atol=1e-7)
-    np.testing.assert_allclose(np.ptp(ball[0], axis=0).max(0), [0, 0.06, 0], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(ball[0], axis=0).max(0), [0, 0, 0.06], atol=1e-6)
     assert len(wall[0]) == 1  # what stands has no targets
 
 

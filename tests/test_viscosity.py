@@ -55,6 +55,19 @@ def test_a_tetrahedron_swings_as_an_oscillator_does(solver, most):
     np.testing.assert_allclose(got, want, rtol=0, atol=most)
 
 
+def test_relations_beside_viscosity_go_on_from_a_saved_state_with_the_same_bits():
+    """Matrices that a pass begins with have its own rates, not those of a pass before."""
+    hold = ds.MultiPointConstraint([5, 7], [[1.0, 0, 0.2], [-1.0, 0.3, 0]], value=lambda t: 2 * t)
+    body = scene(ds.KelvinVoigt(ELASTIC, time=0.1), terms=[hold, ds.Gravity()], fixed="zmin")
+    one, other = (ds.Simulator(made(ds.BDF2Solver, body, 0.02)) for _ in range(2))
+    one.run(3)
+    kept = {name: x.copy() for name, x in one.state.items()}
+    one.step()
+    other.resume(kept)
+    other.step()
+    np.testing.assert_array_equal(other.velocities, one.velocities)
+
+
 def test_time_times_moduli_is_the_two_viscosities():
     """And negative lam has a bulk viscosity, too."""
     for nu in (NU, -0.3):

@@ -32,7 +32,7 @@ class Replay:
     def __init__(self, rollout, given: Sequence[np.ndarray] | None = None, solves: bool = False):
         self.rollout, self.given, self.solves, sweep = rollout, given, solves, rollout.sweep
         self.places, self.residuals, self.sizes, self.weights = {}, {}, {}, {}
-        sweep.make_workspace = lambda derived: self._joined(sweep.solver.workspace(derived))
+        sweep.make_workspace = lambda derived: self._joined(sweep.solver.workspace(derived, sweep.bend))
         sweep.make_adjoint = lambda density, shape: _Adjoint(self, sweep.workspace, density, shape)
 
     def _joined(self, workspace: ImplicitWorkspace) -> ImplicitWorkspace:

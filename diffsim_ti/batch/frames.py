@@ -17,6 +17,7 @@ from diffsim_ti.terms import Robot
 
 if TYPE_CHECKING:
     from diffsim_ti.batch.batch import Batch
+    from diffsim_ti.scene import Scene
 
 
 class LazyFrames(Sequence):
@@ -38,6 +39,15 @@ class LazyFrames(Sequence):
 
     def __reduce__(self):
         return list, (list(self),)
+
+
+def check_goes_on(scene: "Scene") -> None:
+    """Raise ValueError unless a run may start from where another one ended, by positions and velocities."""
+    if scene.law.state_names or scene.term(Robot):
+        raise ValueError(
+            "a run does not start from joints of robots that have moved, nor from what a law remembers: take a "
+            "Simulator for each scene, whose steps go on from there"
+        )
 
 
 class BatchFrames(Sequence, metaclass=Public):
@@ -105,12 +115,7 @@ class BatchFrames(Sequence, metaclass=Public):
         `reset` restarts some scenes. What is given over time begins again with that run, and BDF2 with backward Euler.
         Raises ValueError for scenes with robots, and laws that remember, whose states no input of a run has.
         """
-        scene = self._batch.scene
-        if scene.law.state_names or scene.term(Robot):
-            raise ValueError(
-                "a run does not start from joints of robots that have moved, nor from what a law remembers: take a "
-                "Simulator for each scene, whose steps go on from there"
-            )
+        check_goes_on(self._batch.scene)
         rest = self.values["rest_positions"]
         rest = np.stack(rest) if isinstance(rest, tuple) else rest
         return dict(

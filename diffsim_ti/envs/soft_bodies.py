@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from diffsim_ti.batch import Batch
+from diffsim_ti.batch.frames import check_goes_on
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver
 
@@ -21,6 +22,7 @@ class SoftBodies(gymnasium.vector.VectorEnv):
     and rewarded. What a step does is `batch.forward(initial_positions=..., initial_velocities=..., **inputs(actions))`, so
     that gradients go through `batch.vjp`, or in torch through `diffsim_ti.rollout_frames(batch, ...)`.
     step_time [s]; horizon: steps of an episode; substeps of a step.
+    Raises ValueError for a scene with a robot, or a law that remembers, whose states no input of a run has.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -30,6 +32,7 @@ class SoftBodies(gymnasium.vector.VectorEnv):
 
     def __init__(self, num_envs: int = 32):
         self.scene, self.num_envs = self.make_scene(), num_envs
+        check_goes_on(self.scene)
         solver = SemiImplicitSolver(self.scene, dt=self.step_time, substeps=self.substeps)
         self.batch = Batch(solver, 1, num_envs, gradients=self.gradients)
         X = self.scene.mesh.vertices

@@ -207,7 +207,7 @@ def named(law: str, p: np.ndarray) -> dict:
 
 def shear_modulus(law: str, p: np.ndarray) -> float:
     """That of small strains [Pa]."""
-    return float(nominal_stress(law, p, np.array([1 + 1e-5]))[0] / 3e-5)
+    return float(np.diff(nominal_stress(law, p, np.array([1 - 1e-5, 1 + 1e-5])))[0] / 6e-5)
 
 
 def interval_widths(law: str, p: np.ndarray, curves: Sequence[Curve]) -> np.ndarray:

@@ -75,9 +75,13 @@ class TensileTest:
 
     @property
     def rate(self) -> float | None:
-        """Nominal rate of strain at the beginning [1/s], from the header's speed and length."""
-        speed, length = (of_header(self.header, word, "mm") for word in ("speed", "length"))
-        return speed / 60 / length if speed and length else None
+        """Nominal rate of strain at the beginning [1/s], from the header's speed [mm/min or mm/s] and length [mm]."""
+        length = of_header(self.header, "length", "mm")
+        for time, seconds in (("min", 60), ("s(?:ec)?", 1)):
+            speed = of_header(self.header, "speed", rf"mm\s*/\s*{time}")
+            if speed and length:
+                return speed / seconds / length
+        return None
 
 
 def _cells(path) -> list[list[str]]:

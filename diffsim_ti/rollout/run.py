@@ -24,6 +24,7 @@ class Run:
     start: called with the workspace after the values are loaded; sets another start there, the same each time.
     first_step: steps that came before, for reports.
     seen_by: the name of the sweep that looked after it to its end.
+    bend: how far it took faces of ten-node tetrahedra to bend [m] (state/bending.py), once it came to its end.
     error: what stopped it, where the sweep marks runs that fail; its frames hold the last good one from there on.
     """
 
@@ -33,6 +34,7 @@ class Run:
     law_state: np.ndarray | None = None
     contacts: Callable[[], ContactResolution] | None = field(default=None, repr=False)
     seen_by: object | None = field(default=None, repr=False)
+    bend: float | None = field(default=None, repr=False)
     error: FloatingPointError | None = None
 
     __repr__ = brief_fields

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.answers import answered
-from diffsim_ti.common.checked import instance, numbers, whole
+from diffsim_ti.common.checked import between, instance, numbers, whole
 from diffsim_ti.common.origin import positions_of
 from diffsim_ti.common.public import Public
 from diffsim_ti.common.warn import warn
@@ -164,7 +164,8 @@ class Simulator(metaclass=Public):
         `step(activation=0.3)`. What it has by a function or by keyframes, as motions and paths are, goes linearly within the
         step to the value given, from where it was: `step(path=(0.0, 0.1, 0.0))`; or two values, as the step begins and ends.
         Values stay, as they end, in the steps to come, until others are given or the simulator is reset. A run of a
-        Rollout with the same rows has the same states. For gradients of control loops see `diff_simulator.TorchSimulator`.
+        Rollout with the same rows has the same states, unless ten-node faces that touch bend more on the way than they were
+        taken for: a run takes them so from its start on. For gradients of control loops see `diff_simulator.TorchSimulator`.
         Raises ValueError for unknown names and for shapes, before anything moves.
         """
         before = self._set
@@ -291,8 +292,8 @@ class Simulator(metaclass=Public):
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
         two-step solvers the displacements and velocities before, pressures of constrained volumes in implicit steps and
         what multigrid has learned there, joint_states of robots with positions and velocities before (joints, 5), what
-        steps were given over time, and substeps where more were taken than at the start. `np.savez(file,
-        **simulator.state)` keeps it, to the bit."""
+        steps were given over time, substeps where more were taken than at the start, and how far faces of ten nodes that
+        touch are taken to bend [m]. `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:
@@ -308,6 +309,8 @@ class Simulator(metaclass=Public):
             out["preconditioner"] = state.beside[0].numbers()
         if self.solver is not self._first_solver:
             out["substeps"] = np.array(int(self.solver.substeps))
+        if self.workspace.arrays.bend:
+            out["bend"] = np.array(self.workspace.arrays.bend)
         return out | self._set
 
     def resume(self, state: dict) -> None:
@@ -322,7 +325,7 @@ class Simulator(metaclass=Public):
         held = {"constraint_pressures"} if self.workspace.volumes and not self.solver.explicit else set()
         more_substeps = {"substeps"} if self._first_solver.automatic else set()
         matrices = set() if self.solver.explicit else {"preconditioner"}
-        optional = two_step | over_time | held | more_substeps | matrices
+        optional = two_step | over_time | held | more_substeps | matrices | {"bend"}
         lacking, more = known.keys() - optional - given.keys(), given.keys() - known.keys() - optional
         if lacking or more or len(given.keys() & two_step) == 1:
             raise ValueError(
@@ -342,6 +345,8 @@ class Simulator(metaclass=Public):
                 )
         law_state = self.workspace.checked_law_state(given["law_state"]) if "law_state" in given else None
         following = Following.of(given["preconditioner"], shape) if matrices & given.keys() else None
+        if (bend := between("resume: bend", given.get("bend", 0.0), 0, np.inf, True)) != self.workspace.arrays.bend:
+            self._make_workspace(bend)
         self.reset()
         kept = {name: given[name] for name in over_time & given.keys()}
         self._set = self._step_values.next(int(count), kept, {})

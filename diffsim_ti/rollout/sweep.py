@@ -76,7 +76,7 @@ class Sweep:
         self.run_substeps = RunSubsteps(solver, self.values) if solver.automatic else None
         self._plan()
         self.workspace = None  # made by the first run
-        self._bend = 0.0  # how far faces have bent in runs so far [m] (state/bending.py)
+        self.bend = 0.0  # how far faces bend in the last run [m] (state/bending.py)
         self._name = object()  # that runs bear
         self._loaded, self._started = None, False  # the values that are on the device; whether the run began elsewhere
         self._current = None  # the run whose frames and snapshots the workspace holds
@@ -155,7 +155,11 @@ class Sweep:
         return self.scene.inputs.derive(values)
 
     def make_workspace(self, derived):
-        return self.solver.workspace(derived, self._bend)
+        return self.solver.workspace(derived, self.bend)
+
+    def take_bend(self, bend: float) -> None:
+        """Faces bend so far from here on [m]."""
+        self.bend, self.workspace, self._adjoint, self._loaded = bend, None, None, None
 
     def _make_guard(self):
         return Guard(self.workspace)
@@ -221,6 +225,8 @@ class Sweep:
             raise RuntimeError("the solver's substeps changed since this Rollout was made: make a new one")
         self._current = None  # until the sweep is through
         values = run.values
+        if run.bend not in (None, self.bend):
+            self.take_bend(run.bend)
         if self._loaded is not None and all(value is self._loaded[name] for name, value in values.items()):
             self.workspace.restart()
             if self._started:
@@ -253,8 +259,7 @@ class Sweep:
             try:
                 return self._forward_as_bent(run, again)
             except FacesBend as bent:
-                self._bend, self._loaded = bent.bend, None
-                self.workspace = self._adjoint = None
+                self.take_bend(bent.bend)
 
     def _forward_as_bent(self, run: Run, again: bool) -> None:
         self._load(run)
@@ -277,7 +282,7 @@ class Sweep:
                 advance(first, last, self.num_passes, self.save_every, self._recorded)
         if self.solver.last_frame_is_state:
             ws.save_frame(self.num_frames - 1)
-        run.seen_by = self._name
+        run.seen_by, run.bend = self._name, self.bend
         self._kept, self._current = path, run  # segments whose starts are in the snapshots
 
     def _expects_gradient(self) -> bool:

@@ -10,7 +10,9 @@ class VelocityVerletSolver(ExplicitSolver):
 
     Second order; the two half kicks that meet at a time share one force evaluation. Drag acts in the middle of the
     drift (exact, symmetric). Stable for h <= 2 / omega_max. Forces given per step enter a kick that two steps share
-    with half of each, or with their parts of it where steps are unequal. Hairer, Lubich, Wanner, Geometric Numerical
+    with half of each, or with their parts of it where steps are unequal. A `Simulator` ends each step with a force of its
+    own: the same, but of viscous laws, and of contact beside what is held exactly, which a run takes at the speed between
+    two kicks there. Hairer, Lubich, Wanner, Geometric Numerical
     Integration, I.1.4, doi:10.1007/3-540-30666-8.
 
     >>> import diffsim_ti as ds

@@ -18,7 +18,8 @@ class GltfWriter(SurfacesWriter):
 
     Each frame is a morph target, whose weight the animation brings to 1 at the frame's time [s] and leads linearly to the
     next. Places are those of the first frame, of what is far from the origin less a translation (origin.py), and float32
-    differences to it [m], y upwards. A body has one colour: colours of a field cannot move in glTF.
+    differences to it [m]. In glTF y is up: where the scene's gravity acts along z, nodes are turned. A body has one colour:
+    colours of a field cannot move in glTF.
     Khronos Group 2021, glTF 2.0 Specification, sections 3.7.2 (morph targets) and 3.11 (animations).
     """
 
@@ -30,7 +31,7 @@ class GltfWriter(SurfacesWriter):
             self.path.write_bytes(self._file())
 
     def _file(self) -> bytes:
-        content, times = Content(), np.array(self._times) - self._times[0]
+        content, times = Content(self.setting.up == 2), np.array(self._times) - self._times[0]
         at = content.add(times, limits=True) if len(times) > 1 else None
         for name, triangles, places, _ in self.surfaces():
             content.add_surface(name, triangles, places, at, BODY if name == "body" else OBSTACLE)
@@ -38,9 +39,10 @@ class GltfWriter(SurfacesWriter):
 
 
 class Content:
-    """What a file holds: the parts of its JSON, and the numbers that they name."""
+    """What a file holds: the parts of its JSON, and the numbers that they name; turned: from z upwards to y upwards."""
 
-    def __init__(self):
+    def __init__(self, turned: bool):
+        self.turned = turned
         self.parts = {name: [] for name in ("nodes", "meshes", "materials", "accessors", "bufferViews")}
         self.channels, self.samplers, self.bytes = [], [], bytearray()
 
@@ -71,7 +73,10 @@ class Content:
         node = len(self.parts["nodes"])
         weights = dict(weights=[0.0] * len(changes)) if changes else {}
         self.parts["meshes"].append(dict(name=name, primitives=[shape]) | weights)
-        self.parts["nodes"].append(dict(name=name, mesh=node) | (dict(translation=away.tolist()) if away.any() else {}))
+        away = away[[0, 2, 1]] * [1, 1, -1] if self.turned else away
+        turn = dict(rotation=[-(0.5**0.5), 0.0, 0.0, 0.5**0.5]) if self.turned else {}
+        moved = dict(translation=away.tolist()) if away.any() else {}
+        self.parts["nodes"].append(dict(name=name, mesh=node) | turn | moved)
         look = dict(baseColorFactor=[*colour, 1.0], metallicFactor=0.0, roughnessFactor=0.8)
         self.parts["materials"].append(dict(name=name, pbrMetallicRoughness=look, doubleSided=True))
         if changes:

@@ -5,6 +5,7 @@ import weakref
 import numpy as np
 
 from diffsim_ti.inputs import Mass, diagonal_of
+from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.solvers.implicit.multigrid import Following, Multigrid
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, BodyBlocks
 
@@ -25,8 +26,11 @@ class Preconditioners:
         key = float(mass.sum())
         if key not in self._kept:
             with ws.potential.at_rest():
-                blocks, contact = ws.potential.blocks(), ws.potential.contact_blocks()
-            size = np.abs(blocks if contact is None else blocks - contact).sum((1, 2))[:, None]
+                blocks = ws.potential.blocks()
+                if ws.potential.contact_blocks() is not None:  # of this pass, which others are not to depend on
+                    K, diagonal = assemble(ws.potential, 0 * size_of, np.ones_like(size_of))
+                    blocks = K.data[diagonal]
+            size = np.abs(blocks).sum((1, 2))[:, None]
             kind, how = BodyBlocks if ws.scene.reduced else BlockJacobi, size
             if self._wants_multigrid(size, mass):
                 kind, how = Multigrid, weakref.proxy(self)

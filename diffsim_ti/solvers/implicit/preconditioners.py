@@ -10,6 +10,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.supports.free import Free, FreeBodies, FreeDirections, mask_of
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.solvers.implicit.cg_kernels import CGKernels
@@ -106,32 +107,25 @@ class BlockJacobi(Preconditioner):
 
 
 class BodyBlocks(BlockJacobi):
-    """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, with inertia and
-    contact as they are; where its basis is of each component turned with it, as in multigrid.py. Of sets that do not deform
-    q are shifts and turns (mechanics/reduced/rigid_sets.py), whose part of the body at rest turns with them, too. What ties
-    glue takes the blocks of its vertices."""
+    """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the stress of the body at rest, with
+    inertia, contact and host forces as they are; where its basis is of each component turned with it, as in multigrid.py.
+    Of sets that do not deform q are shifts and turns (mechanics/reduced/rigid_sets.py), whose part of the body at rest turns
+    with them, too. What ties glue takes the blocks of its vertices."""
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
         super().__init__(potential, mass, free, size, parallel)
         with potential.at_rest():
+            potential.blocks()
+            K = assemble(potential, np.zeros((len(mass), 1)), np.ones((len(mass), 1)))[0].tocsr()
             soft = [(body, body.fields()) for body in free.reduced.bodies if body.kind not in ("rigid", "tie")]
             stiff = [(own, own.fields()) for own in free.rigid.sets]
-            self._at_rest = [(body, self._of_products(body.vertices, fields)) for body, fields in soft]
-            self._rigid_at_rest = [(own, self._of_products(own.vertices, fields)) for own, fields in stiff]
+            self._at_rest = [(body, _reduced(K, body.vertices, fields)) for body, fields in soft]
+            self._rigid_at_rest = [(own, _reduced(K, own.vertices, fields)) for own, fields in stiff]
 
     @property
     def patience(self) -> int:
         """Where there are only ties the factorisation takes its place, else nothing does."""
         return super().patience if self.free.elimination is not None else 10**9
-
-    def _of_products(self, vertices: np.ndarray, fields: np.ndarray) -> np.ndarray:
-        """B^T d2E/du2 B where the potential stands, shape (count, count), for fields B of shape (k, 3, count)."""
-        columns = []
-        for j in range(fields.shape[2]):
-            w = np.zeros((len(self.mass), 3))
-            w[vertices] = fields[:, :, j]
-            columns.append(np.tensordot(fields, self.potential.product(w)[vertices], ((0, 1), (0, 1))))
-        return 0.5 * (np.array(columns) + np.array(columns).T)
 
     def update(self, u: np.ndarray) -> None:
         super().update(u)
@@ -173,6 +167,14 @@ class BodyBlocks(BlockJacobi):
             fields = own.fields()
             out[own.vertices] = fields @ (inverse @ np.tensordot(fields, r[own.vertices], ((0, 1), (0, 1))))
         return out
+
+
+def _reduced(K, vertices: np.ndarray, fields: np.ndarray) -> np.ndarray:
+    """B^T K B, shape (count, count), for fields B of some vertices, shape (k, 3, count)."""
+    rows = (3 * vertices[:, None] + np.arange(3)).ravel()
+    B = fields.reshape(len(rows), -1)
+    G = B.T @ (K[rows][:, rows] @ B)
+    return 0.5 * (G + G.T)
 
 
 def turn_of(X: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -31,12 +31,12 @@ class RecordedPasses:
         if self.joints:
             self.joints.open(j - base)
             ws.joints.problem = ws.problem(j, stage, self.x, self.y)
+        if ws.strains:
+            ws.strains.hold(stage, self.u, self.before)
         ws.begin(j, stage, self.u, self.x)
         if self.joints:
             self.joints.hold()
         ws.rigid.begin(self.u, stage.c0)
-        if ws.strains:
-            ws.strains.hold(stage, self.u, self.before)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
         self.gamma = ws.instant(j, stage).gamma  # of velocities that host forces read

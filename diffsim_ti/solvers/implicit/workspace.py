@@ -233,9 +233,9 @@ class ImplicitWorkspace(PrescribedInPasses):
             u if place is None else self.with_frozen(u, u[self.arrays.held] + (place - u[self.arrays.held]) / stage.c0)
         )
         self.begun = u, held, problem
-        self.begin(j, stage, u, x, None if stage.static else self.linear * (problem[1] - u))
-        if self.strains:
+        if self.strains:  # before matrices are made
             self.strains.hold(stage, u, before)
+        self.begin(j, stage, u, x, None if stage.static else self.linear * (problem[1] - u))
         self.start_multipliers(j, u)
         start = u
         if overlap := self.overlaps and self.overlaps.get(u.tobytes()):
