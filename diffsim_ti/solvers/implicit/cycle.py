@@ -111,9 +111,11 @@ def inverses(blocks: np.ndarray) -> np.ndarray:
 def positive_inverse(A: np.ndarray) -> np.ndarray:
     """The inverse of a symmetric matrix; where that is not definite, as of a body that nothing holds yet, eigenvalues are
     raised to a millionth of the largest, which float32 resolves."""
-    values, vectors = np.linalg.eigh(A)
-    if values[0] > 1e-10 * values[-1]:
+    try:
+        np.linalg.cholesky(A - 1e-10 * np.abs(A).sum(1).max(initial=0.0) * np.eye(len(A)))
         return np.linalg.inv(A)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(A)
     return (vectors / np.maximum(np.abs(values), 1e-6 * np.abs(values).max())) @ vectors.T
 
 
@@ -187,13 +189,19 @@ class Cycle:
         """Set the numbers of other matrices and ways; False where their entries are not in the same places."""
         if [len(M.data) for M in (*matrices, *ways)] != self._entries:
             return False
-        for level, M in zip(self.levels, matrices):
-            level.put_numbers(M)
+        self.levels[0].put_numbers(matrices[0])
         for (_, between, _), P in zip(self._down, ways):
             runtime.fill(between["down"].values, rows_of(P.T.tobsr(P.blocksize[::-1]).data))
             runtime.fill(between["up"].values, rows_of(P.data))
-        runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
+        self.put_below(matrices[1:])
         return True
+
+    def put_below(self, matrices: list) -> None:
+        """Set the numbers of the levels below the finest one, if there are any, and of the inverse."""
+        for level, M in zip(self.levels[1:], matrices):
+            level.put_numbers(M)
+        if matrices:
+            runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""
