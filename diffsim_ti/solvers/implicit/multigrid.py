@@ -75,7 +75,8 @@ class Multigrid(Preconditioner):
     price = 40, 50_000
     # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
     usual, strained = (1.5, 3.0), 0.1
-    changed = 0.25  # of contact's share of the stiffness at vertices, from which on coarse levels take it anew
+    # vertices from which on coarse levels take contact, and the change of its share of the stiffness there that they take
+    large, changed = 1000, 0.25
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
         """run: what has the `following` of a run."""
@@ -153,7 +154,8 @@ class Multigrid(Preconditioner):
 
     def _bring_contact_down(self) -> None:
         """The levels below the finest one take contact with obstacles, where it has changed by much or a solve begins."""
-        if not self.potential.arrays.contacts or self._ties is not None:
+        a = self.potential.arrays
+        if not a.contacts or a.vertices_of_one <= self.large or self._ties is not None:
             return
         blocks, stiffness = self.potential.obstacle_blocks(), np.abs(np.einsum("kii->k", self._diagonal))
         size = np.abs(np.einsum("kii->k", blocks))
