@@ -295,8 +295,8 @@ class Newton:
         return self.collisions(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
     def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[list], np.ndarray]:
-        """places -> how much higher Phi of each body is there than at u (`Rounds.rises`). Forces without an energy do no more
-        work on the way than at u."""
+        """places -> how much higher Phi of each body is there than at u (`Rounds.rises`). Forces without an energy do no
+        more work on the way than at u."""
         self.pose(problem)
         here = self.loop
         here.stand(self, u)
