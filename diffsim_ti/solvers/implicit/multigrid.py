@@ -59,7 +59,8 @@ class Multigrid(Preconditioner):
     state, or of the one that `following` names.
 
     Isotropic laws: turning a body turns its stiffness, K(R u) = R K(u) R^T. So residuals are turned back by each vertex's
-    mean rotation, and corrections forth. Contact stiffness, and that of host forces as it changes, join the finest level, of obstacles the others of large bodies, too.
+    mean rotation, and corrections forth. Contact stiffness, and that of host forces as it changes, join the finest level;
+    of large bodies that of obstacles joins the others, too.
     Where strains have grown so much that iterations in excess cost more than numbers of the matrices do, these are made anew
     at the present state, its tetrahedra made positive semidefinite, on the same aggregates.
     The V-cycle over it is cycle.py's.
