@@ -91,7 +91,7 @@ class JoinedWorkspace(ImplicitWorkspace):
         for start in starts:
             share = newton.spread(self.collisions.past(near, start - near))
             there = near + share * (start - near)
-            rise = rise_of(there)
+            rise = rise_of([there])[0]
             better = rise < least
             best, least = np.where(newton.spread(better), there, best), np.minimum(rise, least)
         there, solved = newton.solve_all(best, problem, ~self.left, stage.static)
@@ -121,7 +121,7 @@ class JoinedWorkspace(ImplicitWorkspace):
         rise_of = self.newton.rises_from(held, problem)
         for start in starts:
             led = meets & (collisions.detection.shares(u, start - u, before, drift) == 1)
-            led &= rise_of(start) <= 0
+            led &= rise_of([start])[0] <= 0
             near, meets = np.where(spread(led), start, near), meets & ~led
         near = self._in_parts(near, step, before, drift, problem, meets)
         collisions.put(after)

@@ -19,6 +19,7 @@ from diffsim_ti.runtime.start import is_alive
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 _TASK = 6 * _WORD  # a task: its name, a string of four words, the sizes of its grid and blocks, and padding
 _MOST_TASKS = 1024  # of a kernel: an iteration with a deep hierarchy has hundreds
+KNOWN = ti.__version__ == (1, 7, 4) and sys.platform == "linux"  # the build of Taichi whose objects are known
 
 
 def _word(address: int) -> int:
@@ -27,8 +28,7 @@ def _word(address: int) -> int:
 
 def can_repeat() -> bool:
     """Whether loops can be repeated: where Taichi is the build whose objects are known, and compiles by LLVM."""
-    known = ti.__version__ == (1, 7, 4) and sys.platform == "linux"
-    return known and impl.current_cfg().arch in (ti.x64, ti.arm64, ti.cuda)
+    return KNOWN and impl.current_cfg().arch in (ti.x64, ti.arm64, ti.cuda)
 
 
 class RepeatedLoops:

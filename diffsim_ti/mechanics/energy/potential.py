@@ -206,12 +206,16 @@ class Potential:
         own = self.pairs.multiplying(self.u, self.w, convex) if self.pairs else []
         return [*own, (self.kernels.product, self._records, None)]
 
-    def blocks(self) -> np.ndarray:
-        """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
-        a = self.arrays
+    def find_blocks(self) -> None:
+        """`blocks` on the device, without host forces, ten nodes and patches."""
         self.launch("blocks", out=self.block_arrays)
         if self.pairs:
             self.pairs.launch(self.pairs.adding_blocks(self.u, self.block_arrays.blocks))
+
+    def blocks(self) -> np.ndarray:
+        """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
+        a = self.arrays
+        self.find_blocks()
         blocks = np.swapaxes(runtime.fetch(self.block_arrays.blocks).astype(np.float64), 0, 1)
         blocks = blocks + self.hosts.blocks(self.held_at)
         if a.points > 1:

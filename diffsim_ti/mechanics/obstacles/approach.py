@@ -46,7 +46,7 @@ class Approach:
             for start in starts:
                 if self._share(u, start - u, before, drift)[0] == 1 and self._is_sound(u, start):
                     ws.collisions.put(before)
-                    if ws.newton.rises_from(held, problem)(start) <= 0:
+                    if ws.newton.rises_from(held, problem)([start])[0] <= 0:
                         return start
             return self._in_parts(u, step, before, drift, problem)
         finally:

@@ -179,7 +179,8 @@ class ImplicitAdjoint(RecordedPasses):
             reaction, self.rest_adj = reaction + by_joints[0], self.rest_adj + self.joints.by_rest
         share = ws.load_share(j, s)
         self.gravity = self.gravity + share * self._sum(ws.mass * by_star)
-        self._add_mass(by_star, self.weight(share))
+        if self.features.density:
+            self._add_mass(by_star, self.weight(share))
         if self.forces is not None:
             ws.add_loads(self.forces, j, s, share * by_star)
         # where inertia starts from
@@ -201,11 +202,12 @@ class ImplicitAdjoint(RecordedPasses):
                 by_poses = by_poses + ws.pairs.obstacles.take_rows()
             ws.collisions.vjp(by_poses, j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
-        db0, db1, de0, de1 = s.by_rate
-        by_rate = db0 * y_adj * self.v + de0 * q_free * self.v_star + de1 * q_free * self.y
-        if self.before is not None:
-            by_rate += db1 * y_adj * self.before[1]
-        self.rate = self.rate + self._sum(by_rate).sum(-1)
+        if self.features.drag >= 0:
+            db0, db1, de0, de1 = s.by_rate
+            by_rate = db0 * y_adj * self.v + de0 * q_free * self.v_star + de1 * q_free * self.y
+            if self.before is not None:
+                by_rate += db1 * y_adj * self.before[1]
+            self.rate = self.rate + self._sum(by_rate).sum(-1)
         u_adj = s.a0 * x_adj + (1 - s.c0) * p_free + by_lag
         v_adj = s.b0 * y_adj
         if ws.rigid:

@@ -111,9 +111,15 @@ def inverses(blocks: np.ndarray) -> np.ndarray:
 def positive_inverse(A: np.ndarray) -> np.ndarray:
     """The inverse of a symmetric matrix; where that is not definite, as of a body that nothing holds yet, eigenvalues are
     raised to a millionth of the largest, which float32 resolves."""
+    from scipy.linalg.lapack import dpotrf, dpotri
+
+    factor, fails = dpotrf(A, lower=1)
+    if not fails:
+        lower = np.tril(dpotri(factor, lower=1)[0])
+        inverse = lower + np.tril(lower, -1).T
+        if np.abs(A).sum(0).max() * np.abs(inverse).sum(0).max() < 1e10:  # which is at least its condition
+            return inverse
     values, vectors = np.linalg.eigh(A)
-    if values[0] > 1e-10 * values[-1]:
-        return np.linalg.inv(A)
     return (vectors / np.maximum(np.abs(values), 1e-6 * np.abs(values).max())) @ vectors.T
 
 
@@ -125,14 +131,16 @@ def inverse_matrix(M):
     k, b = nodes_of(M), M.blocksize[0]
     graph = bsr_matrix((np.ones((len(M.indices), 1, 1)), M.indices, M.indptr), shape=(k, k)).tocsr()
     count, label = connected_components(graph, directed=False)
-    M, rows, columns, data = M.tocsr(), [], [], []
+    at, place, rows, columns, data = np.repeat(np.arange(k), np.diff(M.indptr)), np.zeros(k, int), [], [], []
     for own in np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1]) if count else []:
-        at = (own[:, None] * b + np.arange(b)).ravel()
-        dense = M[at][:, at].toarray()
-        there = np.abs(np.diagonal(dense)) > 0
+        place[own] = np.arange(len(own))
+        mine = label[at] == label[own[0]]
+        dense = np.zeros((len(own), len(own), b, b))
+        dense[place[at[mine]], place[M.indices[mine]]] = M.data[mine]
+        dense = dense.swapaxes(1, 2).reshape(b * len(own), -1)
+        there = np.ix_(*2 * (np.abs(np.diagonal(dense)) > 0,))
         inverse = np.zeros_like(dense)
-        inverse[np.ix_(there, there)] = positive_inverse(dense[np.ix_(there, there)])
-        inverse = 0.5 * (inverse + inverse.T)
+        inverse[there] = positive_inverse(dense[there])
         rows.append(np.repeat(own, len(own)))
         columns.append(np.tile(own, len(own)))
         data.append(inverse.reshape(len(own), b, len(own), b).transpose(0, 2, 1, 3).reshape(-1, b, b))
@@ -187,13 +195,19 @@ class Cycle:
         """Set the numbers of other matrices and ways; False where their entries are not in the same places."""
         if [len(M.data) for M in (*matrices, *ways)] != self._entries:
             return False
-        for level, M in zip(self.levels, matrices):
-            level.put_numbers(M)
+        self.levels[0].put_numbers(matrices[0])
         for (_, between, _), P in zip(self._down, ways):
             runtime.fill(between["down"].values, rows_of(P.T.tobsr(P.blocksize[::-1]).data))
             runtime.fill(between["up"].values, rows_of(P.data))
-        runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
+        self.put_below(matrices[1:])
         return True
+
+    def put_below(self, matrices: list) -> None:
+        """Set the numbers of the levels below the finest one, if there are any, and of the inverse."""
+        for level, M in zip(self.levels[1:-1], matrices):
+            level.put_numbers(M)
+        if matrices:
+            runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""

@@ -157,7 +157,7 @@ class DeviceCG:
         system that meets a direction of negative curvature has the x before it or, if it is the first, the preconditioned b.
         """
         rows = b.reshape(self.systems, -1)
-        size, state = np.linalg.norm(rows, axis=1), np.zeros((self.systems, ROOM))
+        size, state = np.sqrt(np.einsum("ij,ij->i", rows, rows)), np.zeros((self.systems, ROOM))
         wanted, done = going & (size > 0), 0
         runtime.fill(self.r, (rows / np.where(wanted, size, np.inf)[:, None]).reshape(1, -1, 3))
         state[:, LEAST], state[:, LIMIT], state[:, STOPPED] = tolerance**2, most, ~wanted

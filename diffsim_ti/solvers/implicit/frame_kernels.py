@@ -8,7 +8,7 @@ import taichi as ti
 from diffsim_ti.runtime import Kernel
 
 A = ti.template()
-ROUNDS = 8  # of Newton's iteration for rotations
+ROUNDS, NEAR = 8, 1e-7  # of Newton's iteration for rotations, at most; the square of a change that makes it the last
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,10 @@ class FrameKernels:
             for _ in range(ROUNDS):
                 C = self.cofactors(X)
                 det = X[0, 0] * C[0, 0] + X[1, 0] * C[1, 0] + X[2, 0] * C[2, 0]
-                X = ti.cast(0.5, ti.f32) * (X + C / det)
+                change = ti.cast(0.5, ti.f32) * (C / det - X)
+                X += change
+                if change.norm_sqr() < ti.cast(NEAR, ti.f32):
+                    break
             R = X
         return R
 

@@ -59,7 +59,8 @@ class Multigrid(Preconditioner):
     state, or of the one that `following` names.
 
     Isotropic laws: turning a body turns its stiffness, K(R u) = R K(u) R^T. So residuals are turned back by each vertex's
-    mean rotation, and corrections forth. Contact stiffness, and that of host forces as it changes, join the finest level.
+    mean rotation, and corrections forth. Contact stiffness, and that of host forces as it changes, join the finest level;
+    of large bodies that of obstacles joins the others, too.
     Where strains have grown so much that iterations in excess cost more than numbers of the matrices do, these are made anew
     at the present state, its tetrahedra made positive semidefinite, on the same aggregates.
     The V-cycle over it is cycle.py's.
@@ -75,6 +76,8 @@ class Multigrid(Preconditioner):
     price = 40, 50_000
     # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
     usual, strained = (1.5, 3.0), 0.1
+    # vertices from which on coarse levels take contact, and the change of its share of the stiffness there that they take
+    large, changed = 1000, 0.25
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
         """run: what has the `following` of a run."""
@@ -92,6 +95,7 @@ class Multigrid(Preconditioner):
             self.frames.update()
             matrices, ways = self._levels()
         self.place = None
+        self._made, self._contact = (matrices, ways), None
         self.cycle = Cycle(matrices, ways, self.frames, parallel)
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
         if self._changes:
@@ -116,6 +120,7 @@ class Multigrid(Preconditioner):
 
     def begin(self) -> None:
         super().begin()
+        self._is_new = True
         place = self.run.following.place if self._follows else None
         if self.place is not place:
             self._go_to(place)
@@ -126,7 +131,7 @@ class Multigrid(Preconditioner):
         if place is None:
             with self.potential.at_rest():
                 self.frames.update()
-                self.cycle.put(*self._levels())
+                self._put(*self._levels())
             if self._changes:
                 self._begin_join()
             return
@@ -137,12 +142,44 @@ class Multigrid(Preconditioner):
             matrices, ways = self._levels([correction.matrix(obstacles=False)] if len(correction.C) else [])
             if is_definite(matrices[-1]):
                 break
-        self._follows = self.cycle.put(matrices, ways)
+        self._follows = self._put(matrices, ways)
         if not self._follows:  # entries lie in other places: from here on as at rest
             self._go_to(None)
         elif self._changes:
             self._begin_join()
         self.potential.place(u)
+
+    def _put(self, matrices: list, ways: list) -> bool:
+        self._made, self._contact = (matrices, ways), None
+        return self.cycle.put(matrices, ways)
+
+    def _bring_contact_down(self) -> None:
+        """The levels below the finest one take contact with obstacles, where it has changed by much or a solve begins."""
+        a = self.potential.arrays
+        if not a.contacts or a.vertices_of_one <= self.large or self._ties is not None:
+            return
+        blocks, stiffness = self.potential.obstacle_blocks(), np.abs(np.einsum("kii->k", self._diagonal))
+        size = np.abs(np.einsum("kii->k", blocks))
+        share, before = size / (size + stiffness + 1e-300), 0.0 if self._contact is None else self._contact
+        few = np.abs(share - before).sum() <= self.changed * np.maximum(share, before).sum()
+        if self.potential.pairs:
+            self.potential.put_contact_blocks()
+        if few and not (self._is_new and (size.any() or self._contact is not None)):
+            return
+        from scipy.sparse import bsr_matrix
+
+        self._is_new, self._contact = False, share if size.any() else None
+        self.frames.update()
+        at, (matrices, ways) = np.flatnonzero(size), self._made
+        turns = projectors_of(self.free)[at] @ self.frames.matrices()[at]
+        values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
+        roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        start = np.searchsorted(at, np.arange(len(size) + 1))
+        more, levels = bsr_matrix((roots @ np.swapaxes(roots, 1, 2), at, start), shape=matrices[0].shape), []
+        for M, P in zip(matrices[1:], ways):
+            more = (P.T @ (more @ P)).tobsr(M.blocksize)
+            levels.append(with_blocks(M, more))
+        self.cycle.put_below(levels)
 
     def _levels(self, more=()) -> tuple[list, list]:
         """(matrices of all levels, ways from each to the one before) where the potential stands, turned back by frames."""
@@ -212,6 +249,7 @@ class Multigrid(Preconditioner):
         if self._is_poor(u):
             self.run.following = Following(u.copy())
             self._go_to(self.run.following.place)
+        self._bring_contact_down()
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
@@ -289,6 +327,16 @@ def is_definite(M) -> bool:
     """Whether the least eigenvalue of a matrix is not negative, but for rounding."""
     values = np.linalg.eigvalsh(M.toarray())
     return bool(values[0] > -1e-9 * values[-1])
+
+
+def with_blocks(M, more):
+    """M and another matrix, whose blocks are among those of M."""
+    out, places = M.copy(), []
+    more.sort_indices()
+    for A in (M, more):
+        places.append(np.repeat(np.arange(nodes_of(A)), np.diff(A.indptr)) * nodes_of(A) + A.indices)
+    out.data[np.searchsorted(*places)] += more.data
+    return out
 
 
 def _repeated(M, count: int):

@@ -294,13 +294,13 @@ class Newton:
         pairs = self.potential.pairs
         return self.collisions(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
-    def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[np.ndarray], np.ndarray]:
-        """there -> how much higher Phi of each body is at another place than at u. Forces without an energy do no more work
-        on the way than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+    def rises_from(self, u: np.ndarray, problem: tuple) -> Callable[[list], np.ndarray]:
+        """places -> how much higher Phi of each body is there than at u (`Rounds.rises`). Forces without an energy do no
+        more work on the way than at u."""
         self.pose(problem)
         here = self.loop
         here.stand(self, u)
-        return here.rise
+        return here.rises
 
     def pose(self, problem: tuple) -> None:
         """What is solved: mass, inertial and loads of `solve`."""

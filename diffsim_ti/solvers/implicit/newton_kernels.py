@@ -20,8 +20,9 @@ A = ti.template()
 (BESIDE, BESIDE_PARTS, BESIDE_CHANGE, UNMET, RECOUNTS) = range(ROUGHLY + 1, ROUGHLY + 6)
 # whether R is small; what brings the linear solve's x to the direction, whether that is of negative curvature, the longest
 # free step along it, the least change of the potential along it so far (1: go back to that); what makes a step good, and
-# the |R| that it is to lower
+# the |R| that it is to lower; places that rises are asked of, how many there are, and the rise of the second
 (SOLVED, SCALE, INDEFINITE, LONGEST, BEST, MEASURE, TO_LOWER) = range(RECOUNTS + 1, RECOUNTS + 8)
+(PROBES, PROBED, SECOND_RISE) = range(TO_LOWER + 1, TO_LOWER + 4)
 COUNTED = dict(products=PRODUCTS, trials=TRIALS, halvings=HALVINGS, cuts=CUTS)  # by NewtonReport, too
 # phases: it is done, no step is found, rounds are used up; energies where rises are measured from, and of one; where a solve
 # starts, a trial of the line search, its residual, the preconditioner, conjugate gradients; the host says how far along a
@@ -199,11 +200,14 @@ class NewtonKernels:
                 newton.far[i], newton.u[i] = most, u
             if cg.state[b, PHASE] == TRY:
                 at.u[0, i] = self.cg.to(PRECISIONS[self.scene], newton.u[i] + newton.d[i] * cg.state[b, FRACTION])
+            if cg.state[b, PHASE] == PROBE and cg.state[b, PROBES] > 0:
+                at.u[0, i] = newton.places[ti.cast(cg.state[b, PROBED], ti.i32), i]
 
     @cached_property
     def move(self) -> Kernel:
         """To what is tried."""
-        own, at = dict(u="vectors", d="vectors", far="scalars"), dict(u=f"vectors2_{self.scene}")
+        at = dict(u=f"vectors2_{self.scene}")
+        own = dict(u="vectors", d="vectors", far="scalars", places=at["u"])
         return self._kernel("move", self.go, newton=own, at=at)
 
     @ti.func
@@ -250,11 +254,17 @@ class NewtonKernels:
         flat = cg.part[2, c] > 0
         if cg.state[b, PHASE] == BASE:
             cg.state[b, E], cg.state[b, PARTS], cg.state[b, ACCEPTED] = value, size, ti.cast(1, self.fp)
-            cg.state[b, PHASE] = ti.cast(DONE, self.fp)
+            cg.state[b, PHASE] = ti.cast(ti.select(cg.state[b, PROBES] > 0, PROBE, DONE), self.fp)
         elif cg.state[b, PHASE] == PROBE:
-            cg.state[b, RISE], cg.state[b, PHASE] = change, ti.cast(DONE, self.fp)
             if flat:
-                cg.state[b, RISE] = ti.cast(ti.math.inf, self.fp)
+                change = ti.cast(ti.math.inf, self.fp)
+            if cg.state[b, PROBED] == 0:
+                cg.state[b, RISE] = change
+            else:
+                cg.state[b, SECOND_RISE] = change
+            cg.state[b, PROBED] = cg.state[b, PROBED] + ti.cast(1, self.fp)
+            if cg.state[b, PROBED] >= cg.state[b, PROBES]:
+                cg.state[b, PHASE] = ti.cast(DONE, self.fp)
         elif cg.state[b, PHASE] == START:
             if cg.state[b, UPRIGHT] < 0:
                 cg.state[b, UPRIGHT] = ti.cast(cg.part[3, c] == 0, self.fp)

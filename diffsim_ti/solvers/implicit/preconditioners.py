@@ -4,6 +4,7 @@ Block Jacobi is a function of the present state alone, multigrid of that and of 
 (`Following`), so that a run that is started again from a checkpoint takes the same steps.
 """
 
+from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -59,6 +60,7 @@ class BlockJacobi(Preconditioner):
     """
 
     quick = 3
+    _launch = None
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray | float, parallel: bool = True):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
@@ -66,6 +68,8 @@ class BlockJacobi(Preconditioner):
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
+        if self._is_found_on_device():
+            return
         D = self.potential.blocks() + self.mass[:, :, None] * np.eye(3)
         if isinstance(self.free, FreeDirections):
             D = self.free.around(D)
@@ -78,18 +82,36 @@ class BlockJacobi(Preconditioner):
         if not isinstance(self.free, FreeBodies):
             self.solver.put_inverse(self._inverse)
 
-    def updating(self) -> tuple[list, object]:
-        a, p, solver = self.potential.arrays, self.potential, self.solver
-        if isinstance(self.free, FreeDirections) or a.points > 1 or a.patches is not None:
-            return [], None
-        kernels, n = kernels_of(CGKernels, a.precision, solver.precision, solver.parallel, False, False), len(self.mass)
+    @cached_property
+    def _on_device(self) -> tuple | None:
+        """(kernel, records) that invert the blocks that the device has found; None where the host has a part in them."""
+        a, p, solver, n = self.potential.arrays, self.potential, self.solver, len(self.mass)
+        if not isinstance(self.free, np.ndarray) or a.points > 1 or a.patches is not None or p.hosts or solver.several:
+            return None
+        kernels = kernels_of(CGKernels, a.precision, solver.precision, solver.parallel, False, False)
         kind = runtime.PRECISIONS[solver.precision]
         body = SimpleNamespace(hard=runtime.array(ti.i32, n), mass=runtime.array(kind, n), least=runtime.array(kind, n))
         runtime.fill(body.mass, self.mass[:, 0])
         runtime.fill(body.least, np.broadcast_to(self.least, (n, 1))[:, 0])
-        own, pairs = [(p.kernels.blocks, dict(scene=a, pass_=p, at=p, out=p.block_arrays), None)], p.pairs
+        return kernels.invert, dict(cg=solver, body=body, out=p.block_arrays)
+
+    def _is_found_on_device(self) -> bool:
+        """Whether the inverse is there; not where a block is not positive definite."""
+        if self._on_device is None:
+            return False
+        kernel, records = self._on_device
+        self._launch, self._inverse = self._launch or kernel.bind(**records), None
+        self.potential.find_blocks()
+        self._launch(nodes=len(self.mass))
+        return not runtime.look(records["body"].hard).any()
+
+    def updating(self) -> tuple[list, object]:
+        if self._on_device is None:
+            return [], None
+        (invert, records), p, pairs = self._on_device, self.potential, self.potential.pairs
+        own = [(p.kernels.blocks, dict(scene=p.arrays, pass_=p, at=p, out=p.block_arrays), None)]
         own += pairs.adding_blocks(p.u, p.block_arrays.blocks) if pairs else []
-        return [*own, (kernels.invert, dict(cg=solver, body=body, out=p.block_arrays), None)], body
+        return [*own, (invert, records, None)], records["body"]
 
     def _inverted(self, D: np.ndarray) -> np.ndarray:
         least = np.broadcast_to(self.least, (len(D), 1))
@@ -103,6 +125,8 @@ class BlockJacobi(Preconditioner):
         return np.matmul(vectors * inverse[:, None, :], np.swapaxes(vectors, 1, 2))
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
+        if self._inverse is None:
+            self._inverse = np.moveaxis(runtime.fetch(self.solver.inverse), 0, 2).astype(np.float64)
         return np.einsum("ijk,ik->ij", self._inverse, r)
 
 

@@ -60,6 +60,7 @@ class Rounds:
         self.sizes |= dict(points=points, points_length=-(-(points // cg.systems) // (cg.chunks // cg.systems)))
         self._always = self.sizes | dict(kept=detection.kept)
         self.next = runtime.array(a.vector, 1, n) if self.pairs else None  # where the longest step leads
+        self.places = runtime.array(a.vector, 2, n)  # of which rises are asked at once
         self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small
         self.whole &= potential.kernels.blocks.variables <= self.short and not (self.beside or self.several)
         self.whole &= not (self.pairs and self.pairs.asks)
@@ -167,19 +168,32 @@ class Rounds:
     # ---- rises of the potential --------------------------------------------------------------------------------------
 
     def stand(self, newton, u: np.ndarray) -> None:
-        """Measure `rise` from u."""
+        """Measure `rises` from u, where the potential then stands."""
         self.potential.place(u)
         self._begin(newton, nk.BASE)
-        self.advance()
+        if not self.whole:
+            self.advance()
+            self.state[:, nk.PHASE] = np.where(newton.going, nk.PROBE, nk.DONE)
         self._based = self.state
 
-    def rise(self, there: np.ndarray) -> np.ndarray:
-        """How much higher Phi of each body is there; infinite where a tetrahedron changes its volume more than tenfold."""
-        self.potential.place(there)
-        self.state = self._based.copy()
-        self.state[:, nk.PHASE] = np.where(self.newton.going, nk.PROBE, nk.DONE)
-        self.advance()
-        return self.state[:, nk.RISE]
+    def rises(self, places: list) -> np.ndarray:
+        """How much higher Phi of each body is at one place or two, shape (places, bodies); infinite where a tetrahedron
+        changes its volume more than tenfold."""
+        if self.whole:
+            runtime.fill(self.places, np.stack([places[0], places[-1]]))
+            self.state = self._based
+            self.state[0, nk.PROBES], self.state[0, nk.PROBED] = len(places), 0
+            self.advance()
+            self.state[0, nk.PHASE] = nk.PROBE
+            self._based = self.state
+            return self.state[:, [nk.RISE, nk.SECOND_RISE]][:, : len(places)].T
+        found = []
+        for there in places:
+            self.potential.place(there)
+            self.state = self._based.copy()
+            self.advance()
+            found.append(self.state[:, nk.RISE])
+        return np.array(found)
 
     # ---- a solve -----------------------------------------------------------------------------------------------------
 

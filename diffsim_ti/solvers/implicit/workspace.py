@@ -331,14 +331,14 @@ class ImplicitWorkspace(PrescribedInPasses):
         would lead what is stiff or light there are others."""
         best, least, apart = u, 0.0, self.pairs or self.joints
         rise_of = self.newton.rises_from(u, problem) if starts else None
-        for start in starts:
-            # surfaces are looked at together where they have not passed through each other
-            rise = 0.0 if apart else rise_of(start)
-            if not apart and not rise < least:
+        # surfaces are looked at together where they have not passed through each other
+        rises = rise_of(starts)[:, 0] if starts and not apart else [-np.inf] * len(starts)
+        for start, rise in zip(starts, rises):
+            if not rise < least:
                 continue
             longest = min(self.collisions.past(u, start - u)[0], self.pairs_share(u, start - u))
             at = self.rigid.nearest(u + longest * (start - u))
-            rise = rise_of(at) if apart or longest < 1 else rise
+            rise = rise_of([at])[0, 0] if apart or longest < 1 else rise
             if rise < least and not (self.rigid and not self.newton.is_free(u, at - u)):  # it turns on another way
                 best, least = at, rise
         return best
