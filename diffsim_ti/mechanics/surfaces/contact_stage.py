@@ -7,6 +7,7 @@ surfaces apart. Vertices of no near pair keep what they had, bit by bit.
 """
 
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from math import fsum
 from types import SimpleNamespace
 
@@ -449,7 +450,7 @@ class PairContact(Stage):
         e = b = np.zeros_like(of.motion)
         looks = []
         for part in one.parts:
-            own = Part(part.begin, part.share, part.c, e, b, part.P)
+            own = replace(part, e=part.e + 1j * e.imag, b=part.b + 1j * b.imag)  # from where the run was
             looks.append((own, one.solver.look(own, of)))
             e, b = one.solver.take(own, of, looks[-1][1])
         if run.impulses:
@@ -459,6 +460,7 @@ class PairContact(Stage):
         given, start = (u.copy(), v.copy()), one.start + dots.start
         mass, rest = (x[: self.a.num_vertices] for x in (dots.mass, dots.rest))
         mass, rest = self.a.values.mass + mass, self.a.values.rest - self.a.origin + rest
+        e, b = one.e + 1j * e.imag, one.b + 1j * b.imag
         self._settle(one, given, u, v, start, e, b, decay, mass, rest)
         self.rows.put(run.u, 0, u.imag[: self.num_own] / 1e-30)
         self.rows.put(run.v, 0, v.imag / 1e-30)
