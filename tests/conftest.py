@@ -50,7 +50,8 @@ def pytest_collection_modifyitems(config, items):
     """Without the thorough ones; for several processes in the order of areas.py."""
     if not config.getoption("--thorough"):
         single = left_out(PLAIN)
-        if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.getoption("lf"):  # all of them
+        whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+        if whole and not config.getoption("lf", False):
             if gone := single - {_id(item) for item in items}:
                 raise pytest.UsageError(f"left_out.py names tests that are not there: {', '.join(sorted(gone))}")
         deselected = {item for item in items if item.get_closest_marker("thorough") or _id(item) in single}

@@ -468,7 +468,8 @@ def test_an_even_pressure_has_an_even_traction(order, pattern, cells, stiffness)
     at the block's edges, between cells of unequal sides too, the traction is force per area; elsewhere there is none."""
     mesh = ds.TetrahedralMesh.create_box(cells, (0.1, 0.06, 0.1), pattern=pattern)
     mesh = mesh if order == 1 else mesh.quadratic()
-    floor = ds.Ground(-0.002, stiffness_per_area=stiffness, width=0.004, name="floor")
+    rough = dict(friction=0.4, path=lambda t: np.zeros(3))  # as where derivatives are judged: the same kernels
+    floor = ds.Ground(-0.002, stiffness_per_area=stiffness, width=0.004, name="floor", **rough)
     down = dict(fixed="ymax", motion=lambda t: [0, -0.002 * t, 0], precision="f64")
     scene = ds.Scene(mesh, ds.LinearElastic(1e6, 0.0), terms=[floor], **down)
     named = [ds.ContactTraction("floor"), ds.ContactForce("floor")]
@@ -485,7 +486,7 @@ def test_an_even_pressure_has_an_even_traction(order, pattern, cells, stiffness)
 def test_traction_on_faces_of_ten_nodes_has_derivatives():
     mesh = ds.TetrahedralMesh.create_box((3, 2, 3), (0.1, 0.05, 0.1), origin=(0, 0.004, 0)).quadratic()
     held = dict(fixed="ymax", motion=lambda t: (0.001 * t, -0.001 * t, 0.0), precision="f64")
-    scene = ds.Scene(mesh, ds.StableNeoHookean(2e5, 0.3), terms=[ds.Gravity(), pressed().terms[1]], **held)
+    scene = ds.Scene(mesh, ds.LinearElastic(2e5, 0.3), terms=[pressed().terms[1]], **held)
     named = [ds.ContactTraction("floor", part, name=part) for part in ("total", "friction")]
     solver = ds.StaticSolver(scene, load_steps=2, tolerance=1e-12)
     rollout, rng = ds.Rollout(solver, 2, save_every=1, outputs=named, gradients="all"), np.random.default_rng(0)

@@ -194,7 +194,7 @@ def test_two_numbers_of_a_law_from_a_force_stretch_curve():
     force = pulled_bar((6, 2, 2), ds.Gent(**truth, bulk_modulus=1.5e5), "five").forward()["force"]
     noise = 5e-3 * np.abs(force).max()
     fitted = pulled_bar((3, 1, 1), ds.Gent(2e4, 12.0, 1.5e5), "kuhn")
-    for seed in range(3):
+    for seed in range(2):
         seen = force + noise * np.random.default_rng(seed).standard_normal(force.shape)
         seen[:, 1:] = np.nan  # the machine reads one direction
         found = identify(fitted, {"force": seen}, dict(mu=2e4, limit=12.0), noise)
