@@ -231,7 +231,7 @@ def test_wrong_arguments(name):
 def test_wrong_arguments_of_runs():
     """Numbers of a run, seeds, tangents, states: refused by the package in one message, or a run that says where it ends.
 
-    Of rollouts and of batches every other input gets a wrong number, the others the next: by a run, a tangent or torch in turn.
+    Of a rollout, as of a batch, every other input gets a wrong number: by a run, a tangent or torch in turn.
     """
     by_turns = [f"{call}(" for call in ("Rollout.forward", "Rollout.tangents", "Batch.forward", "Batch.tangents")]
     bad = [

@@ -110,8 +110,8 @@ def fallen(terms, solver, steps=12, **options):
 
 @pytest.mark.parametrize("solver, options", [(ds.VelocityVerletSolver, dict(substeps=8)), (ds.ImplicitEulerSolver, {})])
 def test_a_meshed_box_is_the_analytic_one(solver, options):
-    """Flat regions count once, whatever triangles they consist of."""
-    rough = dict(friction=0.4, friction_speed=0.05)
+    """Flat regions count once, whatever triangles they consist of. With kernels of the land of test_obstacle_pairs.py."""
+    rough = dict(friction=0.4, friction_speed=0.05, stiffness=None, stiffness_per_area=3e3, path=lambda t: np.zeros(3))
     found, expected = (
         fallen(make(**rough), solver, **options) for make in (meshed_box, lambda **o: box(by_pairs=True, **o))
     )

@@ -30,8 +30,7 @@ def test_learned_material(tmp_path):
 
 
 def test_controller(tmp_path):
-    result = example("control/train_controller").main(tmp_path, iterations=30)
-    print(result)
+    result = example("control/train_controller").main(tmp_path, iterations=45)
     assert result["miss_seen"] < 0.025 and result["miss_unseen"] < 0.04 and result["miss_before"] > 0.1
     check_files(tmp_path, "train_controller", kind="gif")
 
