@@ -72,7 +72,7 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item):
-    """With --minutes durations are those of processors, of processes that a test started, too: the same beside other work."""
+    """With --minutes durations are those of processors, of processes that a test starts, too, whatever else runs."""
     report = yield
     if item.config.getoption("--minutes"):
         begin, _spent["until"] = _spent["until"], sum(os.times()[:4])
