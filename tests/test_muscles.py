@@ -53,15 +53,6 @@ def test_every_number(kind):
     assert_transposed(rollout_of(kind), 1e-11 if kind.explicit else 1e-8)
 
 
-def test_every_number_of_ten_nodes():
-    """Beside a fluid and growth over time, whose kernels for ten nodes take as long to compile."""
-    mesh = mesh_of(2)
-    growth = np.random.default_rng(3).uniform(0.01, 0.02, (STEPS, 2))
-    beside = [ds.SurfaceDrag(900.0, 1.2, 0.3, [0.4, -0.2, 0.1]), ds.Growth(growth, ["left", "right"], per="set")]
-    start = dict(initial_velocities=np.random.default_rng(3).normal(size=mesh.vertices.shape))
-    assert_transposed(rollout_of(ds.VelocityVerletSolver, muscles(mesh) + beside, order=2, **start), 1e-11)
-
-
 @pytest.mark.parametrize(
     "kind, order, precision", [(ds.VelocityVerletSolver, 1, "f64"), (ds.SemiImplicitSolver, 2, "f32")]
 )

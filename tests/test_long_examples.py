@@ -1,0 +1,83 @@
+"""Examples that run longest, as CI runs them by a command of its own; what they are made of has its tests in the suite."""
+
+import numpy as np
+import pytest
+import torch
+from example_files import example
+from scipy.spatial.transform import Rotation
+
+pytestmark = pytest.mark.thorough
+
+
+def test_indentation(capsys, monkeypatch):
+    indentation = example("identify/indentation")
+    monkeypatch.setattr(indentation, "STEPS", 3)
+    numbers = indentation.main()
+    assert max(numbers["errors"].values()) < 0.01 and numbers["runs"] <= 10
+    assert max(numbers["spread"]) < 0.01  # standard errors, of numbers in logarithms
+    assert "friction = " in capsys.readouterr().out
+
+
+def test_measured_beam(tmp_path, capsys, monkeypatch):
+    """Recordings that it makes itself, seen by a tilted camera: numbers come back, and the weight's motion is foretold."""
+    beam = example("identify/measured_beam")
+    monkeypatch.setattr(beam, "EDGE", 8e-3)
+    monkeypatch.setattr(beam, "EVERY", 20)
+    truth, tilt = dict(youngs_modulus=2.2e5, drag_rate=9.0), Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
+    rng = np.random.default_rng(0)
+    for name, mass, share in (("gravity_a", 0.0, 0.1), ("load40_a", 0.04, 0.2)):
+        body = beam.mesh(2, beam.EDGE if mass else 0.0)
+        numbers = dict(truth, prony_shares=np.array([0.0, 0.05]), support=(share, 0.0))
+        numbers["youngs_modulus"] *= beam.finer(2, body)
+        moved = beam.swing(body, "drag", numbers, 1.6, mass).forward()["markers"]
+        before, after = (
+            np.tile(moved[:1], (60, 1, 1)),
+            np.tile(beam.hang(body, numbers, mass).forward()["markers"][-1], (60, 1, 1)),
+        )
+        tip = np.concatenate([before, moved, after]) + (beam.TIP - moved[0])
+        seen = np.concatenate([tip, np.tile(beam.BASE, (len(tip), 1, 1))], 1) @ tilt + [0.1, 0.2, 0.3]
+        seen = seen + 1e-5 * rng.standard_normal(seen.shape)
+        rows = np.column_stack([0.01 * np.arange(len(seen)), seen.reshape(-1, 18)])
+        np.savetxt(tmp_path / f"beam_{name}.csv", rows, delimiter=",", header="time, x, y, z of six markers")
+    found = beam.main(tmp_path, kinds=("drag",), span=0.4, output=tmp_path)
+    intervals, errors = found["fits"]["drag"].intervals, found["errors"][0.04]
+    for name, x in truth.items():
+        low, high = intervals[name]
+        assert low < x < high < 1.2 * low
+    assert abs(errors["rest"]) < 0.01 and abs(errors["frequency"]) < 0.01 and abs(errors["decay"]) < 0.1
+    assert "with 40 g, predicted:" in capsys.readouterr().out
+    for name in ("measured_beam.png", "beam_load40_a.gif"):
+        assert (tmp_path / name).stat().st_size > 20_000
+
+
+def test_soft_hand():
+    """The gradient of what slips says to squeeze more; a grip that it found holds what the one at first drops."""
+    hand = example("control/soft_hand")
+    scene, start = hand.hand_scene(), np.radians(np.repeat(hand.START, 3)).reshape(2, 3)
+    grip = hand.Grip(scene, 0.4)
+    frames, slip = grip.run(start)
+    gradient = grip.loss(frames, slip)[1]
+    squares = [(grip.run(start + move)[1] ** 2).sum(1) for move in (1e-5, -1e-5)]
+    ends = [float((square / (square + hand.LOST**2)).sum()) for square in squares]
+    assert gradient.sum() == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-3) and np.all(gradient[:, :2] < 0)
+    whole = hand.Grip(scene, 0.6, gradients=())
+    found = np.radians([[20.9, 26.7, 12.7], [17.7, 23.6, 10.7]])
+    slips = [np.linalg.norm(whole.run(turns)[1], axis=1).max() for turns in (start, found)]
+    assert slips[0] > 0.05 and slips[1] < hand.SLIP
+
+
+def test_a_gripper_learns_to_lift():
+    """The gradient through joints, contact and friction, along which the loss falls, is that of differences."""
+    pytest.importorskip("pinocchio", reason='pip install "diffsim-ti[robots]"')
+    pytest.importorskip("gymnasium", reason='pip install "diffsim-ti[envs]"')
+    module = example("control/grasp_and_lift")
+    lift, scale = module.Lift(2, 3), torch.tensor(module.SCALE)
+    at = torch.tensor(module.START[:, :3] + 0.1 * module.SCALE, requires_grad=True)
+    loss, frames = lift.loss(at)
+    loss.backward()
+    along = -(scale**2) * at.grad / (scale * at.grad).norm()
+    with torch.no_grad():
+        ends = [lift.loss(at + e * along)[0].item() for e in (1e-4, -1e-4)]
+    expected = (ends[0] - ends[1]) / 2e-4
+    assert (at.grad * along).sum().item() == pytest.approx(expected, rel=1e-4) and expected < -0.1
+    assert 0.2 < lift.found(frames)["ratio"] < 1 and lift.found(frames)["slip"] < module.LIFT
