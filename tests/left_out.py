@@ -245,6 +245,7 @@ LEFT_OUT = {
         test_curved_contact::test_curved_faces_rub_on_each_other[BDF2Solver-f64]
     """,
     "velocity Verlet or BDF2; transposes in all solvers, and differences in all of `test_implicit_gradients.py`": """
+        test_contact_force::test_gradients_agree_with_differences[static]
         test_springs::test_gradients_against_differences[StaticSolver]
         test_loads_together::test_gradients_are_those_of_differences[ImplicitEulerSolver]
         test_unequal_steps::test_gradients_are_those_of_differences[BDF2Solver]
@@ -325,9 +326,6 @@ LEFT_OUT = {
     "the same beside other loads": """
         test_loads_together::test_and_beside_patches_and_self_contact[ImplicitEulerSolver-True-options2]
     """,
-    "inclines that stand still, and a groove that turns, in implicit steps": """
-        test_poses::test_a_plane_that_tilts_lets_go_at_the_angle_of_friction[ImplicitEulerSolver]
-    """,
     "a slit in f32; the same in f64": """
         test_self_contact_near::test_no_force_at_rest[f32-shaken_1]
     """,
@@ -346,6 +344,18 @@ LEFT_OUT = {
     """,
     "BDF2 with all terms; velocity Verlet with these": """
         test_unequal_steps::test_reverse_gradients_are_the_transpose_of_tangents[loaded_scene-BDF2Solver]
+    """,
+    "two of ten nodes; linear faces in `test_traction_is_force_per_area`": """
+        test_contact_force::test_an_even_pressure_has_an_even_traction[1-five-cells0-100000000000.0]
+    """,
+    "a ball by pairs and a belt in BDF2; a ball in explicit steps": """
+        test_energy_watch::test_bdf2_is_not_blamed_for_work_from_outside[a ball]
+    """,
+    "a block that slides at 0.49 and holds at 0.51; the command `contact_corpus.py`": """
+        test_contact_corpus::test_arch_stands
+    """,
+    "explicit steps; transposes with friction, and nothing passes, in implicit ones": """
+        test_reduced_rigid::test_a_ball_rolls_down_a_slope
     """,
     "one ball in semi-implicit steps": """
         test_curved_contact::test_a_ball_acts_on_curved_faces_where_they_are[ImplicitEulerSolver]
@@ -415,7 +425,8 @@ LEFT_OUT = {
         test_outputs::test_numpy_tape_and_torch_agree[free-ImplicitEulerSolver]
         test_outputs::test_numpy_tape_and_torch_agree[prescribed motion-SemiImplicitSolver]
         test_quadratic_solvers::test_multigrid_takes_as_many_iterations_as_for_linear_tetrahedra[0.3-tetrahedra]
-        test_quadratic_solvers::test_multigrid_takes_as_many_iterations_as_for_linear_tetrahedra[0.49-patches]
+        test_quadratic_solvers::test_multigrid_takes_as_many_iterations_as_for_linear_tetrahedra[0.3-patches]
+        test_quadratic_solvers::test_multigrid_takes_as_many_iterations_as_for_linear_tetrahedra[0.49-tetrahedra]
         test_reduced::test_tangent_and_adjoint_agree_with_contact_and_friction[BDF2Solver-affine]
         test_reduced::test_tangent_and_adjoint_agree_with_contact_and_friction[BDF2Solver-rigid]
         test_reduced::test_tangent_and_adjoint_agree_with_contact_and_friction[ImplicitEulerSolver-affine]

@@ -81,3 +81,38 @@ def test_a_gripper_learns_to_lift():
     expected = (ends[0] - ends[1]) / 2e-4
     assert (at.grad * along).sum().item() == pytest.approx(expected, rel=1e-4) and expected < -0.1
     assert 0.2 < lift.found(frames)["ratio"] < 1 and lift.found(frames)["slip"] < module.LIFT
+
+
+def test_controller(tmp_path):
+    result = example("control/train_controller").main(tmp_path, iterations=45)
+    assert result["miss_seen"] < 0.025 and result["miss_unseen"] < 0.04 and result["miss_before"] > 0.1
+    assert (tmp_path / "train_controller.gif").stat().st_size > 50_000
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_finger_shape(order, tmp_path, capsys):
+    """The same pull, a harder grip; the gradient of a contact force by ten numbers of a shape."""
+    module = example("design/finger_shape")
+    for numbers in module.main(tmp_path, quick=True, orders=[order]).values():
+        assert numbers["ratio"] > 1.4 and numbers["volume"] < 1e-3
+        assert numbers["deeper"] < 1.75 + 1e-6 and numbers["wider"] < 1 + 1e-6 and numbers["smallest_J"] > 0.2
+    name = "finger_shape.png" if order == 1 else "finger_shape_ten_nodes.png"
+    assert (tmp_path / name).stat().st_size > 10_000
+    assert "times" in capsys.readouterr().out
+    finger, rng = module.Finger((6, 2, 2), order), np.random.default_rng(3)
+    x, change = 0.1 * rng.standard_normal((2, 2 * module.STATIONS))
+    slope = finger.grip(x)[1] @ change
+    assert slope == pytest.approx(
+        (finger.grip(x + 1e-3 * change)[0] - finger.grip(x - 1e-3 * change)[0]) / 2e-3, rel=1e-4
+    )
+
+
+@pytest.mark.filterwarnings("ignore:Measured")
+def test_dumbbell(capsys):
+    """To a crosshead's strain of 8 %, on a coarse mesh: within 2 % of the closed form; the shoulders take a third."""
+    numbers = example("identify/dumbbell").main(steps=1, cells=(8, 2, 1), top=1.08)
+    narrow, shoulders = numbers["at the narrow part"], numbers["12 mm farther out"]
+    assert max(narrow["error"], shoulders["error"]) < 0.02
+    assert 1 < narrow["share"][0] < 1.05 and 0.65 < shoulders["modulus"] < 0.72
+    assert abs(numbers["found"] - numbers["truth"]) < 4 * numbers["deviation"] < 0.02 * numbers["truth"]
+    assert "of the closed form" in capsys.readouterr().out

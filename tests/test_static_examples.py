@@ -106,24 +106,6 @@ def test_cantilever_shape(tmp_path, capsys):
         assert f(x)[1] @ change == pytest.approx(difference, rel=gate)
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.thorough)])
-def test_finger_shape(order, tmp_path, capsys):
-    """The same pull, a harder grip; the gradient of a contact force by ten numbers of a shape."""
-    module = example("design/finger_shape")
-    for numbers in module.main(tmp_path, quick=True, orders=[order]).values():
-        assert numbers["ratio"] > 1.4 and numbers["volume"] < 1e-3
-        assert numbers["deeper"] < 1.75 + 1e-6 and numbers["wider"] < 1 + 1e-6 and numbers["smallest_J"] > 0.2
-    name = "finger_shape.png" if order == 1 else "finger_shape_ten_nodes.png"
-    assert (tmp_path / name).stat().st_size > 10_000
-    assert "times" in capsys.readouterr().out
-    finger, rng = module.Finger((6, 2, 2), order), np.random.default_rng(3)
-    x, change = 0.1 * rng.standard_normal((2, 2 * module.STATIONS))
-    slope = finger.grip(x)[1] @ change
-    assert slope == pytest.approx(
-        (finger.grip(x + 1e-3 * change)[0] - finger.grip(x - 1e-3 * change)[0]) / 2e-3, rel=1e-4
-    )
-
-
 def test_pneumatic_finger(tmp_path, capsys):
     """Newton's method with derivatives of the equilibrium: few steps, the last of them quadratic."""
     numbers = example("control/pneumatic_finger").main(tmp_path, quick=True)

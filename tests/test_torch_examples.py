@@ -29,12 +29,6 @@ def test_learned_material(tmp_path):
     check_files(tmp_path, "learned_material")
 
 
-def test_controller(tmp_path):
-    result = example("control/train_controller").main(tmp_path, iterations=45)
-    assert result["miss_seen"] < 0.025 and result["miss_unseen"] < 0.04 and result["miss_before"] > 0.1
-    check_files(tmp_path, "train_controller", kind="gif")
-
-
 def test_resumed_controller_is_the_uninterrupted_one(tmp_path, monkeypatch):
     module, states = example("control/train_controller"), []
     monkeypatch.setattr(module, "save_reaches", lambda *_, **__: None)
