@@ -357,6 +357,27 @@ LEFT_OUT = {
     "explicit steps; transposes with friction, and nothing passes, in implicit ones": """
         test_reduced_rigid::test_a_ball_rolls_down_a_slope
     """,
+    "explicit steps; linear momentum in implicit ones": """
+        test_self_contact_friction::test_angular_momentum_but_for_the_couple_of_friction_across_the_gap[ImplicitMidpointSolver-60-options1]
+    """,
+    "explicit steps; any order has the same bits in implicit ones": """
+        test_term_order::test_two_of_one_kind_swapped[implicit_euler]
+    """,
+    "four obstacles, a sphere among them, in `test_every_adjoint.py`, by each input": """
+        test_implicit_contact::test_reverse_sweep_against_tangent_on_every_shape[sphere]
+    """,
+    "equilibria and explicit steps": """
+        test_work::test_derivatives[euler]
+    """,
+    "explicit steps in lanes; laws in implicit ones by their closed forms": """
+        test_laws_with_state::test_lanes_change_nothing[ImplicitEulerSolver]
+    """,
+    "velocity Verlet; gradients of backward Euler in f32 in `test_implicit_gradients.py`": """
+        test_single_precision::test_gradients_are_the_slopes_of_runs_and_checkpoints_change_no_bit[ImplicitEulerSolver]
+    """,
+    "linear tetrahedra; ten nodes in contact in `test_curved_contact.py`": """
+        test_supports::test_contact_holds_what_supports_leave[2]
+    """,
     "one ball in semi-implicit steps": """
         test_curved_contact::test_a_ball_acts_on_curved_faces_where_they_are[ImplicitEulerSolver]
     """,

@@ -273,11 +273,13 @@ def test_the_adjoint_of_explicit_steps_is_the_transpose_of_their_tangent():
 
 
 def test_nothing_passes_what_moves_up_through_it():
-    """A wire that no vertex meets comes up into a cube that falls."""
+    """A wire that no vertex meets comes up into a cube that falls. With kernels of `caught`."""
     up = lambda t: (0, 0.8 * t, 0)  # noqa: E731
     start, end = np.array([-0.05, -0.012, 0.03]), np.array([0.15, -0.012, 0.06])
-    wire = ds.Capsule(start, end, 4e-3, by_pairs=True, path=up, width=WIDTH, stiffness_per_area=5e7)
-    simulator = ds.Simulator(ds.ImplicitEulerSolver(cube(wire), dt=5e-3))
+    wire = ds.Capsule(start, end, 4e-3, by_pairs=True, path=lambda t: (*up(t), 0, 0, 0), width=WIDTH,
+                      stiffness_per_area=5e7, friction=0.3, friction_speed=0.05)  # fmt: skip
+    scene = cube(wire, ds.SelfContact(1e3, 2e-3, friction=0.2))
+    simulator = ds.Simulator(ds.ImplicitEulerSolver(scene, dt=5e-3))
     solid = dict(kind="capsule", start=start, end=end, radius=4e-3)
     judge = Judge(simulator.scene.mesh.surface_triangles, solid, simulator.positions)
     for _ in range(12):

@@ -211,7 +211,7 @@ def test_second_init_is_noticed():
 
 
 def test_home_that_cannot_be_written(tmp_path):
-    """Without a place for the kernel cache everything works, exit included; no folder is left. Root cannot write in /proc."""
+    """Without a place for the kernel cache everything works, exit included; no folder is left. Nobody can write in /proc."""
     said = "import os; print(len(os.listdir(os.environ['TMPDIR'])) > 0)"
     code = f"import diffsim_ti as ds\nds.init()\nds.init()\n{textwrap.dedent(STEP)}{said}"
     out = python(code, HOME="/proc", TI_OFFLINE_CACHE_FILE_PATH="/proc/none", TMPDIR=str(tmp_path))
