@@ -13,20 +13,6 @@ def test_incline(capsys):
     assert "Coulomb's law" in capsys.readouterr().out
 
 
-def test_bounce_gradients(capsys, tmp_path, monkeypatch):
-    """Soft balls: the stage's gradients are good at the longest steps of the body, and get better with shorter ones."""
-    cases, bounce = [("balls", 2e-3), ("blocks", 0.01)], example("contact/bounce_gradients")
-    kinds = ("stage, default", "stage, damping 0", "stage, damping 1")
-    monkeypatch.setattr(bounce, "KINDS", {kind: bounce.KINDS[kind] for kind in kinds})
-    found = bounce.main(tmp_path, starts=2, finest=1 / 8, cases=cases, shares=(0.8, 0.1))
-    errors, edges = found.values()
-    default = errors["stage, default"]
-    assert edges["stage, default"].max() < 0.01  # sharp edges, and the width that obstacles have by default
-    assert default[0] < 0.02 and default[-1] < 0.25 * default[0]
-    assert errors["stage, damping 1"][-1] > 4 * errors["stage, damping 0"][-1]  # what damping costs
-    assert (tmp_path / "bounce_gradients.png").stat().st_size > 10_000 and "median error" in capsys.readouterr().out
-
-
 def test_refinement():
     """The force of a press is that of the surface, not of its vertices."""
     press = example("contact/refinement").force_of_a_press

@@ -116,3 +116,71 @@ def test_dumbbell(capsys):
     assert 1 < narrow["share"][0] < 1.05 and 0.65 < shoulders["modulus"] < 0.72
     assert abs(numbers["found"] - numbers["truth"]) < 4 * numbers["deviation"] < 0.02 * numbers["truth"]
     assert "of the closed form" in capsys.readouterr().out
+
+
+def test_arm(tmp_path, capsys):
+    """Newton's method is quadratic with a right slope, which differences confirm; the wrench holds the finger."""
+    pytest.importorskip("pinocchio", reason='pip install "diffsim-ti[robots]"')
+    arm = example("control/arm")
+    numbers = arm.main(tmp_path, quick=True)
+    history = numbers["history"]
+    assert history[0] > 0.1 and history[-1] < 1e-6 and len(history) <= 6
+    assert numbers["pressed"][1] == pytest.approx(-2.0, abs=2e-6)
+    np.testing.assert_allclose(numbers["tip"][[0, 2]], arm.PLACE, atol=1e-8)
+    np.testing.assert_allclose(numbers["force"], numbers["pressed"] + [0, numbers["weight"], 0], atol=1e-6)
+    assert (tmp_path / "arm.png").stat().st_size > 10_000 and "wrench at the flange" in capsys.readouterr().out
+    pressing = arm.Pressing(4)
+    angles = torch.tensor(numbers["angles"], requires_grad=True)
+    frames = pressing.frames(angles)
+    # moments of table, weight and arm about the flange add up to nothing
+    x = frames.positions[-1].detach().numpy()
+    at = x - x[pressing.mesh.vertex_indices("xmin")].mean(0)
+    loads = frames["table"][-1].detach().numpy()
+    loads[:, 1] -= 9.81 * pressing.rollout.solver.scene.mass_matrix().diagonal()[::3]
+    np.testing.assert_allclose(np.cross(at, loads).sum(0) + numbers["moment"], 0, atol=1e-7)
+    residual = pressing.residual(frames)
+    slopes = torch.stack([torch.autograd.grad(r, angles, retain_graph=True)[0] for r in residual]).numpy()
+    for k in range(3):
+        move = 1e-5 * torch.eye(3, dtype=torch.float64)[k]
+        ends = [pressing.residual(pressing.frames(angles.detach() + s * move)).detach().numpy() for s in (1, -1)]
+        np.testing.assert_allclose(slopes[:, k], (ends[0] - ends[1]) / 2e-5, atol=1e-5 * np.abs(slopes).max())
+
+
+def test_learned_material(tmp_path):
+    result = example("identify/learned_material").main(tmp_path, iterations=20)
+    assert result["median_error"] < 0.12
+    assert result["unseen_motion_error"] < 0.02 < 0.2 < result["unseen_motion_error_before"]
+    assert (tmp_path / "learned_material.png").stat().st_size > 5000
+
+
+def test_bounce_gradients(capsys, tmp_path, monkeypatch):
+    """Soft balls: the stage's gradients are good at the longest steps of the body, and get better with shorter ones."""
+    cases, bounce = [("balls", 2e-3), ("blocks", 0.01)], example("contact/bounce_gradients")
+    kinds = ("stage, default", "stage, damping 0", "stage, damping 1")
+    monkeypatch.setattr(bounce, "KINDS", {kind: bounce.KINDS[kind] for kind in kinds})
+    found = bounce.main(tmp_path, starts=2, finest=1 / 8, cases=cases, shares=(0.8, 0.1))
+    errors, edges = found.values()
+    default = errors["stage, default"]
+    assert edges["stage, default"].max() < 0.01  # sharp edges, and the width that obstacles have by default
+    assert default[0] < 0.02 and default[-1] < 0.25 * default[0]
+    assert errors["stage, damping 1"][-1] > 4 * errors["stage, damping 0"][-1]  # what damping costs
+    assert (tmp_path / "bounce_gradients.png").stat().st_size > 10_000 and "median error" in capsys.readouterr().out
+
+
+def test_cantilever(capsys):
+    """Small strains as another code finds them (its numbers have three digits); large rotations as the elastica."""
+    numbers = example("benchmarks/cantilever").main(quick=True)
+    for share, known in numbers["shares"].values():
+        assert share == pytest.approx(known, abs=6e-3)
+    ((fine, extrapolated),) = numbers["elastica"].values()
+    assert -0.06 < fine[0] < -0.04  # locked
+    assert np.abs(extrapolated).max() < 0.018  # and how much of it extrapolation from 2 and 3 cells takes away
+    assert "elastica" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("error:scenes")
+def test_cubes_learn_to_jump_by_gradients(capsys):
+    found = example("control/jumper").main(8, 3, 12)
+    assert found["jumped"] > found["rest"] + 0.01
+    assert found["best"] > found["first"] + 0.03
+    assert "at once" in capsys.readouterr().out

@@ -251,7 +251,9 @@ def test_gradients_are_those_of_differences():
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_adjoints_of_equilibria_are_the_transposes_of_tangents(closed):
-    assert_transposed(ds.Rollout(ds.StaticSolver(loaded(closed=closed), tolerance=1e-12), 2, gradients="all"), 1e-8)
+    scene = loaded(closed=closed)
+    scene = scene.replace(terms=[term for term in scene.terms if not isinstance(term, ds.SurfaceDrag)])  # of velocities
+    assert_transposed(ds.Rollout(ds.StaticSolver(scene, tolerance=1e-12), 2, gradients="all"), 1e-8)
 
 
 # Chambers
