@@ -15,8 +15,8 @@ AREAS = {
     "contact_corpus curved_contact",
     "implicit steps and equilibria": "swept implicit_contact couplings tie reduced_explicit reduced reduced_rigid implicit "
     "solve_report implicit_cycle linear_solves implicit_gradients load_path",
-    "examples and pages": "contact_examples readme examples torch_examples static_examples environment reference release "
-    "words types",
+    "examples and pages": "contact_examples readme examples torch_examples static_examples long_examples environment "
+    "reference release words types",
     "pictures, films, the window": "gallery picture_drawing picture_film camera marks optimization_picture writers viewer "
     "viewer_window",
     "command line, resources, backends": "cli manners calls advice hard_use strength layout resources devices launch "

@@ -17,6 +17,13 @@ ARCH = os.environ.get("DIFFSIM_TI_ARCH", "cpu")
 PLAIN = not {"DIFFSIM_TI_ARCH", "DIFFSIM_TI_FORM", "DIFFSIM_TI_TAICHI"} & os.environ.keys()
 
 
+_spent = {}  # seconds of processors until a test began
+
+
+def pytest_collection_finish():
+    _spent["until"] = sum(os.times()[:4])
+
+
 def start():
     debug = dict(debug=True) if os.environ.get("DIFFSIM_TI_DEBUG") else {}
     diffsim_ti.init(ARCH, precision="f64", **debug)
@@ -38,7 +45,9 @@ def as_at_first(taichi):
 
 
 def pytest_addoption(parser):
-    parser.addoption("--minutes", action="store_true", help="write the minutes of each area to tests/README.md")
+    parser.addoption(
+        "--minutes", action="store_true", help="write the processors' minutes of each area to tests/README.md"
+    )
     parser.addoption("--thorough", action="store_true", help="also tests whose behaviour a cheaper one proves, too")
 
 
@@ -50,7 +59,8 @@ def pytest_collection_modifyitems(config, items):
     """Without the thorough ones; for several processes in the order of areas.py."""
     if not config.getoption("--thorough"):
         single = left_out(PLAIN)
-        if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.getoption("lf"):  # all of them
+        whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+        if whole and not config.getoption("lf", False):
             if gone := single - {_id(item) for item in items}:
                 raise pytest.UsageError(f"left_out.py names tests that are not there: {', '.join(sorted(gone))}")
         deselected = {item for item in items if item.get_closest_marker("thorough") or _id(item) in single}
@@ -58,6 +68,16 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [item for item in items if item not in deselected]
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: areas.place(item.path))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item):
+    """With --minutes durations are those of processors, of processes that a test starts, too, whatever else runs."""
+    report = yield
+    if item.config.getoption("--minutes"):
+        begin, _spent["until"] = _spent["until"], sum(os.times()[:4])
+        report.duration = _spent["until"] - begin
+    return report
 
 
 @pytest.hookimpl(optionalhook=True)

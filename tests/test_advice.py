@@ -8,11 +8,11 @@ import ast
 import re
 import warnings
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from package_source import PACKAGE, modules
 
 import diffsim_ti as ds
 from diffsim_ti.cli.identify import numbers_of
@@ -21,7 +21,6 @@ from diffsim_ti.scene.strength import check_strength
 from diffsim_ti.study import recommend
 from diffsim_ti.verify import gradient_health
 
-PACKAGE = Path(ds.__file__).parent
 ARGUMENT = re.compile(r"\b[a-z_]{3,}=")
 NUMBER = re.compile(r"(?:^|[;:,] |or )(?:take|reduce|raise|lower|shorten|pass|let)\b[^;:{]*\{\}")
 LAW, CUBE = ds.StableNeoHookean(1e5, 0.3), ds.TetrahedralMesh.create_cube(2)
@@ -50,9 +49,9 @@ def messages() -> list[tuple[str, str]]:
         for child in ast.iter_child_nodes(node):
             look(child, said)
 
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path, tree in modules().items():
         file = str(path.relative_to(PACKAGE))
-        look(ast.parse(path.read_text()), False)
+        look(tree, False)
     return out
 
 

@@ -1,7 +1,6 @@
 """The command line, its series and its pictures, by what they write and say."""
 
 import re
-import subprocess
 import sys
 
 import battery_of_falls
@@ -386,10 +385,9 @@ def test_demo(tmp_path, capsys):
     assert gradient == pytest.approx(difference, rel=1e-3)
 
 
-def test_help_names_every_command():
-    """In a process of its own."""
-    done = subprocess.run([sys.executable, "-m", "diffsim_ti", "--help"], capture_output=True, text=True)
-    assert done.returncode == 0 and all(name in done.stdout for name in ("simulate", "info", "demo"))
+def test_help_names_every_command(capsys):
+    said = printed(capsys, "--help")
+    assert all(name in said for name in ("simulate", "info", "demo"))
 
 
 @pytest.mark.parametrize("up, axis", [("x", 0), ("y", 1), ("z", 2), ("-x", 0), ("-y", 1), ("-z", 2)])

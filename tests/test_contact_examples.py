@@ -13,20 +13,6 @@ def test_incline(capsys):
     assert "Coulomb's law" in capsys.readouterr().out
 
 
-def test_bounce_gradients(capsys, tmp_path, monkeypatch):
-    """Soft balls: the stage's gradients are good at the longest steps of the body, and get better with shorter ones."""
-    cases, bounce = [("balls", 2e-3), ("blocks", 0.01)], example("contact/bounce_gradients")
-    kinds = ("stage, default", "stage, damping 0", "stage, damping 1")
-    monkeypatch.setattr(bounce, "KINDS", {kind: bounce.KINDS[kind] for kind in kinds})
-    found = bounce.main(tmp_path, starts=2, finest=1 / 8, cases=cases, shares=(0.8, 0.1))
-    errors, edges = found.values()
-    default = errors["stage, default"]
-    assert edges["stage, default"].max() < 0.01  # sharp edges, and the width that obstacles have by default
-    assert default[0] < 0.02 and default[-1] < 0.25 * default[0]
-    assert errors["stage, damping 1"][-1] > 4 * errors["stage, damping 0"][-1]  # what damping costs
-    assert (tmp_path / "bounce_gradients.png").stat().st_size > 10_000 and "median error" in capsys.readouterr().out
-
-
 def test_refinement():
     """The force of a press is that of the surface, not of its vertices."""
     press = example("contact/refinement").force_of_a_press
@@ -80,22 +66,6 @@ def test_gripper(capsys, tmp_path):
     assert numbers["squeezes"].shape == (2, 5) and numbers["squeezes"].max() > 2e-3 and numbers["resolved"]
     assert (tmp_path / "gripper.gif").stat().st_size > 10_000
     assert "slips by" in capsys.readouterr().out
-
-
-def test_soft_hand():
-    """The gradient of what slips says to squeeze more; a grip that it found holds what the one at first drops."""
-    hand = example("control/soft_hand")
-    scene, start = hand.hand_scene(), np.radians(np.repeat(hand.START, 3)).reshape(2, 3)
-    grip = hand.Grip(scene, 0.4)
-    frames, slip = grip.run(start)
-    gradient = grip.loss(frames, slip)[1]
-    squares = [(grip.run(start + move)[1] ** 2).sum(1) for move in (1e-5, -1e-5)]
-    ends = [float((square / (square + hand.LOST**2)).sum()) for square in squares]
-    assert gradient.sum() == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-3) and np.all(gradient[:, :2] < 0)
-    whole = hand.Grip(scene, 0.6, gradients=())
-    found = np.radians([[20.9, 26.7, 12.7], [17.7, 23.6, 10.7]])
-    slips = [np.linalg.norm(whole.run(turns)[1], axis=1).max() for turns in (start, found)]
-    assert slips[0] > 0.05 and slips[1] < hand.SLIP
 
 
 @pytest.mark.thorough

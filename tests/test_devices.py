@@ -147,8 +147,7 @@ print(simulator.describe())
 material = DifferentiableMaterial(torch.tensor(1e5), torch.tensor(0.3))
 simulator = DifferentiableSimulator(mesh, material, DifferentiableSolver(dt=1e-3))
 simulator.step()
-simulator.positions.sum().backward()
-print(simulator.describe(), material.youngs_modulus.grad if hasattr(material, "youngs_modulus") else "")
+print(simulator.describe())
 try:
     DifferentiableSimulator(mesh, material, DifferentiableSolver(dt=1e-3), device="cuda")
 except RuntimeError as error:

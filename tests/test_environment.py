@@ -143,14 +143,6 @@ def test_a_crawler_learns_by_gradients_and_ppo_takes_as_many_samples(against_ppo
         assert curve[-1][2] > curve[0][2] + 0.003
 
 
-@pytest.mark.filterwarnings("error:scenes")
-def test_cubes_learn_to_jump_by_gradients(capsys):
-    found = example("control/jumper").main(8, 3, 12)
-    assert found["jumped"] > found["rest"] + 0.01
-    assert found["best"] > found["first"] + 0.03
-    assert "at once" in capsys.readouterr().out
-
-
 def test_steps_of_grasps_are_counted_on_the_processor_of_ones_choice(monkeypatch, capsys):
     started = []
     monkeypatch.setattr("diffsim_ti.init", started.append)

@@ -9,7 +9,6 @@ import sys
 import numpy as np
 import pytest
 from example_files import EXAMPLES, example
-from scipy.spatial.transform import Rotation
 
 ARCH = os.environ.get("DIFFSIM_TI_ARCH", "cpu")
 
@@ -34,7 +33,7 @@ def test_stiffness_field(tmp_path):
 
 def test_costs_of_identification():
     """On a field of 72 unknowns: fewer simulations than differences, whose share grows with the unknowns."""
-    told = example("benchmarks/identify_costs").main(cells=(3, 2, 2), most=400, rates=(0.1,))
+    told = example("benchmarks/identify_costs").main(cells=(3, 2, 2), most=250, rates=(0.1,))
     for found in told.values():
         for best, theirs in zip(found["Levenberg-Marquardt"], found["SciPy, differences"]):
             assert theirs is None or best[0] <= theirs[0]
@@ -55,17 +54,19 @@ def test_scipys_minimisers(capsys):
 
 
 def test_walker(tmp_path, capsys):
-    """Six of its 25 iterations."""
-    numbers = example("control/walker").main(tmp_path, iterations=6)
+    """Four of its 25 iterations."""
+    numbers = example("control/walker").main(tmp_path, iterations=4)
     assert numbers["way_before"] + 0.003 < numbers["way"] and "walker, a second" in capsys.readouterr().out
     assert (tmp_path / "walker.gif").stat().st_size > 100_000
 
 
-def test_swimmer(tmp_path, capsys):
-    """Three iterations bring it more than three times as far as it came by random strokes."""
-    numbers = example("control/swimmer").main(tmp_path, iterations=3)
-    assert numbers["way"] > 3 * numbers["way_before"] > 0.01 and abs(numbers["aside"]) < 0.02
-    assert "swimmer, five seconds" in capsys.readouterr().out and (tmp_path / "swimmer.gif").stat().st_size > 100_000
+def test_swimmer(tmp_path, capsys, monkeypatch):
+    """Of two of its five seconds; four iterations bring it more than ten times as far as it came by random strokes."""
+    swimmer = example("control/swimmer")
+    monkeypatch.setattr(swimmer, "STEPS", 100)
+    numbers = swimmer.main(tmp_path, iterations=4)
+    assert numbers["way"] > 0.03 > 10 * numbers["way_before"] > 0 and abs(numbers["aside"]) < 0.02
+    assert "swimmer, five seconds" in capsys.readouterr().out and (tmp_path / "swimmer.gif").stat().st_size > 50_000
 
 
 def test_tutorial(tmp_path, capsys, monkeypatch):
@@ -75,47 +76,6 @@ def test_tutorial(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr()
     assert not said.err and "friction" in said.out and "WRONG" not in said.out and "E = 4.5" in said.out, said
     assert (tmp_path / "output" / "tutorial.png").stat().st_size > 20_000
-
-
-def test_indentation(capsys, monkeypatch):
-    indentation = example("identify/indentation")
-    monkeypatch.setattr(indentation, "STEPS", 3)
-    numbers = indentation.main()
-    assert max(numbers["errors"].values()) < 0.01 and numbers["runs"] <= 10
-    assert max(numbers["spread"]) < 0.01  # standard errors, of numbers in logarithms
-    assert "friction = " in capsys.readouterr().out
-
-
-def test_measured_beam(tmp_path, capsys, monkeypatch):
-    """Recordings that it makes itself, seen by a tilted camera: numbers come back, and the weight's motion is foretold."""
-    beam = example("identify/measured_beam")
-    monkeypatch.setattr(beam, "EDGE", 8e-3)
-    monkeypatch.setattr(beam, "EVERY", 20)
-    truth, tilt = dict(youngs_modulus=2.2e5, drag_rate=9.0), Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
-    rng = np.random.default_rng(0)
-    for name, mass, share in (("gravity_a", 0.0, 0.1), ("load40_a", 0.04, 0.2)):
-        body = beam.mesh(2, beam.EDGE if mass else 0.0)
-        numbers = dict(truth, prony_shares=np.array([0.0, 0.05]), support=(share, 0.0))
-        numbers["youngs_modulus"] *= beam.finer(2, body)
-        moved = beam.swing(body, "drag", numbers, 1.6, mass).forward()["markers"]
-        before, after = (
-            np.tile(moved[:1], (60, 1, 1)),
-            np.tile(beam.hang(body, numbers, mass).forward()["markers"][-1], (60, 1, 1)),
-        )
-        tip = np.concatenate([before, moved, after]) + (beam.TIP - moved[0])
-        seen = np.concatenate([tip, np.tile(beam.BASE, (len(tip), 1, 1))], 1) @ tilt + [0.1, 0.2, 0.3]
-        seen = seen + 1e-5 * rng.standard_normal(seen.shape)
-        rows = np.column_stack([0.01 * np.arange(len(seen)), seen.reshape(-1, 18)])
-        np.savetxt(tmp_path / f"beam_{name}.csv", rows, delimiter=",", header="time, x, y, z of six markers")
-    found = beam.main(tmp_path, kinds=("drag",), span=0.4, output=tmp_path)
-    intervals, errors = found["fits"]["drag"].intervals, found["errors"][0.04]
-    for name, x in truth.items():
-        low, high = intervals[name]
-        assert low < x < high < 1.2 * low
-    assert abs(errors["rest"]) < 0.01 and abs(errors["frequency"]) < 0.01 and abs(errors["decay"]) < 0.1
-    assert "with 40 g, predicted:" in capsys.readouterr().out
-    for name in ("measured_beam.png", "beam_load40_a.gif"):
-        assert (tmp_path / name).stat().st_size > 20_000
 
 
 def test_inverse_rest_shape(capsys):

@@ -194,7 +194,7 @@ def test_two_numbers_of_a_law_from_a_force_stretch_curve():
     force = pulled_bar((6, 2, 2), ds.Gent(**truth, bulk_modulus=1.5e5), "five").forward()["force"]
     noise = 5e-3 * np.abs(force).max()
     fitted = pulled_bar((3, 1, 1), ds.Gent(2e4, 12.0, 1.5e5), "kuhn")
-    for seed in range(3):
+    for seed in range(2):
         seen = force + noise * np.random.default_rng(seed).standard_normal(force.shape)
         seen[:, 1:] = np.nan  # the machine reads one direction
         found = identify(fitted, {"force": seen}, dict(mu=2e4, limit=12.0), noise)
@@ -245,7 +245,7 @@ def test_the_curve_of_three_ogden_pairs_from_uniaxial_and_biaxial_data():
 @pytest.mark.filterwarnings("ignore:Ogden. Poisson")  # strains are the same everywhere: nothing locks
 def test_numbers_of_an_input_are_unknowns_of_their_own():
     rollout = stretched_block(ds.Ogden([1e5, -1e4], [1.5, -2.0], 1e7), {"xmax": 1.2})
-    data, given = {"force": rollout.forward()["force"]}, [1e5, -1e4]
+    data, given = {"force": np.zeros((21, 3))}, [1e5, -1e4]  # refused before a run
     for unknown, words in (
         (ds.Unknown([1e5, 2e4, 3e4]), r"start has shape \(3,\), expected one number or the input's shape, \(2,\)"),
         (ds.Unknown(given), "has no logarithm"),

@@ -2,10 +2,10 @@
 
 import ast
 import re
+from functools import lru_cache
 from pathlib import Path
 
-PACKAGE = Path(__file__).parent.parent / "diffsim_ti"
-MODULES = {path: ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))}
+from package_source import PACKAGE, modules, nodes
 
 
 def room(path: Path) -> str:
@@ -18,12 +18,12 @@ def _of_mechanics(parts) -> str:
     return ".".join(parts[:2]) if parts[0] == "mechanics" and len(parts) > 1 else parts[0]
 
 
-def rooms_used(tree: ast.Module) -> set[str]:
+def rooms_used(nodes: list[ast.AST]) -> set[str]:
     """Rooms that a module imports from, also inside functions; what only type checkers read does not count."""
-    ifs = [node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    ifs = [node for node in nodes if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
     typing_only = {id(inner) for node in ifs for inner in node.body}
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if id(node) in typing_only:
             continue
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "diffsim_ti":
@@ -49,21 +49,21 @@ def circles(uses: dict[str, set[str]]) -> list[str]:
 
 def test_imports_between_folders_go_one_way():
     uses = {}
-    for path, tree in MODULES.items():
-        uses.setdefault(room(path), set()).update(rooms_used(tree) - {room(path)})
+    for path, inside in nodes().items():
+        uses.setdefault(room(path), set()).update(rooms_used(inside) - {room(path)})
     del uses["__init__"]
     assert len(uses) > 30 and "mechanics.energy" in uses["monitor"] and not circles(uses)
 
 
 def test_all_warnings_point_at_the_line_of_the_user():
     """By `warn` of common/warn.py."""
-    assert [p.name for p in MODULES if re.search(r"warnings\.warn\b|stacklevel", p.read_text())] == []
+    assert [p.name for p in modules() if re.search(r"warnings\.warn\b|stacklevel", p.read_text())] == []
 
 
 def test_texts_are_read_and_written_in_utf_8():
     """And not in what the system's locale says."""
-    for path, tree in MODULES.items():
-        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+    for path, inside in nodes().items():
+        for call in (node for node in inside if isinstance(node, ast.Call)):
             name = getattr(call.func, "id", getattr(call.func, "attr", ""))
             named = {word.arg for word in call.keywords}
             modes = [x.value for x in call.args if isinstance(x, ast.Constant) and isinstance(x.value, str)]
@@ -81,11 +81,11 @@ def test_a_circle_would_be_found():
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
 
 
-def private_attributes(tree: ast.Module) -> list[str]:
+def private_attributes(nodes: list[ast.AST]) -> list[str]:
     """Names with one underscore that are read off something else than self, and that the module does not make itself."""
-    own = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    own = {node.name for node in nodes if isinstance(node, ast.FunctionDef)}
     read = []
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Attribute) and re.match(r"_[a-z]", node.attr):
             if isinstance(node.value, ast.Name) and node.value.id in ("self", "cls"):
                 own.add(node.attr)
@@ -96,15 +96,15 @@ def private_attributes(tree: ast.Module) -> list[str]:
 
 def test_no_module_reaches_into_another():
     taichis = PACKAGE / "runtime"  # the one place that knows Taichi's internals
-    reached = {str(path): private_attributes(tree) for path, tree in MODULES.items() if taichis not in path.parents}
+    reached = {str(path): private_attributes(x) for path, x in nodes().items() if taichis not in path.parents}
     assert {name: names for name, names in reached.items() if names} == {}
-    assert private_attributes(ast.parse("def f(x):\n    return x._secret")) == ["_secret"]
+    assert private_attributes(list(ast.walk(ast.parse("def f(x):\n    return x._secret")))) == ["_secret"]
 
 
-def internals(tree: ast.Module) -> list[str]:
+def internals(nodes: list[ast.AST]) -> list[str]:
     """Modules of Taichi's that are imported, but for itself and its window."""
     found = []
-    for node in ast.walk(tree):
+    for node in nodes:
         names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
         names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
         found += [name for name in names if name.startswith("taichi.") and name != "taichi.ui"]
@@ -114,8 +114,11 @@ def internals(tree: ast.Module) -> list[str]:
 
 
 def test_one_folder_alone_knows_taichis_internals():
-    assert internals(ast.parse("from taichi.lang import impl\nti.lang.impl")) == ["taichi.lang", "ti.lang"]
-    found = {str(path): internals(tree) for path, tree in MODULES.items() if room(path) != "runtime"}
+    assert internals(list(ast.walk(ast.parse("from taichi.lang import impl\nti.lang.impl")))) == [
+        "taichi.lang",
+        "ti.lang",
+    ]
+    found = {str(path): internals(x) for path, x in nodes().items() if room(path) != "runtime"}
     assert {name: names for name, names in found.items() if names} == {}
 
 
@@ -125,14 +128,17 @@ def lines(text: str) -> int:
 
 
 def test_files_are_short():
-    lengths = {str(path): lines(path.read_text()) for path in MODULES}
+    lengths = {str(path): lines(path.read_text()) for path in modules()}
     assert {name: length for name, length in lengths.items() if length > 600} == {}
     assert sorted(lengths.values())[len(lengths) // 2] <= 130
 
 
-CLASSES = {
-    (path, node.name): node for path, tree in MODULES.items() for node in tree.body if isinstance(node, ast.ClassDef)
-}
+@lru_cache
+def classes() -> dict[tuple[Path, str], ast.ClassDef]:
+    found = [(path, node) for path, tree in modules().items() for node in tree.body if isinstance(node, ast.ClassDef)]
+    return {(path, node.name): node for path, node in found}
+
+
 OF_BATCHES = "elements of a batch are those of one scene with other places of their numbers"
 DEEP = {  # classes that may stand more than three deep, and why
     **dict.fromkeys(
@@ -149,9 +155,9 @@ DEEP = {  # classes that may stand more than three deep, and why
 
 def found_in(path: Path, name: str) -> tuple[Path, str] | None:
     """Where a class of the package is defined that a module calls by a name; None of other classes."""
-    if (path, name) in CLASSES:
+    if (path, name) in classes():
         return path, name
-    for node in MODULES[path].body:
+    for node in modules()[path].body:
         for alias in node.names if isinstance(node, ast.ImportFrom) else []:
             if name == (alias.asname or alias.name) and (node.module or "").split(".")[0] == "diffsim_ti":
                 place = PACKAGE.joinpath(*node.module.split(".")[1:])
@@ -161,12 +167,12 @@ def found_in(path: Path, name: str) -> tuple[Path, str] | None:
 
 def depth(path: Path, name: str) -> int:
     """How many classes of the package stand from it to the farthest of its bases, itself included."""
-    bases = [found_in(path, base.id) for base in CLASSES[path, name].bases if isinstance(base, ast.Name)]
+    bases = [found_in(path, base.id) for base in classes()[path, name].bases if isinstance(base, ast.Name)]
     return 1 + max((depth(*base) for base in bases if base), default=0)
 
 
 def test_classes_stand_at_most_three_deep():
-    depths = {place: depth(*place) for place in CLASSES}
+    depths = {place: depth(*place) for place in classes()}
     assert len(depths) > 500 and sum(d == 3 for d in depths.values()) > 30
     assert {name for (_, name), d in depths.items() if d > 3} == set(DEEP)
 
@@ -175,9 +181,9 @@ def test_kernels_are_those_of_runtime():
     """Which are traced faster (runtime/sources.py): `ti.kernel` stands nowhere else."""
     found = [
         str(path)
-        for path, tree in MODULES.items()
+        for path, inside in nodes().items()
         if room(path) != "runtime"
-        for node in ast.walk(tree)
+        for node in inside
         if isinstance(node, ast.FunctionDef) and any(ast.unparse(d) == "ti.kernel" for d in node.decorator_list)
     ]
     assert found == []

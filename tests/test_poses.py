@@ -18,7 +18,7 @@ from diffsim_ti.visual.series import SavedSeries
 from diffsim_ti.writers import View, writer_for
 from diffsim_ti.writers.adaptive_run import ForwardRun, run_and_write
 
-MU, CREEP, DT = 0.5, 1e-4, 5e-4
+MU, CREEP = 0.5, 1e-4
 SOLVERS = with_options(ds.SemiImplicitSolver, contact_damping=1.0), ds.ImplicitEulerSolver
 
 
@@ -35,8 +35,9 @@ def slid(solver, path, frames, normal=(0, 1, 0), velocity=None) -> tuple[np.ndar
     if velocity is not None:
         start[:3] = velocity(mesh.vertices[:3])
     scene = points(mesh, floor, mass, terms=[ds.Gravity()], initial_velocities=start, precision="f64")
-    each = round(0.1 / DT)
-    return ds.Rollout(solver(scene, dt=DT), steps=frames * each, save_every=each).forward().positions[
+    dt = 5e-4 if solver.explicit else 2e-3
+    each = round(0.1 / dt)
+    return ds.Rollout(solver(scene, dt=dt), steps=frames * each, save_every=each).forward().positions[
         :, :3
     ], mesh.vertices
 

@@ -210,10 +210,12 @@ def test_second_init_is_noticed():
     )
 
 
-def test_home_that_cannot_be_written():
-    """Without a place for the kernel cache everything works, exit included. Not even root can write in /proc."""
-    out = python("import diffsim_ti as ds\nds.init()\n" + textwrap.dedent(STEP) + "print('done')", HOME="/proc")
-    assert out.splitlines()[-1] == "done"
+def test_home_that_cannot_be_written(tmp_path):
+    """Without a place for the kernel cache everything works, exit included; no folder is left. Nobody can write in /proc."""
+    said = "import os; print(len(os.listdir(os.environ['TMPDIR'])) > 0)"
+    code = f"import diffsim_ti as ds\nds.init()\nds.init()\n{textwrap.dedent(STEP)}{said}"
+    out = python(code, HOME="/proc", TI_OFFLINE_CACHE_FILE_PATH="/proc/none", TMPDIR=str(tmp_path))
+    assert out.splitlines()[-1] == "True" and list(tmp_path.glob("ticache-*")) == []
 
 
 def test_the_next_process_finds_the_compiled_kernels(tmp_path):
@@ -252,18 +254,18 @@ def specializations():
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc")
 def test_dropped_scenes_leave_nothing():
-    """110 scenes: memory goes back, and no kernel compiles after the first."""
+    """70 scenes: memory goes back, and no kernel compiles after the first."""
     gc.collect()
     start = runtime.allocated_megabytes()
     resident, compiled = [], []
-    for k in range(110):
+    for k in range(70):
         build_and_drop(field=True)
-        if k in (20, 65, 109):
+        if k in (20, 45, 69):
             gc.collect()
             resident.append(resident_megabytes())
             compiled.append(specializations())
     assert runtime.allocated_megabytes() == pytest.approx(start, abs=1e-9)
-    assert min(np.diff(resident)) < 5  # a leak grows all the time; memory that is handed out in large pieces does not
+    assert min(np.diff(resident)) < 3  # a leak grows all the time; memory that is handed out in large pieces does not
     assert len(set(compiled)) == 1
 
 

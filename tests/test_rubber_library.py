@@ -6,7 +6,7 @@ import warnings
 import battery_of_fits
 import numpy as np
 import pytest
-from example_files import EXAMPLES, example
+from example_files import EXAMPLES
 from test_cli import fails
 
 import diffsim_ti as ds
@@ -279,17 +279,3 @@ def test_fit_refuses_what_it_cannot_read(tmp_path, capsys):
     assert "no three lines with two numbers" in fails(capsys, "fit", tmp_path / "b.csv")
     (tmp_path / "empty").mkdir()
     assert "there is no CSV file" in fails(capsys, "fit", tmp_path / "empty")
-
-
-# ---- the specimen --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("ignore:Measured")
-def test_dumbbell(capsys):
-    """To a crosshead's strain of 8 %, on a coarse mesh: within 2 % of the closed form; the shoulders take a third."""
-    numbers = example("identify/dumbbell").main(steps=1, cells=(8, 2, 1), top=1.08)
-    narrow, shoulders = numbers["at the narrow part"], numbers["12 mm farther out"]
-    assert max(narrow["error"], shoulders["error"]) < 0.02
-    assert 1 < narrow["share"][0] < 1.05 and 0.65 < shoulders["modulus"] < 0.72
-    assert abs(numbers["found"] - numbers["truth"]) < 4 * numbers["deviation"] < 0.02 * numbers["truth"]
-    assert "of the closed form" in capsys.readouterr().out

@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
-import taichi as ti
-import torch
 from test_every_adjoint import assert_transposed
 from test_gradients import random_mesh
 from test_term_order import SOLVERS
 
 import diffsim_ti as ds
-from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.lines.interaction import SpringsAndCables
@@ -469,32 +466,6 @@ def test_energy_is_kept_and_what_cables_do_is_counted(kind):
 
 
 # ---- faces, mistakes -----------------------------------------------------------------------------------------------------
-
-
-def test_torch_and_the_tape_give_the_same_gradients():
-    ours, theirs = (rollout_of(ds.VelocityVerletSolver, attached(lidded())) for _ in range(2))
-    frames = ours.forward()
-    w = np.random.default_rng(7).standard_normal(frames.positions.shape)
-    expected = ours.vjp(frames, w)
-    names = ("spring_stiffness", "struts.anchors", "cable_tension", "cable_length", "foundation_normal")
-    tensors = {n: torch.tensor(theirs.values[n], dtype=torch.float64, requires_grad=True) for n in names}
-    (torch.from_numpy(w) * rollout_frames(theirs, **tensors).positions).sum().backward()
-    for name in names:
-        np.testing.assert_allclose(tensors[name].grad, expected[name], rtol=1e-12, err_msg=name)
-    loss, field = ti.field(ti.f64, (), needs_grad=True), ours.field("tendon.tension")
-    weights = ti.Vector.field(3, ti.f64, w.shape[:2])
-    weights.from_numpy(w)
-    x = ours.positions
-
-    @ti.kernel
-    def weigh():
-        for k, i in ti.ndrange(w.shape[0], w.shape[1]):
-            loss[None] += weights[k, i].dot(x[k, i])
-
-    with ti.ad.Tape(loss):
-        ours.run()
-        weigh()
-    np.testing.assert_allclose(field.grad.to_numpy(), expected["tendon.tension"], rtol=1e-12)
 
 
 def test_many_threads_give_the_same():

@@ -44,7 +44,7 @@ def test_a_thin_wall_stops_a_cube(solver, speed, dt):
 def test_a_plate_that_comes_pushes_a_body_along(solver):
     """30 m/s and steps of 10 ms: 0.3 m in a step, three times the body."""
     path = lambda t: np.array([30 * t - 0.4, 0, 0])  # noqa: E731
-    scene = ds.Scene(cube(), SOFT, terms=[wall(stiffness=1e4, path=path)], precision="f64")
+    scene = ds.Scene(cube(), SOFT, terms=[wall(stiffness_per_area=1e6, path=path)], precision="f64")
     simulator = ds.Simulator(solver(scene, dt=1e-2))
     judged(simulator, WALL, 4, path)
     assert simulator.velocities[:, 0].mean() > 25

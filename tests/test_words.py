@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from package_source import nodes
 from test_readme import GUIDES
 from test_reference import PUBLIC, parts, said
 
@@ -46,10 +47,9 @@ EXCEPTIONS = {
 def messages() -> list[tuple[str, str]]:
     """(file, text) of every string of words in the package that is no docstring."""
     out = []
-    for path in sorted((ROOT / "diffsim_ti").rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        plain = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-        for node in ast.walk(tree):
+    for path, inside in nodes().items():
+        plain = {id(node.value) for node in inside if isinstance(node, ast.Expr)}
+        for node in inside:
             if (
                 isinstance(node, ast.Constant)
                 and isinstance(node.value, str)

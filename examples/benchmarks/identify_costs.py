@@ -121,7 +121,7 @@ def main(cells=(9, 3, 3), most: int = 12000, rates=(0.03, 0.1)) -> dict:
         runs = {method: ours(search(), method) for method in ("Levenberg-Marquardt", "L-BFGS-B")}
         runs["SciPy, differences"] = scipys(search(), most)
         for rate in rates:
-            runs[f"Adam, rate {rate:g}"] = adams(search(), rate, most // 2 if "of" in name else 600)
+            runs[f"Adam, rate {rate:g}"] = adams(search(), rate, most // 2 if "of" in name else min(most, 600))
         size = search().problem.size
         least = min(run.points[-1][2] for run in runs.values())
         out[name] = {m: [run.reached(least + near**2 * size) for near in NEAR] for m, run in runs.items()}
