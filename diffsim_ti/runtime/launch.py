@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import subprocess
+import sys
 
 import numpy as np
 import taichi as ti
@@ -17,13 +18,13 @@ from diffsim_ti.common.progress import LOG
 from diffsim_ti.runtime.arrays import check_owner, full_shape
 from diffsim_ti.runtime.language import made
 from diffsim_ti.runtime.quadrants import QUADRANTS
-from diffsim_ti.runtime.repeated_loops import KNOWN, RepeatedLoops
+from diffsim_ti.runtime.repeated_loops import KNOWN, MOST_TASKS, RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
 from diffsim_ti.runtime.threads import LOCK, materialize, untaped
 
 PATIENCE, SHORT = 5, 500  # [s]; variables of kernels that take less than a second
 _WORD = ctypes.sizeof(ctypes.c_void_p)
-_TASK = ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)  # which keeps Python's lock
+_TASK = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)
 
 
 class Launch:
@@ -120,8 +121,9 @@ class Launch:
             return
         with self._repeated.times(times) if self._repeated else contextlib.nullcontext():
             self._owner().launch_kernel(self._code, self._context)
-            if self._read:
-                self._tasks[times] = compiled_tasks(self._owner(), self._code)
+            tasks = compiled_tasks(self._owner(), self._code) if self._read else None
+            if tasks:
+                self._tasks[times] = tasks
 
 
 @contextlib.contextmanager
@@ -195,17 +197,29 @@ def _object(python) -> int:
     return _word(id(python) + object.__basicsize__).value
 
 
-def compiled_tasks(prog, code) -> list:
-    """The functions of a kernel that was launched on a processor, to be called with the address of what they read.
+def compiled_tasks(prog, code) -> list | None:
+    """The functions of a kernel that was launched on a processor, to be called with the address of what they read; None
+    where something else lies there.
 
     Taichi's launcher looks for the address of each array again each time, for half a microsecond. It has no door to what it
-    calls then: the list of a kernel's functions lies in its object, under the kernel's number.
+    calls then: the list of a kernel's functions lies in its object, under the kernel's number. What is read here is read as
+    a file, so that a wrong address is an error and no crash, and must be code.
     Source: Taichi 1.7.4, program/program.h, runtime/cpu/kernel_launcher.h.
     """
-    launcher = _word(_word(_object(prog) + 87 * _WORD).value + 3 * _WORD).value
-    own = _word(launcher + 3 * _WORD).value + 6 * _WORD * ctypes.c_int32.from_address(_object(code) + _WORD).value
-    first, behind = _word(own).value, _word(own + _WORD).value
-    return [_TASK(_word(place).value) for place in range(first, behind, _WORD)]
+    try:
+        with open("/proc/self/mem", "rb", buffering=0) as memory:
+            word = lambda address: int.from_bytes(os.pread(memory.fileno(), _WORD, address), sys.byteorder)  # noqa: E731
+            launcher = word(word(_object(prog) + 87 * _WORD) + 3 * _WORD)
+            number = word(_object(code) + _WORD) & 0xFFFFFFFF
+            own = word(launcher + 3 * _WORD) + 6 * _WORD * number
+            first, behind = word(own), word(own + _WORD)
+            places = [word(place) for place in range(first, min(behind, first + MOST_TASKS * _WORD), _WORD)]
+        with open("/proc/self/maps") as maps:
+            known = [[int(x, 16) for x in line.split()[0].split("-")] for line in maps if "x" in line.split()[1]]
+    except (OSError, OverflowError):
+        return None
+    is_code = places and all(any(begin <= place < end for begin, end in known) for place in places)
+    return [_TASK(place) for place in places] if is_code else None
 
 
 class ArgumentBuffer:

@@ -62,9 +62,10 @@ class NearPairs:
         """The same without nodes that no pair reads, where sets are; which nodes are kept."""
         read, sets = np.unique(self.C[np.unique(self.corners)].indices), []
         for x in self.sets:
-            here = np.isin(x.at[: len(x.here)], read)
+            vertices, numbers = x.at[: len(x.here)], x.at[len(x.here) :]
+            here = np.isin(vertices, read)
             if here.any():
-                sets.append(vars(x) | dict(here=x.here[here], at=np.append(x.at[: len(x.here)][here], x.at[len(x.here) :])))
+                sets.append(vars(x) | dict(here=x.here[here], at=np.append(vertices[here], numbers)))
         kept = np.unique(np.concatenate([read, *(x["at"] for x in sets)]))
         for x in sets:
             x |= dict(at=np.searchsorted(kept, x["at"]), twist=x["twist"] and int(np.searchsorted(kept, x["twist"])))

@@ -31,7 +31,7 @@ class ContactPass:
 
     def of(self, chosen: np.ndarray, start, u, v, parts: list[Part], e: np.ndarray, b: np.ndarray) -> "ContactPass":
         """What was done to some of the pairs, those that came near, in a pass between these states of all nodes; e, b:
-        what it gained. Of sets it has the vertices of these pairs alone, so that bits do not depend on what else was near."""
+        what it gained. Of sets it has the vertices of these pairs alone: bits do not depend on what else was near."""
         near = replace(self.near, **{x: getattr(self.near, x)[chosen] for x in ("corners", "edges", "scale")})
         plane, weights, own = self.rest
         own = SimpleNamespace(**{name: x[chosen] for name, x in vars(own).items()})
@@ -41,7 +41,8 @@ class ContactPass:
             nodes, e, b = nodes[kept[kept < len(nodes)]], e[kept], b[kept]
             parts = [replace(part, e=part.e[kept], b=part.b[kept]) for part in parts]
         start = start if near.sets else start[nodes]
-        return ContactPass(near, self.numbers[chosen], nodes, self.points, self.pairs[chosen], rest, start, u, v, parts, e, b)
+        given = near, self.numbers[chosen], nodes, self.points, self.pairs[chosen], rest, start
+        return ContactPass(*given, u, v, parts, e, b)
 
     def vectors(self, x: np.ndarray) -> np.ndarray:
         """Those of its nodes, from vectors of all nodes, and zeros of what stands for numbers of sets."""
