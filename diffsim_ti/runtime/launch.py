@@ -214,12 +214,20 @@ def compiled_tasks(prog, code) -> list | None:
             own = word(launcher + 3 * _WORD) + 6 * _WORD * number
             first, behind = word(own), word(own + _WORD)
             places = [word(place) for place in range(first, min(behind, first + MOST_TASKS * _WORD), _WORD)]
-        with open("/proc/self/maps") as maps:
-            known = [[int(x, 16) for x in line.split()[0].split("-")] for line in maps if "x" in line.split()[1]]
+        if not _are_code(places):  # nor has been before
+            with open("/proc/self/maps", encoding="ascii", errors="replace") as maps:
+                rows = (line.split(maxsplit=2) for line in maps)
+                _code[:] = [tuple(int(x, 16) for x in row[0].split("-")) for row in rows if "x" in row[1]]
     except (OSError, OverflowError):
         return None
-    is_code = places and all(any(begin <= place < end for begin, end in known) for place in places)
-    return [_TASK(place) for place in places] if is_code else None
+    return [_TASK(place) for place in places] if _are_code(places) else None
+
+
+_code: list[tuple[int, int]] = []  # begin and end of what this process may execute
+
+
+def _are_code(places: list[int]) -> bool:
+    return bool(places) and all(any(begin <= place < end for begin, end in _code) for place in places)
 
 
 class ArgumentBuffer:
