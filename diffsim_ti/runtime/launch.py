@@ -214,7 +214,7 @@ def compiled_tasks(prog, code) -> list | None:
             first, behind = word(own), word(own + _WORD)
             size = behind - first if behind - first < MOST_BYTES else 0
             places = np.frombuffer(os.pread(memory.fileno(), size, first), np.uintp).tolist()
-        with open("/proc/self/maps") as maps:
+        with open("/proc/self/maps", encoding="utf-8", errors="replace") as maps:
             known = [[int(x, 16) for x in line.split()[0].split("-")] for line in maps if "x" in line.split()[1]]
     except (OSError, OverflowError, ValueError):
         return None

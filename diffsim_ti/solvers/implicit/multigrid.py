@@ -160,7 +160,6 @@ class Multigrid(Preconditioner):
             return
         blocks, stiffness = self.potential.obstacle_blocks(), np.abs(np.einsum("kii->k", self._diagonal))
         size = np.abs(np.einsum("kii->k", blocks))
-        size[~np.isfinite(blocks.sum((1, 2)))] = 0  # of a scene of a batch that is given up
         share, before = size / (size + stiffness + 1e-300), 0.0 if self._contact is None else self._contact
         few = np.abs(share - before).sum() <= self.changed * np.maximum(share, before).sum()
         if self.potential.pairs:
