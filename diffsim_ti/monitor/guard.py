@@ -143,7 +143,8 @@ class Guard:
         self.restart()
 
     def restart(self) -> None:
-        """A new run: checks come at the same passes whatever ran before, wherever states are kept, and sooner where it starts deformed or pulled."""
+        """A new run: checks come at the same passes whatever ran before and wherever states are kept; sooner where it starts
+        deformed or pulled."""
         solver = self.ws.solver
         if solver.explicit and self.ws.energy_watch:
             self.ws.energy_watch.clear()
