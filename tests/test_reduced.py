@@ -224,10 +224,11 @@ def test_steps_one_by_one_and_single_precision():
     np.testing.assert_allclose(scene_of().reduced.of(u), u, atol=1e-15)
 
 
-def test_a_saved_run_goes_on_with_the_same_bits_where_an_obstacle_has_come():
-    """Matrices of the body at rest are not those of what stands there by now."""
+@pytest.mark.parametrize("what", ["an obstacle has come", "it has grown"])
+def test_a_saved_run_goes_on_with_the_same_bits_where(what):
+    """Matrices of the body at rest are not those of what is there by now."""
     lift = ds.Ground(-0.011, stiffness=2e4, width=0.01, path=lambda t: [0, 3.0 * t, 0])
-    scene = scene_of(terms=[lift], precision="f64")
+    scene = scene_of(terms=[lift if "obstacle" in what else ds.Growth(lambda t: 4.0 * t)], precision="f64")
     one, other = (ds.Simulator(ds.ImplicitEulerSolver(scene, dt=2e-3)) for _ in range(2))
     one.run(10)
     kept = {name: x.copy() for name, x in one.state.items()}

@@ -389,6 +389,38 @@ def test_surfaces_push_a_set(kind, friction, monkeypatch):
         assert ds.check_gradients(rollout, inputs=names, verbose=False).passed
 
 
+@pytest.mark.parametrize("reduced", [{"body_1": "rigid", "body_2": "rigid"}, {}])
+def test_what_is_near_and_does_not_touch_has_no_bit_of_it(reduced, monkeypatch):
+    """Nor have gradients, such as that of drag, which is a sum over vertices."""
+    low = ds.TetrahedralMesh.create_box((5, 3, 5), size=0.1)
+    up = ds.TetrahedralMesh.create_box((4, 2, 4), size=0.08, origin=(0.01, 0.104, 0.02)).rotated([0, 1, 0], 0.1)
+    side = ds.TetrahedralMesh.create_box(2, size=0.08, origin=(0.106, 0.01, 0.02)).rotated([1, 0.2, 0], 0.1)
+    mesh = ds.TetrahedralMesh.joined([low, up, side])
+    speed = np.repeat([[0, 0, 0], [0.1, -0.5, 0], [0, 0.2, 0.1]], [x.num_vertices for x in (low, up, side)], axis=0)
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(5e4, 0.3),
+        1000.0,
+        [ds.SelfContact(2e4, 5e-3, friction=0.4, friction_speed=0.05), ds.Drag(2.0)],
+        reduced=reduced,
+        initial_velocities=speed,
+        precision="f64",
+    )
+    found = []
+    for close in (2, 0):
+        monkeypatch.setattr(contact_stage, "CLOSE", close)
+        rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=10), 6, gradients=["drag_rate", "density"])
+        frames = rollout.forward()
+        found.append(
+            [
+                frames.positions,
+                *rollout.vjp(frames, np.sin(np.arange(frames.positions.size)).reshape(frames.positions.shape)).values(),
+            ]
+        )
+    for one, other in zip(*found):
+        np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_starts_that_a_body_cannot_have_are_brought_near(kind):
     rng = np.random.default_rng(2)

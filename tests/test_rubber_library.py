@@ -81,7 +81,7 @@ def test_files_of_many_forms_give_the_same_curve(form, tmp_path):
 
 
 def test_rates_by_minutes_and_seconds_and_the_modulus_of_small_strains():
-    for unit, speed in (("mm/min", "450"), ("mm/s", "7,5"), ("mm / sec", "7.5"), ("in/s", "7.5")):
+    for unit, speed in (("mm/min", "450"), ("mm/s", "7,5"), ("mm / sec", "7.5"), ("mm/minute", "450"), ("in/s", "7.5")):
         rate = TensileTest(STRETCH, stress(), header={f"speed ({unit})": speed, "length (mm)": "33"}).rate
         assert rate is None if unit == "in/s" else rate == pytest.approx(450 / 60 / 33)
     assert rubber_fit.shear_modulus("MooneyRivlin", np.array([4e4, 1e4])) == pytest.approx(1e5, rel=1e-9)

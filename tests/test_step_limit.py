@@ -279,6 +279,10 @@ def test_compression_outgrows_the_step_before_any_nan(solver, how):
     error = caught.value
     assert 0 < error.step < steps and 0 <= error.tetrahedron < scene.mesh.num_tetrahedra
     assert error.stable_dt < dt
+    if how == "rollout":  # which is looked at in the same steps wherever states are kept
+        with pytest.raises(ds.Divergence) as again:
+            ds.Rollout(run, steps, checkpoint_every=30).forward()
+        assert again.value.step == error.step
     if how == "simulator":
         assert simulator.step_count == error.step
         assert np.abs(simulator.positions - scene.mesh.vertices).max() < 2  # stopped before anything flew off

@@ -235,8 +235,6 @@ class Batch(metaclass=Public):
     def _one_by_one(self, values: dict, b: int) -> tuple[Frames, Exception | None]:
         """(frames of scene b, run alone, what stopped it)"""
         own = {name: value_of(value, b) for name, value in values.items()}
-        if self.one.sweep.bend:  # of the scene before
-            self.one.sweep.take_bend(0.0)
         try:
             return self.one.forward(**own), None
         except FloatingPointError as error:

@@ -77,7 +77,7 @@ class TensileTest:
     def rate(self) -> float | None:
         """Nominal rate of strain at the beginning [1/s], from the header's speed [mm/min or mm/s] and length [mm]."""
         length = of_header(self.header, "length", "mm")
-        for time, seconds in (("min", 60), ("s(?:ec)?", 1)):
+        for time, seconds in (("min(?:ute)?", 60), ("s(?:ec(?:ond)?)?", 1)):
             speed = of_header(self.header, "speed", rf"mm\s*/\s*{time}")
             if speed and length:
                 return speed / seconds / length

@@ -143,7 +143,8 @@ class Guard:
         self.restart()
 
     def restart(self) -> None:
-        """A new run: checks come at the same passes whatever ran before, and sooner where it starts deformed or pulled."""
+        """A new run: checks come at the same passes whatever ran before and wherever states are kept; sooner where it starts
+        deformed or pulled."""
         solver = self.ws.solver
         if solver.explicit and self.ws.energy_watch:
             self.ws.energy_watch.clear()
@@ -200,9 +201,11 @@ class Guard:
         balance = self.ws.energy_watch if self.ws.solver.explicit else None
         schedule, bends = self.ws.solver.schedule, self.ws.bending and np.isfinite(self.ws.bending.of_pairs)
         while first < last:
-            stop = min(last, first + self.every)
-            if bends:  # looked at after each step, so that what is found does not depend on where segments end
-                stop = min(stop, int(schedule.first(schedule.row(first) + 1)))
+            end = stop = min(last, first + self.every - self._passes)  # wherever segments end
+            if bends:  # looked at after each step alone, so that what is found does not depend on where segments end
+                step = int(schedule.row(first)) + 1
+                end = int(schedule.first(step)) if step <= schedule.row(num_passes - 1) else num_passes
+                stop = min(stop, end)
             if balance:
                 balance.before(first, num_passes)
             self.mark(first)
@@ -210,7 +213,7 @@ class Guard:
                 self._pass(first, stop, num_passes, save_every, recording)
             except Tunnelling as error:
                 raise self._with_stable_step(error) from None
-            if self.ws.bending and self.ws.solver.explicit:
+            if self.ws.bending and self.ws.solver.explicit and stop == end:
                 self.ws.bending.check(stop, runtime.fetch_row(self.ws.state.u, 0))
             if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
                 self._diagnose_crossing(stop, num_passes)

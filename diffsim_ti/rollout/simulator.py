@@ -138,7 +138,8 @@ class Simulator(metaclass=Public):
         return f"Simulator({self.solver!r}, {self.scene.mesh!r}, step {self.step_count}, t = {self.time:.6g} s)"
 
     def reset(self) -> None:
-        """Back to the start of the scene, and to the substeps of its solver."""
+        """Back to the start of the scene, and to the substeps of its solver. Ten-node faces that touch are taken to bend as
+        they did."""
         self._take_solver(self._first_solver)
         self.step_count = 0
         self._set: dict[str, np.ndarray] = {}  # inputs that were given since, as a run of the last step has them

@@ -159,7 +159,7 @@ class Sweep:
 
     def take_bend(self, bend: float) -> None:
         """Faces bend so far from here on [m]."""
-        self.bend, self.workspace, self._adjoint, self._loaded = bend, None, None, None
+        self.bend, self.workspace, self._adjoint, self._loaded, self._current = bend, None, None, None, None
 
     def _make_guard(self):
         return Guard(self.workspace)
@@ -175,6 +175,8 @@ class Sweep:
     def run(self, values: dict, start: Callable | None = None, law_state=None) -> Run:
         """Run from the scene's inputs with some values replaced; see `Run` for the rest."""
         run, self.last_error = Run(self._checked(values), start, self.first_step, law_state), None
+        if self.bend:  # of the run before
+            self.take_bend(0.0)
         self.fit([run.values])
         try:
             self._forward(run)

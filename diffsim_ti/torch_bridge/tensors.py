@@ -138,6 +138,8 @@ class TensorRollout:
         known = self._launches.get(key)
         if known is None:  # the arrays are kept, so that their ids stay theirs
             kernel = _copy_kernel(way, runtime.runs_on_cpu() and not self.rollout.solver.runs_parallel())
+            if len(self._launches) > 8:  # of arrays that runs have replaced
+                self._launches.pop(next(iter(self._launches)))
             known = self._launches[key] = (runtime.TensorLaunch(kernel, *arrays), arrays)
         if pair[0].is_cuda:  # torch and Taichi order their work on streams of their own
             torch.cuda.current_stream(pair[0].device).synchronize()

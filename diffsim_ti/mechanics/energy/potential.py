@@ -130,14 +130,16 @@ class Potential:
     @contextmanager
     def at_rest(self):
         """At rest, and then back to where it was."""
-        u, kept = self.held_at, [(x, runtime.fetch(x)) for x in (self.z, self.held) if x is not None]
+        growths = self.arrays.growths if self.arrays.values.growths is not None else None
+        u, kept = self.held_at, [(x, runtime.fetch(x)) for x in (self.z, self.held, growths) if x is not None]
         try:
             with self.joints.still() if self.joints else nullcontext():
                 self.place(np.zeros_like(u))
                 if self.z is not None:
                     runtime.fill(self.z, self.arrays.initial_state_blocks())
-                if self.held is not None:
-                    runtime.fill(self.held, 0)
+                for array in (self.held, growths):  # of this pass, which others are not to depend on
+                    if array is not None:
+                        runtime.fill(array, 0)
                 yield
         finally:
             self.place(u)

@@ -44,6 +44,11 @@ from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
 DENSE = 1000  # unknowns up to which a dense matrix is factored
 
 
+def total(x: np.ndarray) -> float:
+    """The sum, with the same bits whatever zeros stand among the numbers: those of nodes that no pair reads."""
+    return x[x != 0].sum()
+
+
 @dataclass
 class NearPairs:
     """What does not change in a pass: corners (pairs, 4) among the points, which are of edges, their scale (proximity.py);
@@ -320,7 +325,7 @@ class PartSolver:
         near, at = self.near, self.look(part, of)
         self.take(part, of, at)
         blend = 0.5 * (1 + part.c)
-        by_alpha = (e_adj * at.w_drift).sum()
+        by_alpha = total(e_adj * at.w_drift)
         e_prev, b_prev = e_adj.copy(), b_adj + at.alpha * e_adj
         delta_adj, friction_adj = b_adj + at.alpha * blend * e_adj, b_adj + at.alpha * e_adj
         by = SimpleNamespace(
@@ -356,7 +361,7 @@ class PartSolver:
         Bnu = at.B @ nu
         of_nu = dot(nu, at.pressed)
         near.lightened_vjp(of, adj, at.give * pushed, at.pressed)
-        by_alpha += of_nu.sum() / at.alpha
+        by_alpha += total(of_nu) / at.alpha
         by.n += at.P[:, None] * Bnu
         by.w += at.P[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(nu))
         by.P += dot(at.n, Bnu)
@@ -386,7 +391,7 @@ class PartSolver:
         adj.x += X_adj - by_moved
         adj.motion += -0.5 * by_moved
         adj.motion += part.begin * X_adj + part.share * f_adj + by.motion
-        by_alpha += (f_adj * part.b).sum()
+        by_alpha += total(f_adj * part.b)
         adj.alpha += part.share * by_alpha
         return e_prev + X_adj, b_prev + at.alpha * f_adj
 
@@ -427,7 +432,7 @@ class PartSolver:
         by.P += of.mu * by_load
         adj.mu += at.P * by_load
         by.motion += V_adj / of.alpha
-        adj.alpha -= (V_adj * of.motion).sum() / of.alpha**2
+        adj.alpha -= total(V_adj * of.motion) / of.alpha**2
         return V_adj
 
     def _at_corners_of(self, entries) -> np.ndarray:

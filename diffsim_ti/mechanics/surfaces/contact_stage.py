@@ -8,7 +8,6 @@ surfaces apart. Vertices of no near pair keep what they had, bit by bit.
 
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from math import fsum
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +17,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.buffers import whole
-from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part
+from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, total
 from diffsim_ti.mechanics.surfaces.contact_pass import ContactPass
 from diffsim_ti.mechanics.surfaces.near_set import NearSet
 from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
@@ -104,6 +103,8 @@ class PairContact(Stage):
         for near, places in zip(one.near.sets, self._places(one, start, given[0], mass, rest)):
             x, at = self.sets[near.set], self.sets[near.set].at
             numbers = near.at[len(near.here) :]
+            if not (e[numbers].any() or b[numbers].any()):  # bit by bit, though others have pairs beside it
+                continue
             moved, v[at] = x.settle(*places[:2], given[1][at], e[numbers], b[numbers], decay, places[2])
             u[at] += moved
 
@@ -487,7 +488,7 @@ class PairContact(Stage):
         )  # fmt: skip
         e_adj, b_adj, alone = np.zeros((count, 3)), np.zeros((count, 3)), np.flatnonzero(self._alone_among(one.nodes))
         e_adj[alone], b_adj[alone] = p[one.nodes[alone]], q[one.nodes[alone]]
-        by_decay = fsum((b_adj * one.b).ravel())  # whatever other nodes the set has, which add zeros
+        by_decay = total(b_adj * one.b)
         b_adj = now.decay * b_adj
         at_begin, places = np.zeros_like(p), []
         if one.near.sets:

@@ -25,10 +25,11 @@ class Preconditioners:
         mass = self._rounded(size_of)
         key = float(mass.sum())
         if key not in self._kept:
-            with ws.potential.at_rest():
-                blocks = ws.potential.blocks()
-                if ws.potential.contact_blocks() is not None:  # of this pass, which others are not to depend on
-                    K, diagonal = assemble(ws.potential, 0 * size_of, np.ones_like(size_of))
+            p = ws.potential
+            with p.at_rest():
+                blocks = p.blocks()
+                if p.hosts or p.pairs or ws.arrays.contacts:  # of this pass, which others are not to depend on
+                    K, diagonal = assemble(p, 0 * size_of, np.ones_like(size_of))
                     blocks = K.data[diagonal]
             size = np.abs(blocks).sum((1, 2))[:, None]
             kind, how = BodyBlocks if ws.scene.reduced else BlockJacobi, size
