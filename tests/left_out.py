@@ -352,11 +352,11 @@ LEFT_OUT = {
     "a ball by pairs and a belt in BDF2; a ball in explicit steps": """
         test_energy_watch::test_bdf2_is_not_blamed_for_work_from_outside[a ball]
     """,
-    "other scenes of the corpus, all by the command `contact_corpus.py`; slabs that hold at 0.51; rounds between two plates": """
+    "other scenes of the corpus, all by `contact_corpus.py`; slabs that hold at 0.51; plates that come": """
         test_contact_corpus::test_arch_stands
         test_contact_corpus::test_pins_come_in_few_parts_of_a_step
     """,
-    "explicit steps; transposes with friction, and nothing passes, in implicit ones": """
+    "explicit steps; in implicit ones free turns by Euler's equations, friction of vertices, transposes of both": """
         test_reduced_rigid::test_a_ball_rolls_down_a_slope
     """,
     "explicit steps; two plates in implicit ones in `test_swept.py`": """
@@ -371,7 +371,7 @@ LEFT_OUT = {
     "linear tetrahedra; ten nodes in contact in `test_curved_contact.py`": """
         test_supports::test_contact_holds_what_supports_leave[2]
     """,
-    "implicit steps over the same land; points in explicit ones": """
+    "implicit steps over the same land; points that come round in explicit ones": """
         test_obstacle_pairs::test_a_run_has_what_is_near_alone_and_finds_what_it_would_find_with_all[SemiImplicitSolver-0.001-50]
     """,
     "one ball in semi-implicit steps": """
