@@ -1,6 +1,6 @@
 """Examples that run longest, which CI runs, too; what they are made of has its tests in the suite.
 
-    python -m pytest --thorough tests/test_long_examples.py
+python -m pytest --thorough tests/test_long_examples.py
 """
 
 import numpy as np
