@@ -1,5 +1,8 @@
 """Prepared launches: the same kernel with the same arrays again and again, other numbers and other tensors each time."""
 
+import _thread
+import threading
+import time
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -66,6 +69,28 @@ def test_two_launches_of_one_kernel_keep_their_own_arrays():
     for k in range(6):
         launches[k % 2](1.0 + k % 2, 0)
     assert [runtime.fetch(target).tolist() for target in targets] == [[3.0] * 4, [6.0] * 4]
+
+
+@ti.kernel
+def count_in_two_loops(counts: ti.types.ndarray(ti.i32, 1), most: ti.i32):
+    for i in range(1):
+        for k in range(most):
+            counts[i] = (3 * counts[i] + k) & 1023
+    for i in range(1):
+        for k in range(most):
+            counts[i + 1] = (3 * counts[i + 1] + k) & 1023
+
+
+def test_an_interrupt_ends_no_launch_between_its_loops():
+    counts = runtime.upload(np.zeros(2), ti.i32)
+    launch = runtime.Launch(count_in_two_loops, counts)
+    launch(1)
+    with pytest.raises(KeyboardInterrupt):
+        threading.Timer(0.02, _thread.interrupt_main).start()
+        launch(10_000_000)
+        time.sleep(10)
+    first, second = runtime.fetch(counts)
+    assert first == second != 0
 
 
 def test_launch_takes_other_tensors_each_time():
@@ -147,7 +172,7 @@ def repeated():
 
 def test_loops_are_gone_through_as_often_as_a_launch_says(repeated):
     (launch, data), sums = repeated(), np.arange(20)
-    for k, times in enumerate((1, 3, 2, 3, 1, 5, 2)):
+    for k, times in enumerate((1, 3, 2, 3, 1, 600, 2, 600)):  # of which the longest is a list of 1200 loops
         launch(first=8, second=4 + k % 2, more=k, times=times)
         expected_sums(sums, 8, 4 + k % 2, k, times)
         assert runtime.fetch(data.sums).tolist() == sums.tolist()

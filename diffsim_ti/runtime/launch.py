@@ -7,6 +7,8 @@ import os
 import signal
 import subprocess
 import sys
+from collections import deque
+from itertools import repeat
 
 import numpy as np
 import taichi as ti
@@ -18,13 +20,14 @@ from diffsim_ti.common.progress import LOG
 from diffsim_ti.runtime.arrays import check_owner, full_shape
 from diffsim_ti.runtime.language import made
 from diffsim_ti.runtime.quadrants import QUADRANTS
-from diffsim_ti.runtime.repeated_loops import KNOWN, MOST_TASKS, RepeatedLoops
+from diffsim_ti.runtime.repeated_loops import KNOWN, RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
 from diffsim_ti.runtime.threads import LOCK, materialize, untaped
 
 PATIENCE, SHORT = 5, 500  # [s]; variables of kernels that take less than a second
+MOST_BYTES = 2**20  # of a list of functions, which names those of loops as often as they are gone through
 _WORD = ctypes.sizeof(ctypes.c_void_p)
-_TASK = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)
+_TASK = ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)  # which keeps Python's lock, as Taichi's launcher does
 
 
 class Launch:
@@ -95,6 +98,8 @@ class Launch:
     def __call__(self, *numbers) -> None:
         check_alive(self._owner)
         with LOCK:
+            if self._owner() is None:  # by a thread that was waited for
+                check_alive(self._owner)
             self._launch(numbers)
 
     def _launch(self, numbers: tuple) -> None:
@@ -115,9 +120,8 @@ class Launch:
                 setter(index, number)
                 known[k] = number
         times = numbers[-1] if self._loops else 1
-        if times in self._tasks:
-            for task in self._tasks[times]:
-                task(self._read)
+        if times in self._tasks:  # without a line of Python between them, where an interrupt would end half a launch
+            deque(map(_TASK.__call__, self._tasks[times], repeat(self._read)), maxlen=0)
             return
         with self._repeated.times(times) if self._repeated else contextlib.nullcontext():
             self._owner().launch_kernel(self._code, self._context)
@@ -166,11 +170,6 @@ def _settings(config, **values):
 class TensorLaunch(Launch):
     """A kernel whose first arguments are torch tensors, other ones at each launch; its arrays are bound once."""
 
-    def __call__(self, *tensors) -> None:
-        check_alive(self._owner)
-        with LOCK:
-            self._launch(tensors)
-
     def _launch(self, tensors: tuple) -> None:
         if QUADRANTS:
             untaped(self._kernel)(*tensors, *self._arrays)
@@ -213,13 +212,22 @@ def compiled_tasks(prog, code) -> list | None:
             number = word(_object(code) + _WORD) & 0xFFFFFFFF
             own = word(launcher + 3 * _WORD) + 6 * _WORD * number
             first, behind = word(own), word(own + _WORD)
-            places = [word(place) for place in range(first, min(behind, first + MOST_TASKS * _WORD), _WORD)]
-        with open("/proc/self/maps") as maps:
-            known = [[int(x, 16) for x in line.split()[0].split("-")] for line in maps if "x" in line.split()[1]]
-    except (OSError, OverflowError):
+            size = behind - first if behind - first < MOST_BYTES else 0
+            places = np.frombuffer(os.pread(memory.fileno(), size, first), np.uintp).tolist()
+        if not _are_code(places):  # nor have been before
+            with open("/proc/self/maps", encoding="utf-8", errors="replace") as maps:
+                rows = (line.split(maxsplit=2) for line in maps)
+                _code[:] = [tuple(int(x, 16) for x in row[0].split("-")) for row in rows if "x" in row[1]]
+    except (OSError, OverflowError, ValueError):
         return None
-    is_code = places and all(any(begin <= place < end for begin, end in known) for place in places)
-    return [_TASK(place) for place in places] if is_code else None
+    return [_TASK(place) for place in places] if _are_code(places) else None
+
+
+_code: list[tuple[int, int]] = []  # begin and end of what this process may execute
+
+
+def _are_code(places: list[int]) -> bool:
+    return bool(places) and all(any(begin <= place < end for begin, end in _code) for place in set(places))
 
 
 class ArgumentBuffer:

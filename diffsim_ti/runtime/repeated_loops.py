@@ -18,7 +18,7 @@ from diffsim_ti.runtime.start import is_alive
 
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 _TASK = 6 * _WORD  # a task: its name, a string of four words, the sizes of its grid and blocks, and padding
-MOST_TASKS = 1024  # of a kernel: an iteration with a deep hierarchy has hundreds
+_MOST_TASKS = 1024  # of a kernel: an iteration with a deep hierarchy has hundreds
 KNOWN = ti.__version__ == (1, 7, 4) and sys.platform == "linux"  # the build of Taichi whose objects are known
 
 
@@ -69,7 +69,7 @@ class RepeatedLoops:
     def _names(self) -> list[str]:
         first, behind, _ = (word or 0 for word in self._tasks)
         count, rest = divmod(behind - first, _TASK)
-        if rest or not 0 < count < MOST_TASKS:
+        if rest or not 0 < count < _MOST_TASKS:
             return []
         return [
             ctypes.string_at(_word(task), _word(task + _WORD)).decode("ascii", "replace")

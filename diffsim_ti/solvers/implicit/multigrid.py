@@ -95,7 +95,7 @@ class Multigrid(Preconditioner):
             self.frames.update()
             matrices, ways = self._levels()
         self.place = None
-        self._made, self._contact = (matrices, ways), None
+        self._made, self._contact = (matrices[1:], ways), None
         self.cycle = Cycle(matrices, ways, self.frames, parallel)
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
         if self._changes:
@@ -150,7 +150,7 @@ class Multigrid(Preconditioner):
         self.potential.place(u)
 
     def _put(self, matrices: list, ways: list) -> bool:
-        self._made, self._contact = (matrices, ways), None
+        self._made, self._contact = (matrices[1:], ways), None
         return self.cycle.put(matrices, ways)
 
     def _bring_contact_down(self) -> None:
@@ -175,8 +175,8 @@ class Multigrid(Preconditioner):
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
         start = np.searchsorted(at, np.arange(len(size) + 1))
-        more, levels = bsr_matrix((roots @ np.swapaxes(roots, 1, 2), at, start), shape=matrices[0].shape), []
-        for M, P in zip(matrices[1:], ways):
+        more, levels = bsr_matrix((roots @ np.swapaxes(roots, 1, 2), at, start), shape=2 * (3 * len(size),)), []
+        for M, P in zip(matrices, ways):
             more = (P.T @ (more @ P)).tobsr(M.blocksize)
             levels.append(with_blocks(M, more))
         self.cycle.put_below(levels)
