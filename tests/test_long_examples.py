@@ -1,4 +1,7 @@
-"""Examples that run longest, as CI runs them by a command of its own; what they are made of has its tests in the suite."""
+"""Examples that run longest, which CI runs, too; what they are made of has its tests in the suite.
+
+python -m pytest --thorough tests/test_long_examples.py
+"""
 
 import numpy as np
 import pytest
@@ -180,6 +183,7 @@ def test_cantilever(capsys):
 
 @pytest.mark.filterwarnings("error:scenes")
 def test_cubes_learn_to_jump_by_gradients(capsys):
+    pytest.importorskip("gymnasium", reason='pip install "diffsim-ti[envs]"')
     found = example("control/jumper").main(8, 3, 12)
     assert found["jumped"] > found["rest"] + 0.01
     assert found["best"] > found["first"] + 0.03

@@ -210,8 +210,10 @@ def test_second_init_is_noticed():
     )
 
 
-def test_home_that_cannot_be_written(tmp_path):
+def test_home_that_cannot_be_written(tmp_path, monkeypatch):
     """Without a place for the kernel cache everything works, exit included; no folder is left. Nobody can write in /proc."""
+    monkeypatch.setenv("HOME", "/proc")
+    assert not runtime.start._can_write_cache(None) and runtime.start._can_write_cache(str(tmp_path))
     said = "import os; print(len(os.listdir(os.environ['TMPDIR'])) > 0)"
     code = f"import diffsim_ti as ds\nds.init()\nds.init()\n{textwrap.dedent(STEP)}{said}"
     out = python(code, HOME="/proc", TI_OFFLINE_CACHE_FILE_PATH="/proc/none", TMPDIR=str(tmp_path))

@@ -136,7 +136,7 @@ def turned(width, friction, solver, steps, **options):
     contact = ds.SelfContact(0.5 / width**2, width, friction=friction, friction_speed=0.05)
     mesh = ds.TetrahedralMesh(places, bodies().tetrahedra)
     scene = ds.Scene(
-        mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, [contact], initial_velocities=velocity, precision="f64"
+        mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, [contact, *STILL_AIR], initial_velocities=velocity, precision="f64"
     )
     impulse, dt = ds.SelfContactForce(range(4, 8), "friction"), 1.6 * width / steps
     frames = ds.Rollout(solver(scene, dt=dt, **options), steps, save_every=1, outputs=impulse, gradients=[]).forward()
