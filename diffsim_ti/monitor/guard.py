@@ -201,8 +201,8 @@ class Guard:
         balance = self.ws.energy_watch if self.ws.solver.explicit else None
         schedule, bends = self.ws.solver.schedule, self.ws.bending and np.isfinite(self.ws.bending.of_pairs)
         while first < last:
-            end = stop = min(last, first + self.every - self._passes)  # wherever segments end
-            if bends:  # looked at after each step alone, so that what is found does not depend on where segments end
+            end = stop = min(last, first + self.every - self._passes)
+            if bends:  # looked at after whole steps alone: what is found does not depend on where segments end
                 step = int(schedule.row(first)) + 1
                 end = int(schedule.first(step)) if step <= schedule.row(num_passes - 1) else num_passes
                 stop = min(stop, end)

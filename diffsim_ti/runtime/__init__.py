@@ -10,8 +10,8 @@ whether Taichi runs, its tape, its program | `_prog` |
 | `impl.current_cfg`, `prog.config()` and its options | start, launch | backend, options of one kernel | the same |
 | `kernel._primal`, `ensure_compiled`, `compiled_kernels`, `prog.compile_kernel`, `launch_kernel`, launch contexts |
 launch | launches with bound arguments | plain calls, which keep their arguments |
-| two pointers in a launch context; the launcher's list of compiled functions | launch | launches on CUDA; short ones on a
-processor | not used |
+| two pointers in a launch context; the launcher's list of compiled functions | launch | launches on CUDA; on a processor,
+without the launcher | not used |
 | layout of a compiled kernel | repeated_loops | several substeps in a launch on CUDA | not used |
 | `Ndarray`, `VectorNdarray`, `ScalarNdarray`, `prog.create_ndarray`, `delete_ndarray`, `fill_uint`,
 `get_ndarray_data_ptr_as_int` | arrays | arrays that are freed, NumPy's view of them | its constructors |

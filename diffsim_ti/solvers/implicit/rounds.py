@@ -60,10 +60,10 @@ class Rounds:
         self.sizes |= dict(points=points, points_length=-(-(points // cg.systems) // (cg.chunks // cg.systems)))
         self._always = self.sizes | dict(kept=detection.kept)
         self.next = runtime.array(a.vector, 1, n) if self.pairs else None  # where the longest step leads
-        self.places = runtime.array(a.vector, 2, n)  # of which rises are asked at once
         self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small
         self.whole &= potential.kernels.blocks.variables <= self.short and not (self.beside or self.several)
         self.whole &= not (self.pairs and self.pairs.asks)
+        self.places = runtime.array(a.vector, 2, n if self.whole else 1)  # of which rises are asked in one kernel
         self._bind()
         if self.whole:
             cg.serve(self._serve)
