@@ -15,12 +15,13 @@ from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.mechanics.workspace import Workspace
-from diffsim_ti.runtime import Kernel, assign, kernels_of, traced
+from diffsim_ti.runtime import Kernel, as_kernel, assign, kernels_of, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, needed, with_state
 
 A = ti.template()
+FIELDS = dict(energy="scalars", von_mises="scalars", J="scalars")
 
 
 @dataclass(frozen=True)
@@ -62,31 +63,22 @@ class ObserverKernels:
 
         self.element.each_seen(e, scene, at, 0, see)
 
-    @ti.func
-    def observe(self, scene: A, at: A, out: A, plan: A):
+    @as_kernel("fields", lambda self: FIELDS | (dict(stress="vectors2") if self.features.order == 2 else {}))
+    def fields(self, scene: A, at: A, out: A, plan: A):
+        """Energy density [J/m^3], von Mises stress [Pa], J at each point; of ten nodes rows of Cauchy's stress [Pa] too."""
         for e in range(plan.num_places):
             self.observe_points(e, scene, at, out)
 
-    @ti.func
-    def store(self, scene: A, at: A, out: A, plan: A):
+    @as_kernel("stored", dict(energy="scalars"))
+    def stored(self, scene: A, at: A, out: A, plan: A):
+        """Energy density [J/m^3] at each point alone, for what looks often."""
         for e in range(plan.num_places):
             self.store_points(e, scene, at, out)
 
-    def _kernel(self, name: str, body, *out: str, **more: str) -> Kernel:
+    def _kernel(self, name: str, body, out: dict) -> Kernel:
         at = with_state(dict(u="vectors2"), self.law)
-        own = dict(scene=needed(SCENE, self.features), at=at, out=dict.fromkeys(out, "scalars") | more)
+        own = dict(scene=needed(SCENE, self.features), at=at, out=out)
         return Kernel(name, body, self.law.precision, own, dict(num_places="int"))
-
-    @cached_property
-    def stored(self) -> Kernel:
-        """Energy density [J/m^3] at each point alone, for what looks often."""
-        return self._kernel("stored", self.store, "energy")
-
-    @cached_property
-    def fields(self) -> Kernel:
-        """Energy density [J/m^3], von Mises stress [Pa], J at each point; of ten nodes rows of Cauchy's stress [Pa] too."""
-        more = dict(stress="vectors2") if self.features.order == 2 else {}
-        return self._kernel("fields", self.observe, "energy", "von_mises", "J", **more)
 
 
 def _kernels(arrays) -> ObserverKernels:

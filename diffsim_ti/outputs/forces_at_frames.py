@@ -15,7 +15,7 @@ from diffsim_ti.mechanics.host_force import HostForces, Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, as_kernel
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, Adjoint, Tangent, with_state
@@ -137,42 +137,32 @@ class BodyForceKernels:
         )
         return Kernel(name, body, self.law.precision, own, dict(num_items="int", num_vertices="int"))
 
-    @ti.func
-    def all_forces(self, scene: A, at: A, out: A, plan: A):
+    @as_kernel("body_forces")
+    def forces(self, scene: A, at: A, out: A, plan: A):
         for e in range(plan.num_items):
             self.element.forces(e, scene, at, 0, out.corner)
         for i in range(plan.num_vertices):
             out.y[0, i] = self.element.gather(i, scene, out.corner)
 
-    @cached_property
-    def forces(self) -> Kernel:
-        return self._kernel("body_forces", self.all_forces)
-
-    @ti.func
-    def all_jvp(self, scene: A, at: A, out: A, change: A, tangent: A, plan: A):
+    @as_kernel("body_forces_jvp", change=lambda self: with_state(STATE, self.law), tangent=TANGENT)
+    def jvp(self, scene: A, at: A, out: A, change: A, tangent: A, plan: A):
         for e in range(plan.num_items):
             self.element.forces_jvp(e, scene, at, 0, change, out.corner, tangent)
         for i in range(plan.num_vertices):
             out.y[0, i] = self.element.gather(i, scene, out.corner)
 
-    @cached_property
-    def jvp(self) -> Kernel:
-        change = with_state(STATE, self.law)
-        return self._kernel("body_forces_jvp", self.all_jvp, change=change, tangent=TANGENT)
-
-    @ti.func
-    def all_vjp(self, scene: A, at: A, out: A, seed: A, adjoint: A, plan: A):
+    @as_kernel(
+        "body_forces_vjp",
+        seed=dict(w="vectors2"),
+        adjoint=lambda self: with_state(ADJOINT | dict(rate_corner="vectors"), self.law),
+    )
+    def vjp(self, scene: A, at: A, out: A, seed: A, adjoint: A, plan: A):
         for e in range(plan.num_items):
             self.element.forces_vjp(e, scene, at, 0, seed.w, out.corner, adjoint, True)
         for i in range(plan.num_vertices):
             out.y[0, i] = self.element.gather(i, scene, out.corner)
             if ti.static(self.element.reads_rates):
                 out.y_rate[0, i] = self.element.gather(i, scene, out.rate_corner)
-
-    @cached_property
-    def vjp(self) -> Kernel:
-        own = with_state(ADJOINT | dict(rate_corner="vectors"), self.law)
-        return self._kernel("body_forces_vjp", self.all_vjp, seed=dict(w="vectors2"), adjoint=own)
 
 
 class BodyForces:

@@ -4,6 +4,7 @@ import linecache
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
+from types import MethodType
 
 import taichi as ti
 
@@ -105,6 +106,31 @@ class Kernel:
         arrays = [_found(records[bundle], name) for bundle, own in self.arrays.items() for name in own]
         launch, names = Launch(self.kernel, *arrays, vectorized=vectorized, **self.options), self.numbers
         return lambda **numbers: launch(*map(numbers.__getitem__, names))
+
+
+class as_kernel:
+    """Decorator of a method that is the code of a kernel: as an attribute it is that `Kernel`, which the object's own
+    `_kernel(name, body, *described, **more)` makes once. What depends on the object is given as a function of it."""
+
+    def __init__(self, name: str, *described, **more):
+        self.name, self.described, self.more = name, described, more
+
+    def __call__(self, body: Callable) -> "as_kernel":
+        body.__annotations__["self"] = ti.template()  # Taichi knows methods by the line that calls `ti.func`
+        self.__doc__, self.body = body.__doc__, ti.func(body)
+        return self
+
+    def __set_name__(self, kind: type, attribute: str):
+        self.attribute = attribute
+
+    def __get__(self, owner, kind: type | None = None) -> "Kernel | as_kernel":
+        if owner is None:
+            return self
+        described = [x(owner) if callable(x) else x for x in self.described]
+        more = {name: x(owner) if callable(x) else x for name, x in self.more.items()}
+        made = owner._kernel(self.name, MethodType(self.body, owner), *described, **more)
+        vars(owner)[self.attribute] = made
+        return made
 
 
 def _compiled(name: str, arguments: dict, lines: list, scope: dict):

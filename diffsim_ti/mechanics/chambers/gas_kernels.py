@@ -11,12 +11,11 @@ volume is counted.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
-from diffsim_ti.runtime import Kernel, at, cross, let, traced
+from diffsim_ti.runtime import Kernel, as_kernel, at, cross, let, traced
 from diffsim_ti.state.pass_table import pass_at
 from diffsim_ti.terms.chambers import gas_law
 
@@ -158,8 +157,9 @@ class ChamberKernels(StepNumbers):
         for q in range(plan.num_sums):
             self.sums(q, what, scene, at, more, chambers, plan)
 
-    @ti.func
-    def all_forces(self, chambers: A, scene: A, at: A, out: A, table: A, plan: A):
+    @as_kernel("chamber_forces", out=dict(corner="vectors"))
+    def forces(self, chambers: A, scene: A, at: A, out: A, table: A, plan: A):
+        """Corner forces in a slot of the state, as pass `pass_` takes them."""
         self.sum_up("value", scene, at, at, chambers, plan)
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
@@ -170,8 +170,11 @@ class ChamberKernels(StepNumbers):
             for a in ti.static(range(3)):
                 out.corner[plan.first + 3 * t + a] = factor * normals[a]
 
-    @ti.func
-    def all_jvp(self, chambers: A, scene: A, at: A, tangent: A, out: A, table: A, plan: A):
+    @as_kernel(
+        "chamber_jvp", tangent=dict(u="vectors2", rest="vectors", follower="vectors2"), out=dict(corner="vectors")
+    )
+    def jvp(self, chambers: A, scene: A, at: A, tangent: A, out: A, table: A, plan: A):
+        """Their change."""
         self.sum_up("jvp", scene, at, tangent, chambers, plan)
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
@@ -185,8 +188,11 @@ class ChamberKernels(StepNumbers):
             for a in ti.static(range(3)):
                 out.corner[plan.first + 3 * t + a] = factor * (p * changes[a] + dp * normals[a])
 
-    @ti.func
-    def all_vjp(self, chambers: A, scene: A, at: A, adjoint: A, table: A, plan: A):
+    @as_kernel(
+        "chamber_vjp", adjoint=dict(w="vectors2", corner="vectors", chamber_adjoint="vectors2", chamber_rest="vectors")
+    )
+    def vjp(self, chambers: A, scene: A, at: A, adjoint: A, table: A, plan: A):
+        """Products of the transposed derivative with adjoint.w, to corners; adds the adjoints of numbers and of places."""
         self.sum_up("vjp", scene, at, adjoint, chambers, plan)
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
@@ -214,20 +220,3 @@ class ChamberKernels(StepNumbers):
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         own = dict(chambers=CHAMBERS, scene=SCENE, at=dict(u="vectors2")) | arrays | dict(table=TABLE)
         return Kernel(name, body, self.precision, own, NUMBERS)
-
-    @cached_property
-    def forces(self) -> Kernel:
-        """Corner forces in a slot of the state, as pass `pass_` takes them."""
-        return self._kernel("chamber_forces", self.all_forces, out=dict(corner="vectors"))
-
-    @cached_property
-    def jvp(self) -> Kernel:
-        """Their change."""
-        tangent = dict(u="vectors2", rest="vectors", follower="vectors2")
-        return self._kernel("chamber_jvp", self.all_jvp, tangent=tangent, out=dict(corner="vectors"))
-
-    @cached_property
-    def vjp(self) -> Kernel:
-        """Products of the transposed derivative with adjoint.w, to corners; adds the adjoints of numbers and of places."""
-        own = dict(w="vectors2", corner="vectors", chamber_adjoint="vectors2", chamber_rest="vectors")
-        return self._kernel("chamber_vjp", self.all_vjp, adjoint=own)

@@ -8,7 +8,7 @@ import taichi as ti
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import Bundle, Kernel, assign, kernels_of, let, traced
+from diffsim_ti.runtime import Bundle, Kernel, as_kernel, assign, kernels_of, let, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed, with_frozen, with_pass
@@ -74,8 +74,9 @@ class PotentialKernels:
 
         self.single.each_seen(e, scene, at, 0, see)
 
-    @ti.func
-    def energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
+    @as_kernel("energy", at=dict(u="vectors2"), out=dict(elastic="scalars", J="scalars", contact="scalars"))
+    def energy(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        """Energy [J] and volume ratio of each point, energy of contact and friction [J] of each vertex."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_tetrahedra):
             self.elastic_energies(e, scene, at, out)
@@ -90,21 +91,10 @@ class PotentialKernels:
                 value = self.obstacles.total_energy(i, at.u[0, i], scene, pass_, plan, friction)
             out.contact[i] = value
 
-    @cached_property
-    def energy(self) -> Kernel:
-        """Energy [J] and volume ratio of each point, energy of contact and friction [J] of each vertex."""
-        out = dict(elastic="scalars", J="scalars", contact="scalars")
-        return self._kernel("energy", self.energies, at=dict(u="vectors2"), out=out)
-
-    @ti.func
-    def barrier_energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
-        self.contact_energies(scene, pass_, at, out, plan, False)
-
-    @cached_property
-    def barrier_energy(self) -> Kernel:
+    @as_kernel("barrier_energy", reads_law=False, at=dict(u="vectors2"), out=dict(contact="scalars"))
+    def barrier_energy(self, scene: A, pass_: A, at: A, out: A, plan: A):
         """Energy of the barriers [J] of each vertex."""
-        arrays = dict(at=dict(u="vectors2"), out=dict(contact="scalars"))
-        return self._kernel("barrier_energy", self.barrier_energies, reads_law=False, **arrays)
+        self.contact_energies(scene, pass_, at, out, plan, False)
 
     # ---- forces ------------------------------------------------------------------------------------------------------
 
@@ -112,8 +102,9 @@ class PotentialKernels:
     def length(self, v):
         return ti.sqrt(v.norm_sqr())  # `norm` adds a float64 zero
 
-    @ti.func
-    def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
+    @as_kernel("forces", at=dict(u="vectors2"), out=dict(y="vectors2", size="scalars"))
+    def forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        """Forces, and the sum of the sizes of what meets at a vertex, against which a rest is measured."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.element.forces(e, scene, at, 0, scene.corner)
@@ -129,11 +120,6 @@ class PotentialKernels:
                 norm += self.length(part)
             out.y[0, i] = total + pushed
             out.size[i] = norm
-
-    @cached_property
-    def forces(self) -> Kernel:
-        """Forces, and the sum of the sizes of what meets at a vertex, against which a rest is measured."""
-        return self._kernel("forces", self.all_forces, at=dict(u="vectors2"), out=dict(y="vectors2", size="scalars"))
 
     # ---- products with the stiffness ---------------------------------------------------------------------------------
 
@@ -158,15 +144,10 @@ class PotentialKernels:
         """y = df/du w"""
         return self._kernel("product", self.products, at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
 
-    @ti.func
-    def smooth_products(self, scene: A, pass_: A, at: A, out: A, plan: A):
-        self.multiply(scene, pass_, at, out, plan, False)
-
-    @cached_property
-    def stiffness(self) -> Kernel:
+    @as_kernel("stiffness", at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
+    def stiffness(self, scene: A, pass_: A, at: A, out: A, plan: A):
         """y = df/du w without friction: what bounds an explicit step."""
-        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
-        return self._kernel("stiffness", self.smooth_products, **own)
+        self.multiply(scene, pass_, at, out, plan, False)
 
     # ---- block diagonal ----------------------------------------------------------------------------------------------
 
@@ -208,8 +189,10 @@ class PotentialKernels:
             f = self.obstacles.total_product(i, at.u[0, i], unit, scene, pass_, plan, True)
         return f
 
-    @ti.func
-    def all_blocks(self, scene: A, pass_: A, at: A, out: A, plan: A):
+    @as_kernel("blocks", at=dict(u="vectors2"), out=dict(corners="vectors", tangent="blocks", blocks="vectors2"))
+    def blocks(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        """d2psi/dF2 of each point, and the 3x3 diagonal blocks of -df/du, by columns; of ten nodes the tetrahedra's part is
+        left to the host."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             for c in range(9):
@@ -226,38 +209,22 @@ class PotentialKernels:
                         f += out.corners[d * (out.corners.shape[0] // 3) + scene.corner_of[c]]
                 out.blocks[d, i] = f - self.contact_column(i, d, at, scene, pass_, plan)
 
-    @cached_property
-    def blocks(self) -> Kernel:
-        """d2psi/dF2 of each point, and the 3x3 diagonal blocks of -df/du, by columns; of ten nodes the tetrahedra's part is
-        left to the host."""
-        out = dict(corners="vectors", tangent="blocks", blocks="vectors2")
-        return self._kernel("blocks", self.all_blocks, at=dict(u="vectors2"), out=out)
-
-    @ti.func
-    def all_contact_blocks(self, scene: A, pass_: A, at: A, out: A, plan: A):
+    @as_kernel("contact_blocks", at=dict(u="vectors2"), out=dict(blocks="vectors2"))
+    def contact_blocks(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        """The part of obstacles in `blocks`."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             for d in range(3):
                 out.blocks[d, i] = 0 - self.contact_column(i, d, at, scene, pass_, plan)
 
-    @cached_property
-    def contact_blocks(self) -> Kernel:
-        """The part of obstacles in `blocks`."""
-        own = dict(at=dict(u="vectors2"), out=dict(blocks="vectors2"))
-        return self._kernel("contact_blocks", self.all_contact_blocks, **own)
-
     # ---- patches -----------------------------------------------------------------------------------------------------
 
-    @ti.func
-    def unit_pressure(self, scene: A, pass_: A, at: A, out: A, plan: A):
+    @as_kernel("pressure_forces", at=dict(u="vectors2"), out={})
+    def pressure_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        """Corner forces of a unit pressure in every patch."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.element.pressure_forces(e, scene, at, 0, scene.corner)
-
-    @cached_property
-    def pressure_forces(self) -> Kernel:
-        """Corner forces of a unit pressure in every patch."""
-        return self._kernel("pressure_forces", self.unit_pressure, at=dict(u="vectors2"), out={})
 
     # ---- derivatives by everything -----------------------------------------------------------------------------------
 
@@ -267,8 +234,14 @@ class PotentialKernels:
         own = {name: getattr(tangent, name) for name in ("z", "held") if hasattr(tangent, name)}
         return Bundle(u=at.w, **own)
 
-    @ti.func
-    def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
+    @as_kernel(
+        "jvp",
+        at=dict(u="vectors2", w="vectors2"),
+        out=dict(y="vectors2"),
+        tangent=lambda self: with_frozen(TANGENT | PASS, self.law),
+    )
+    def jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
+        """Change y of the forces for changes w of the displacement and of everything else that they depend on."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.element.forces_jvp(e, scene, at, 0, self.change(at, tangent), scene.corner, tangent)
@@ -279,15 +252,14 @@ class PotentialKernels:
                 f = self.obstacles.add_jvp(i, f, at.u[0, i], at.w[0, i], scene, pass_, tangent, plan)
             out.y[0, i] = f
 
-    @cached_property
-    def jvp(self) -> Kernel:
-        """Change y of the forces for changes w of the displacement and of everything else that they depend on."""
-        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
-        own["tangent"] = with_frozen(TANGENT | PASS, self.law)
-        return self._kernel("jvp", self.all_jvp, **own)
-
-    @ti.func
-    def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
+    @as_kernel(
+        "vjp",
+        at=dict(u="vectors2", w="vectors2"),
+        out=dict(y="vectors2"),
+        adjoint=lambda self: with_frozen(ADJOINT | dict(lag="vectors2", poses="vectors2"), self.law),
+    )
+    def vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
+        """y = df/du w (it is symmetric) and adjoints of the pass; adds the adjoints of all else that forces depend on."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.element.forces_vjp(e, scene, at, 0, at.w, scene.corner, adjoint, self.features.shape)
@@ -297,13 +269,6 @@ class PotentialKernels:
             if self.meets_obstacles(i, scene):
                 f = self.obstacles.add_vjp(i, f, at.u[0, i], at.w[0, i], scene, pass_, adjoint, plan)
             out.y[0, i] = f
-
-    @cached_property
-    def vjp(self) -> Kernel:
-        """y = df/du w (it is symmetric) and adjoints of the pass; adds the adjoints of all else that forces depend on."""
-        adjoint = ADJOINT | dict(lag="vectors2", poses="vectors2")
-        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=with_frozen(adjoint, self.law))
-        return self._kernel("vjp", self.all_vjp, **own)
 
 
 def potential_kernels(law, features: Features, parallel: bool, lanes: bool) -> PotentialKernels:

@@ -5,12 +5,12 @@ potential's forces do (obstacles.py).
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
-from diffsim_ti.runtime import Kernel, traced
+from diffsim_ti.runtime import Kernel, as_kernel, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed
 
@@ -34,8 +34,9 @@ class ObstacleShares(ObstaclePotential):
         own = dict(scene=needed(SCENE, self.features), pass_=PASS) | arrays
         return Kernel(name, body, self.precision, own, NUMBERS)
 
-    @ti.func
-    def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
+    @as_kernel("obstacle_forces", at=dict(u="vectors2"), out=dict(force="vectors2"))
+    def forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        """Forces at `at.u`."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             own, told = self.seen_at(i, scene, pass_)
@@ -51,13 +52,11 @@ class ObstacleShares(ObstaclePotential):
                     out.force[row, i] = f
                     out.force[row + 1, i] = drag
 
-    @cached_property
-    def forces(self) -> Kernel:
-        """Forces at `at.u`."""
-        return self._kernel("obstacle_forces", self.all_forces, at=dict(u="vectors2"), out=dict(force="vectors2"))
-
-    @ti.func
-    def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
+    @as_kernel(
+        "obstacle_forces_jvp", at=dict(u="vectors2", w="vectors2"), out=dict(force="vectors2"), tangent=TANGENT | PASS
+    )
+    def jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
+        """Their change for changes `at.w` of the displacement and of everything else that they depend on."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             for g in ti.static(self.features.groups):
@@ -71,14 +70,14 @@ class ObstacleShares(ObstaclePotential):
                     out.force[row, i] = f
                     out.force[row + 1, i] = drag
 
-    @cached_property
-    def jvp(self) -> Kernel:
-        """Their change for changes `at.w` of the displacement and of everything else that they depend on."""
-        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(force="vectors2"), tangent=TANGENT | PASS)
-        return self._kernel("obstacle_forces_jvp", self.all_jvp, **own)
-
-    @ti.func
-    def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
+    @as_kernel(
+        "obstacle_forces_vjp",
+        at=dict(u="vectors2", seed="vectors2"),
+        out=dict(y="vectors2"),
+        adjoint=ADJOINT | dict(lag="vectors2", poses="vectors2"),
+    )
+    def vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
+        """Adjoint y of the displacement; adds those of all else."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             own, told = self.seen_at(i, scene, pass_)
@@ -92,14 +91,6 @@ class ObstacleShares(ObstaclePotential):
                             if self.has_friction_at(g, k, i, own, told):
                                 y += self.drag_vjp(g, k, i, at.u[0, i], at.seed[row + 1, i], own, told, adjoint, plan)
             out.y[0, i] = y
-
-    @cached_property
-    def vjp(self) -> Kernel:
-        """Adjoint y of the displacement; adds those of all else."""
-        own = dict(at=dict(u="vectors2", seed="vectors2"), out=dict(y="vectors2"))
-        return self._kernel(
-            "obstacle_forces_vjp", self.all_vjp, **own, adjoint=ADJOINT | dict(lag="vectors2", poses="vectors2")
-        )
 
 
 @lru_cache(maxsize=None)

@@ -5,12 +5,11 @@ and again from there: conservative advancement (Mirtich 1996, Impulse-based Dyna
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
-from diffsim_ti.runtime import Kernel, traced
+from diffsim_ti.runtime import Kernel, as_kernel, traced
 from diffsim_ti.state.numbers import SCENE, needed
 from diffsim_ti.state.obstacle_poses import MORE
 from diffsim_ti.terms.obstacles import turning
@@ -107,8 +106,8 @@ class SweptKernels(ObstacleFunctions):
                 share = t
         return share
 
-    @ti.func
-    def all_shares(self, scene: A, way: A, at: A, out: A, plan: A):
+    @as_kernel("shares")
+    def shares(self, scene: A, way: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for j in range(plan.count):
             share, blocker = plan.most, -1
@@ -121,14 +120,11 @@ class SweptKernels(ObstacleFunctions):
             out.found[j] = share
             out.blocker[j] = blocker
 
-    @cached_property
-    def shares(self) -> Kernel:
-        return self._kernel("shares", self.all_shares)
-
     # ---- distances ---------------------------------------------------------------------------------------------------
 
-    @ti.func
-    def all_distances(self, scene: A, way: A, at: A, out: A, plan: A):
+    @as_kernel("distances")
+    def distances(self, scene: A, way: A, at: A, out: A, plan: A):
+        """Distances below `most`, at the places and displacements given."""
         ti.loop_config(serialize=not self.parallel)
         for j in range(plan.count):
             least, blocker, none = plan.most, -1, ti.cast(0, self.fp)
@@ -140,8 +136,3 @@ class SweptKernels(ObstacleFunctions):
                         blocker = g.number + k
             out.found[j] = least
             out.blocker[j] = blocker
-
-    @cached_property
-    def distances(self) -> Kernel:
-        """Distances below `most`, at the places and displacements given."""
-        return self._kernel("distances", self.all_distances)

@@ -20,7 +20,7 @@ from diffsim_ti.materials.calculus.tensor import (
     six_adjoint,
 )
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import Kernel, kernels_of, traced
+from diffsim_ti.runtime import Kernel, as_kernel, kernels_of, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import OF_TETRAHEDRA, SCENE, TANGENT
 from diffsim_ti.state.stage import Stage
@@ -58,15 +58,11 @@ class FrozenStrainKernels:
             B, half = el.gradients_of(e, scene.gradients, q), self.law.real(0.5)
             self.put(e, held, q, green_strain(D @ B, half) * a0 + green_strain(before @ B, half) * a1)
 
-    @ti.func
-    def all_forward(self, scene: A, at: A, out: A, plan: A):
+    @as_kernel("frozen_strains", out=dict(held="blocks2"))
+    def forward(self, scene: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.hold(e, scene, at, out.held, plan)
-
-    @cached_property
-    def forward(self) -> Kernel:
-        return self._kernel("frozen_strains", self.all_forward, out=dict(held="blocks2"))
 
     @traced
     def hold_jvp(self, e, scene, at, tangent, plan):
@@ -80,16 +76,12 @@ class FrozenStrainKernels:
         for q, dE in enumerate(total):
             self.put(e, tangent.held, q, dE)
 
-    @ti.func
-    def all_jvp(self, scene: A, at: A, tangent: A, plan: A):
+    @as_kernel("frozen_strains_jvp", tangent=TANGENT | dict(du="vectors2", held="blocks2"))
+    def jvp(self, scene: A, at: A, tangent: A, plan: A):
+        """The change tangent.held, for changes tangent.du of the states and of the rest shape."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.hold_jvp(e, scene, at, tangent, plan)
-
-    @cached_property
-    def jvp(self) -> Kernel:
-        """The change tangent.held, for changes tangent.du of the states and of the rest shape."""
-        return self._kernel("frozen_strains_jvp", self.all_jvp, tangent=TANGENT | dict(du="vectors2", held="blocks2"))
 
     @traced
     def hold_vjp(self, e, scene, at, adjoint, plan):
@@ -105,8 +97,12 @@ class FrozenStrainKernels:
                     el.add_shape(e, adjoint, q, D.transpose() @ by_H)
             el.store(e, corner, pushes)
 
-    @ti.func
-    def all_vjp(self, scene: A, at: A, adjoint: A, plan: A):
+    @as_kernel(
+        "frozen_strains_vjp",
+        adjoint=OF_TETRAHEDRA | dict(held="blocks2", corner="vectors", corner_before="vectors", y="vectors2"),
+    )
+    def vjp(self, scene: A, at: A, adjoint: A, plan: A):
+        """adjoint.y of both states, from adjoint.held; adds that of the rest shape."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.hold_vjp(e, scene, at, adjoint, plan)
@@ -114,12 +110,6 @@ class FrozenStrainKernels:
         for i in range(plan.num_vertices):
             adjoint.y[0, i] = self.element.gather(i, scene, adjoint.corner)
             adjoint.y[1, i] = self.element.gather(i, scene, adjoint.corner_before)
-
-    @cached_property
-    def vjp(self) -> Kernel:
-        """adjoint.y of both states, from adjoint.held; adds that of the rest shape."""
-        own = dict(held="blocks2", corner="vectors", corner_before="vectors", y="vectors2")
-        return self._kernel("frozen_strains_vjp", self.all_vjp, adjoint=OF_TETRAHEDRA | own)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         return Kernel(name, body, self.law.precision, dict(scene=SCENE, at=AT) | arrays, NUMBERS)

@@ -10,7 +10,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
-from diffsim_ti.runtime import Bundle, Kernel, traced
+from diffsim_ti.runtime import Bundle, Kernel, as_kernel, traced
 from diffsim_ti.runtime.slots import add_slot, copy_slot
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import OF_TETRAHEDRA, SCENE, TANGENT
@@ -37,32 +37,24 @@ class LawStateKernels:
     def onwards(self, plan) -> Onwards:
         return Onwards(h=plan.h, moves=None)
 
-    @ti.func
-    def all_forward(self, scene: A, at: A, plan: A):
+    @as_kernel("law_state", at=AT)
+    def forward(self, scene: A, at: A, plan: A):
+        """The state after the pass, in the place of that before."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.element.move_on(e, scene, at, plan.slot, plan.slot, self.onwards(plan), plan.end)
 
-    @cached_property
-    def forward(self) -> Kernel:
-        """The state after the pass, in the place of that before."""
-        return self._kernel("law_state", self.all_forward, at=AT)
-
-    @ti.func
-    def all_jvp(self, scene: A, at: A, tangent: A, plan: A):
+    @as_kernel("law_state_jvp", at=AT, tangent=TANGENT | dict(w="vectors2", z="blocks2"))
+    def jvp(self, scene: A, at: A, tangent: A, plan: A):
+        """The change tangent.z of the state, for a change tangent.w of the displacement."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             change = Bundle(u=tangent.w, z=tangent.z)
             self.element.move_on_jvp(e, scene, at, plan.slot, change, tangent, self.onwards(plan), plan.end)
 
-    @cached_property
-    def jvp(self) -> Kernel:
-        """The change tangent.z of the state, for a change tangent.w of the displacement."""
-        tangent = TANGENT | dict(w="vectors2", z="blocks2")
-        return self._kernel("law_state_jvp", self.all_jvp, at=AT, tangent=tangent)
-
-    @ti.func
-    def all_vjp(self, scene: A, at: A, adjoint: A, plan: A):
+    @as_kernel("law_state_vjp", at=AT, adjoint=OF_TETRAHEDRA | dict(z="blocks2", corner="vectors", y="vectors2"))
+    def vjp(self, scene: A, at: A, adjoint: A, plan: A):
+        """From the adjoint.z of the state after to that before; adjoint.y of u; adds those of all else."""
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             on = self.onwards(plan)
@@ -72,12 +64,6 @@ class LawStateKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             adjoint.y[0, i] = self.element.gather(i, scene, adjoint.corner)
-
-    @cached_property
-    def vjp(self) -> Kernel:
-        """From the adjoint.z of the state after to that before; adjoint.y of u; adds those of all else."""
-        adjoint = OF_TETRAHEDRA | dict(z="blocks2", corner="vectors", y="vectors2")
-        return self._kernel("law_state_vjp", self.all_vjp, at=AT, adjoint=adjoint)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         return Kernel(name, body, self.law.precision, dict(scene=SCENE) | arrays, NUMBERS)

@@ -3,7 +3,6 @@ faces (mesh/collision_surface.py), and corners of obstacles, which their poses g
 to them by C and g, forces back by C^T; all between is that of linear tetrahedra."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +15,7 @@ from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleMotion, SurfaceWithObstacles
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.mesh.geometry import edges_of
-from diffsim_ti.runtime import Kernel, kernels_of, vector_type
+from diffsim_ti.runtime import Kernel, as_kernel, kernels_of, vector_type
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
 A = ti.template()
@@ -50,8 +49,11 @@ class Transfer:
 
     vector = vector_type
 
-    @ti.func
-    def refine_all(self, rows: A, at: A, plan: A):
+    @as_kernel(
+        "refine", "vectors2", "vectors2", lambda self: dict(given="vectors") if self.has_given else {}, slot="int"
+    )
+    def refine(self, rows: A, at: A, plan: A):
+        """target[0] = C source[slot] + given"""
         ti.loop_config(serialize=not self.parallel)
         for k in range(plan.count):
             total = self.vector(0)
@@ -61,14 +63,9 @@ class Transfer:
                 total += at.given[k]
             at.target[0, k] = total
 
-    @cached_property
-    def refine(self) -> Kernel:
-        """target[0] = C source[slot] + given"""
-        given = dict(given="vectors") if self.has_given else {}
-        return self._kernel("refine", self.refine_all, "vectors2", "vectors2", given, slot="int")
-
-    @ti.func
-    def gather_all(self, rows: A, at: A, plan: A):
+    @as_kernel("gather_points", "vectors", "vectors", first="int")
+    def gather(self, rows: A, at: A, plan: A):
+        """target[first + k] = (rows source)[k]"""
         ti.loop_config(serialize=not self.parallel)
         for k in range(plan.count):
             total = self.vector(0)
@@ -76,24 +73,15 @@ class Transfer:
                 total += rows.weight[m] * at.source[rows.index[m]]
             at.target[plan.first + k] = total
 
-    @cached_property
-    def gather(self) -> Kernel:
-        """target[first + k] = (rows source)[k]"""
-        return self._kernel("gather_points", self.gather_all, "vectors", "vectors", first="int")
-
-    @ti.func
-    def add_all(self, rows: A, at: A, plan: A):
+    @as_kernel("add_point_blocks", "vectors2", "vectors2")
+    def add_blocks(self, rows: A, at: A, plan: A):
+        """Adds to rows 0..2 of target those of source, by squares of the weights."""
         ti.loop_config(serialize=not self.parallel)
         for k in range(plan.count):
             for m in range(rows.start[k], rows.start[k + 1]):
                 for d in range(3):
                     w = rows.weight[m] * rows.weight[m]
                     at.target[d, k] = at.target[d, k] + w * at.source[d, rows.index[m]]
-
-    @cached_property
-    def add_blocks(self) -> Kernel:
-        """Adds to rows 0..2 of target those of source, by squares of the weights."""
-        return self._kernel("add_point_blocks", self.add_all, "vectors2", "vectors2")
 
 
 class FinerArrays:

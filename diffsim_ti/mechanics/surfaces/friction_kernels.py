@@ -8,13 +8,14 @@ import taichi as ti
 from diffsim_ti.mechanics.surfaces.listed_pair import ListedPair, behind, first_of, three
 from diffsim_ti.mechanics.surfaces.pressed_pair import PressedPair
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import as_kernel
 from diffsim_ti.terms.self_contact import SelfContact
 
 A = ti.template()
 OWN = dict(weights="vectors", pressing="vectors", label="ints", row_of="ints")
 DOT = dict(weights_dot="vectors", pressing_dot="vectors")
 SUMS = dict(numbers="vectors", mu_adj="scalars", sums="vectors", rest_adj="vectors")
+CHANGED = dict(u="vectors2", w="vectors2", rest_dot="vectors", parameters_dot="scalars")
 ADJ = dict(weights_adj="vectors", pressing_adj="vectors")
 
 
@@ -81,19 +82,15 @@ class FrictionKernels(ListedPair):
             scene.weights[p] = w
         scene.pressing[p] = pressing
 
-    @ti.func
-    def measure_all(self, scene: A, at: A, plan: A):
+    @as_kernel("measure", dict(u="vectors2"), OWN)
+    def measure(self, scene: A, at: A, plan: A):
+        """Weights, normals and forces at u[slot], after `forces` there."""
         ti.loop_config(serialize=not self.parallel)
         for p in range(plan.num_pairs):  # of both kinds: each loop takes time to start
             if p < plan.num_vt:
                 self.measure_pair(VERTEX_TRIANGLE, p, scene, at, plan)
             else:
                 self.measure_pair(EDGE_EDGE, p, scene, at, plan)
-
-    @cached_property
-    def measure(self) -> Kernel:
-        """Weights, normals and forces at u[slot], after `forces` there."""
-        return self.kernel("measure", self.measure_all, dict(u="vectors2"), OWN)
 
     @ti.func
     def each_pressing(self, act: A, scene: A, at: A, plan: A):
@@ -126,16 +123,10 @@ class FrictionKernels(ListedPair):
         scene.weights_dot[p] = d_weights
         scene.pressing_dot[p] = self.vec4(dn[0], dn[1], dn[2], mu * dN + d_mu / mu * scene.pressing[p][3])
 
-    @ti.func
-    def measure_all_jvp(self, scene: A, at: A, plan: A):
-        self.each_pressing(self.measure_pair_jvp, scene, at, plan)
-
-    @cached_property
-    def measure_jvp(self) -> Kernel:
+    @as_kernel("measure_jvp", lambda self: CHANGED | (dict(numbers_dot="vectors") if self.mixed else {}), OWN | DOT)
+    def measure_jvp(self, scene: A, at: A, plan: A):
         """Changes for those w of the displacements u[slot], of the rest shape and of the numbers."""
-        at = dict(u="vectors2", w="vectors2", rest_dot="vectors", parameters_dot="scalars")
-        at |= dict(numbers_dot="vectors") if self.mixed else {}
-        return self.kernel("measure_jvp", self.measure_all_jvp, at, OWN | DOT)
+        self.each_pressing(self.measure_pair_jvp, scene, at, plan)
 
     @ti.func
     def measure_pair_vjp(self, kind: A, p, scene: A, at: A, plan: A):
@@ -170,16 +161,11 @@ class FrictionKernels(ListedPair):
         scene.sums[s] = scene.sums[s] + total
         scene.rest_adj[s] = scene.rest_adj[s] + by_rest
 
-    @ti.func
-    def measure_all_vjp(self, scene: A, at: A, plan: A):
+    @as_kernel("measure_vjp", dict(u="vectors2", by_place="vectors", by_mu="scalars"), OWN | ADJ | SUMS, num_rows="int")
+    def measure_vjp(self, scene: A, at: A, plan: A):
+        """Adjoint of the displacement u[slot] (`by_place`) for `weights_adj` and `pressing_adj`; adds those of the
+        numbers and of the rest shape."""
         self.each_pressing(self.measure_pair_vjp, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             self.collect_vertex(s, scene, at, plan)
-
-    @cached_property
-    def measure_vjp(self) -> Kernel:
-        """Adjoint of the displacement u[slot] (`by_place`) for `weights_adj` and `pressing_adj`; adds those of the
-        numbers and of the rest shape."""
-        at = dict(u="vectors2", by_place="vectors", by_mu="scalars")
-        return self.kernel("measure_vjp", self.measure_all_vjp, at, OWN | ADJ | SUMS, num_rows="int")

@@ -1,7 +1,6 @@
 """Lagged friction of surfaces on the device (lagged_friction.py): energies, forces, and products with its Hessian."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +9,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import Parts, put
 from diffsim_ti.mechanics.surfaces.listed_pair import three
-from diffsim_ti.runtime import Kernel, kernels_of, number_type, vector_type
+from diffsim_ti.runtime import Kernel, as_kernel, kernels_of, number_type, vector_type
 from diffsim_ti.terms.obstacles.friction import KERNELS, dissipated_in_kernels, slip_in_kernels
 
 A = ti.template()
@@ -64,8 +63,11 @@ class FrictionProductKernels:
         numbers |= dict.fromkeys(("num_sliding", "num_surface", "first_out"), "int")
         return Kernel(name, body, self.precision, dict(of=of, at=at), numbers)
 
-    @ti.func
-    def measure_all(self, of: A, at: A, plan: A):
+    @as_kernel(
+        "measure_friction", OWN, dict(u="vectors2", out="vectors", energy="scalars"), num_pairs="int", per_gamma="float"
+    )
+    def measure(self, of: A, at: A, plan: A):
+        """Energies, behind those of `num_pairs`; adds forces to the last corners of `out`; the stiffness there."""
         ti.loop_config(serialize=not self.parallel)
         for p in range(plan.num_sliding):
             n, load, t = three(of.pressing[p]), of.pressing[p][3], self.sliding(p, at.u, of, plan)
@@ -84,14 +86,10 @@ class FrictionProductKernels:
                 of.stiffness[3 * p + d] = self.vec4(row[0], row[1], row[2], none)
         self.add_pulls(of, at, plan)
 
-    @cached_property
-    def measure(self) -> Kernel:
-        """Energies, behind those of `num_pairs`; adds forces to the last corners of `out`; the stiffness there."""
-        at = dict(u="vectors2", out="vectors", energy="scalars")
-        return self._kernel("measure_friction", self.measure_all, OWN, at, num_pairs="int", per_gamma="float")
-
-    @ti.func
-    def compare_all(self, of: A, at: A, plan: A):
+    @as_kernel("turn_friction", OWN, dict(u="vectors2", w="vectors2"), per_gamma="float")
+    def compare(self, of: A, at: A, plan: A):
+        """Which pairs slide at u[0], and after a step w[0] the other way or so much slower that their stiffness at u, which
+        is none along the motion, says little of the way."""
         ti.loop_config(serialize=not self.parallel)
         for p in range(plan.num_sliding):
             t, way = self.sliding(p, at.u, of, plan), plan.per_gamma * self.moved(p, at.w, of)
@@ -99,15 +97,9 @@ class FrictionProductKernels:
             turns = t.dot(t + self.across(three(of.pressing[p]), way)) < ti.cast(0.3, self.fp) * square
             of.turned[p] = ti.cast(square > half * half and turns, ti.i32)
 
-    @cached_property
-    def compare(self) -> Kernel:
-        """Which pairs slide at u[0], and after a step w[0] the other way or so much slower that their stiffness at u, which
-        is none along the motion, says little of the way."""
-        at = dict(u="vectors2", w="vectors2")
-        return self._kernel("turn_friction", self.compare_all, OWN, at, per_gamma="float")
-
-    @ti.func
-    def add_products(self, of: A, at: A, plan: A):
+    @as_kernel("friction_products", SUMS | dict(stiffness="vectors"), dict(w="vectors2", out="vectors"))
+    def products(self, of: A, at: A, plan: A):
+        """Adds the change of the forces for changes w[0] of the positions to the last corners of `out`."""
         ti.loop_config(serialize=not self.parallel)
         for p in range(plan.num_sliding):
             moved, pull = self.moved(p, at.w, of), self.vec4(0)
@@ -116,14 +108,9 @@ class FrictionProductKernels:
             of.pull[p] = pull
         self.add_pulls(of, at, plan)
 
-    @cached_property
-    def products(self) -> Kernel:
-        """Adds the change of the forces for changes w[0] of the positions to the last corners of `out`."""
-        at = dict(w="vectors2", out="vectors")
-        return self._kernel("friction_products", self.add_products, SUMS | dict(stiffness="vectors"), at)
-
-    @ti.func
-    def add_all_blocks(self, of: A, at: A, plan: A):
+    @as_kernel("friction_blocks", SUMS | dict(stiffness="vectors"), dict(out="vectors2"))
+    def blocks(self, of: A, at: A, plan: A):
+        """Adds the diagonal blocks of the Hessian to rows 0..2 of `out`."""
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             for k in range(of.row[s], of.row[s + 1]):
@@ -131,12 +118,6 @@ class FrictionProductKernels:
                 w = of.weights[p][of.corner_of[k] % 4]
                 for d in ti.static(range(3)):
                     at.out[d, i] = at.out[d, i] + w * w * of.stiffness[3 * p + d]
-
-    @cached_property
-    def blocks(self) -> Kernel:
-        """Adds the diagonal blocks of the Hessian to rows 0..2 of `out`."""
-        own = SUMS | dict(stiffness="vectors")
-        return self._kernel("friction_blocks", self.add_all_blocks, own, dict(out="vectors2"))
 
 
 class FrictionProduct:

@@ -12,7 +12,7 @@ import taichi as ti
 from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, SAFE, ListedPair, between, three
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE
-from diffsim_ti.runtime import Kernel, kernels_of
+from diffsim_ti.runtime import Kernel, as_kernel, kernels_of
 from diffsim_ti.terms.obstacles import barrier
 
 A = ti.template()
@@ -40,8 +40,9 @@ class HessianKernels(ListedPair):
 
     # ---- forces ------------------------------------------------------------------------------------------------------
 
-    @ti.func
-    def place_all(self, scene: A, at: A, plan: A):
+    @as_kernel("place", dict(u="vectors2", out="vectors"), ACTING | dict(energy="scalars", touched="ints"), exact="int")
+    def place(self, scene: A, at: A, plan: A):
+        """As `forces` of PairKernels; and which corners are of pairs that act."""
         self.each_pair(self.pair.force, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
@@ -57,12 +58,6 @@ class HessianKernels(ListedPair):
             if k < end:
                 scene.acting[k] = -1
             at.out[plan.first_out + s] = total
-
-    @cached_property
-    def place(self) -> Kernel:
-        """As `forces` of PairKernels; and which corners are of pairs that act."""
-        own = ACTING | dict(energy="scalars", touched="ints")
-        return self.kernel("place", self.place_all, dict(u="vectors2", out="vectors"), own, exact="int")
 
     @ti.func
     def sum_corners(self, scene: A, out: A, plan: A):
@@ -125,7 +120,7 @@ class HessianKernels(ListedPair):
     def products(self) -> Kernel:
         """Change of the forces for changes w of the positions."""
         at = dict(u="vectors2", w="vectors2", out="vectors")
-        return self.kernel("pair_products", self.all_products, at, ACTING)
+        return self._kernel("pair_products", self.all_products, at, ACTING)
 
     @ti.func
     def convex_product(self, kind: A, p, scene: A, at: A, plan: A):
@@ -136,16 +131,11 @@ class HessianKernels(ListedPair):
             pull = k * (w[1] * n.dot(dy1) + w[2] * n.dot(dy2) + w[3] * n.dot(dy3)) * n
             self.store(p, scene, w[1] * pull, w[2] * pull, w[3] * pull)
 
-    @ti.func
-    def all_convex(self, scene: A, at: A, plan: A):
+    @as_kernel("convex_products", dict(u="vectors2", w="vectors2", out="vectors"), ACTING)
+    def convex_products(self, scene: A, at: A, plan: A):
+        """The same of the convex part of the energy alone."""
         self.each_pair(self.convex_product, scene, at, plan)
         self.sum_corners(scene, at.out, plan)
-
-    @cached_property
-    def convex_products(self) -> Kernel:
-        """The same of the convex part of the energy alone."""
-        at = dict(u="vectors2", w="vectors2", out="vectors")
-        return self.kernel("convex_products", self.all_convex, at, ACTING)
 
     # ---- diagonal ----------------------------------------------------------------------------------------------------
 
@@ -158,8 +148,10 @@ class HessianKernels(ListedPair):
             for a in ti.static(range(4)):
                 scene.corner[4 * p + a] = self.four(w[a] * ti.sqrt(k) * n)
 
-    @ti.func
-    def add_blocks(self, scene: A, at: A, plan: A):
+    @as_kernel("pair_blocks", dict(u="vectors2", out="vectors2"), ACTING, anew="int")
+    def blocks(self, scene: A, at: A, plan: A):
+        """Adds the 3x3 diagonal blocks of the convex part to rows 0..2 of `out`, one column of each vertex; or puts them
+        there `anew`."""
         self.each_pair(self.root, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
@@ -173,12 +165,6 @@ class HessianKernels(ListedPair):
                 if plan.anew == 0:
                     column += at.out[d, scene.surface[s]]
                 at.out[d, scene.surface[s]] = column
-
-    @cached_property
-    def blocks(self) -> Kernel:
-        """Adds the 3x3 diagonal blocks of the convex part to rows 0..2 of `out`, one column of each vertex; or puts them
-        there `anew`."""
-        return self.kernel("pair_blocks", self.add_blocks, dict(u="vectors2", out="vectors2"), ACTING, anew="int")
 
     # ---- how far a step may go ---------------------------------------------------------------------------------------
 
@@ -196,14 +182,10 @@ class HessianKernels(ListedPair):
         if not self.first_share(kind, p, scene, at) >= plan.most:
             scene.flags[2] = 1
 
-    @ti.func
-    def flag_all(self, scene: A, at: A, plan: A):
-        self.each_pair(self.flag, scene, at, plan)
-
-    @cached_property
-    def clear(self) -> Kernel:
+    @as_kernel("clear", dict(w="vectors2"), dict(flags="ints"), most="float")
+    def clear(self, scene: A, at: A, plan: A):
         """flags[2]: some pair is not kept apart by its plane, from where `place` has been, on all of the step w."""
-        return self.kernel("clear", self.flag_all, dict(w="vectors2"), dict(flags="ints"), most="float")
+        self.each_pair(self.flag, scene, at, plan)
 
     @ti.func
     def first_share(self, kind: A, p, scene: A, at: A):
@@ -238,12 +220,7 @@ class HessianKernels(ListedPair):
                         goes_on = share < plan.most
         scene.share[p] = share
 
-    @ti.func
-    def all_shares(self, scene: A, at: A, plan: A):
-        self.each_pair(self.share, scene, at, plan)
-
-    @cached_property
-    def shares(self) -> Kernel:
+    @as_kernel("shares", dict(u="vectors2", w="vectors2"), dict(share="scalars"), most="float")
+    def shares(self, scene: A, at: A, plan: A):
         """`share` of every pair, from where `place` has been."""
-        at = dict(u="vectors2", w="vectors2")
-        return self.kernel("shares", self.all_shares, at, dict(share="scalars"), most="float")
+        self.each_pair(self.share, scene, at, plan)

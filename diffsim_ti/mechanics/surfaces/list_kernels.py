@@ -6,7 +6,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.surfaces.broad_phase_kernels import sort
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, as_kernel
 
 A = ti.template()
 
@@ -52,8 +52,9 @@ class ListKernels:
         arrays = dict(list=written, found=found | areas) | trees
         return Kernel("write", self.write_all, self.precision, arrays, numbers | dict(factor="float"))
 
-    @ti.func
-    def count_all(self, list: A, plan: A):
+    @as_kernel("count")
+    def count(self, list: A, plan: A):
+        """How many of the first `count` corners meet at each surface vertex."""
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface + 1):
             list.row[s] = 0
@@ -61,13 +62,9 @@ class ListKernels:
         for c in range(plan.count):
             list.row[list.place[list.pairs[c]]] += 1  # whole numbers: their order does not matter
 
-    @cached_property
-    def count(self) -> Kernel:
-        """How many of the first `count` corners meet at each surface vertex."""
-        return self._of_rows("count", self.count_all)
-
-    @ti.func
-    def fill_all(self, list: A, plan: A):
+    @as_kernel("fill")
+    def fill(self, list: A, plan: A):
+        """The corners that meet at each surface vertex, in order."""
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             list.cursor[s] = list.row[s]
@@ -79,11 +76,6 @@ class ListKernels:
         for s in range(plan.num_surface):
             sort(list.corner_of, list.row[s], list.row[s + 1])
 
-    @cached_property
-    def fill(self) -> Kernel:
-        """The corners that meet at each surface vertex, in order."""
-        return self._of_rows("fill", self.fill_all)
-
-    def _of_rows(self, name: str, body) -> Kernel:
+    def _kernel(self, name: str, body) -> Kernel:
         arrays = dict(list=dict.fromkeys(("pairs", "place", "row", "cursor", "corner_of"), "ints"))
         return Kernel(name, body, self.precision, arrays, dict(count="int", num_surface="int"))

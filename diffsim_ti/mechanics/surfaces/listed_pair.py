@@ -68,7 +68,7 @@ class ListedPair(Pair):
     first: int
     parallel: bool
 
-    def kernel(self, name: str, body, at: dict, scene: dict | None = None, **numbers) -> Kernel:
+    def _kernel(self, name: str, body, at: dict, scene: dict | None = None, **numbers) -> Kernel:
         """A kernel on the arrays of SCENE and more, and on those it is called `at`."""
         arrays = SCENE | (MIXED if self.mixed else {}) | (scene or {})
         return Kernel(name, body, self.precision, dict(scene=arrays, at=at), NUMBERS | numbers)

@@ -11,10 +11,15 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, between, three
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, as_kernel
 
 A = ti.template()
 BLOCK = 256  # vertices whose motion one thread compares
+AT = dict(u="vectors2")
+FOLLOWED = dict(body="ints", marked="ints", flags="ints", slack="vectors", frame="vectors", farthest="scalars")
+FOLLOWED |= dict(before="vectors", built="vectors")
+SIZES = "num_bodies", "markers", "body_block", "body_blocks", "blocks", "size", "number"
+NUMBERS = dict(lost="float") | dict.fromkeys(SIZES, "int")
 
 
 @dataclass(frozen=True)
@@ -105,16 +110,12 @@ class MotionKernels(ListedPair):
     @cached_property
     def holds(self) -> Kernel:
         """flags: a vertex has used up its slack (0), or that and `lost` (1)."""
-        return self._kernel("holds", self.hold_all)
+        return self._kernel("holds", self.hold_all, AT, FOLLOWED, **NUMBERS)
 
-    def _kernel(self, name: str, body, **own: str) -> Kernel:
-        own |= dict(body="ints", marked="ints", flags="ints", slack="vectors", frame="vectors", farthest="scalars")
-        own |= dict(before="vectors", built="vectors")
-        sizes = "num_bodies", "markers", "body_block", "body_blocks", "blocks", "size", "number"
-        return self.kernel(name, body, dict(u="vectors2"), own, lost="float", **dict.fromkeys(sizes, "int"))
-
-    @ti.func
-    def find_all(self, scene: A, at: A, plan: A):
+    @as_kernel("find", AT, dict(near="ints") | FOLLOWED, **NUMBERS)
+    def find(self, scene: A, at: A, plan: A):
+        """`near`: which pairs may be nearer than their width, where `forces` left planes or here; flags: a vertex
+        has used up its slack (0), there is such a pair (2)."""
         self.hold_all(scene, at, plan)
         self.find_farthest(scene, at, plan)
         self.each_pair(self.flag, scene, at, plan)
@@ -127,12 +128,6 @@ class MotionKernels(ListedPair):
                 near = 1
                 scene.flags[2] = 1
         scene.near[p] = near
-
-    @cached_property
-    def find(self) -> Kernel:
-        """`near`: which pairs may be nearer than their width, where `forces` left planes or here; flags: a vertex
-        has used up its slack (0), there is such a pair (2)."""
-        return self._kernel("find", self.find_all, near="ints")
 
     @ti.func
     def measure(self, kind: A, p, scene: A, at: A, plan: A):
@@ -151,15 +146,12 @@ class MotionKernels(ListedPair):
                 scene.area[p] = ti.cast(1, self.fp)
         scene.plane[p] = self.vec4(0)
 
-    @ti.func
-    def begin_all(self, scene: A, at: A, plan: A):
+    @as_kernel(
+        "begin", AT, lambda self: dict(built="vectors", body="ints") | (dict(per_area="ints") if self.mixed else {})
+    )
+    def begin(self, scene: A, at: A, plan: A):
+        """A new list: where the surface is, how far apart pairs are at rest, and no planes yet."""
         self.each_pair(self.measure, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             scene.built[s] = at.u[plan.slot, scene.surface[s]]
-
-    @cached_property
-    def begin(self) -> Kernel:
-        """A new list: where the surface is, how far apart pairs are at rest, and no planes yet."""
-        own = dict(per_area="ints") if self.mixed else {}
-        return self.kernel("begin", self.begin_all, dict(u="vectors2"), dict(built="vectors", body="ints") | own)

@@ -10,7 +10,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, three
 from diffsim_ti.mechanics.surfaces.proximity import VERTEX_TRIANGLE
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, as_kernel
 
 A = ti.template()
 
@@ -77,8 +77,17 @@ class PairKernels(ListedPair):
             for k in ti.static(range(4)):
                 scene.touched[scene.place[scene.pairs[4 * p + k]]] = 1
 
-    @ti.func
-    def all_forces(self, scene: A, at: A, plan: A):
+    @as_kernel(
+        "forces",
+        dict(u="vectors2", out="vectors"),
+        dict(energy="scalars", touched="ints", before="vectors"),
+        exact="int",
+    )
+    def forces(self, scene: A, at: A, plan: A):
+        """Forces; keeps a plane (n, d) that parts each pair, and where the surface was.
+
+        d is the distance of a pair that is nearer than the width or if `exact`, else a lower bound of it.
+        """
         self.each_pair(self.force, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
@@ -90,15 +99,6 @@ class PairKernels(ListedPair):
                         total += scene.corner[scene.corner_of[k]]
             at.out[plan.first_out + s] = total
             scene.before[s] = at.u[plan.slot, scene.surface[s]]
-
-    @cached_property
-    def forces(self) -> Kernel:
-        """Forces; keeps a plane (n, d) that parts each pair, and where the surface was.
-
-        d is the distance of a pair that is nearer than the width or if `exact`, else a lower bound of it.
-        """
-        own, at = dict(energy="scalars", touched="ints", before="vectors"), dict(u="vectors2", out="vectors")
-        return self.kernel("forces", self.all_forces, at, own, exact="int")
 
     # ---- derivatives -------------------------------------------------------------------------------------------------
 
@@ -147,10 +147,14 @@ class PairKernels(ListedPair):
         at |= dict(numbers_dot="vectors") if self.mixed else {}
         numbers = dict(by_rest="int", d_stiffness="float", d_width="float")
         numbers |= dict(only="int") if self.mixed else {}
-        return self.kernel("products", self.all_products, at, dict(numbers="vectors"), **numbers)
+        return self._kernel("products", self.all_products, at, dict(numbers="vectors"), **numbers)
 
-    @ti.func
-    def add_all_sums(self, scene: A, at: A, plan: A):
+    @as_kernel("add_sums", dict(out="vectors"), dict.fromkeys(("numbers", "sums", "rest_adj"), "vectors"))
+    def add_sums(self, scene: A, at: A, plan: A):
+        """Adjoints of stiffness, width and radius, each pair at one corner, and of the rest shape, after `products`.
+
+        The rest shape moves the corners, and makes the widths of pairs that are near in it.
+        """
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             total, by_rest = self.vec4(0), at.out[plan.first_out + s]
@@ -164,12 +168,3 @@ class PairKernels(ListedPair):
                     by_rest += self.four(weight * three(scene.rest_plane[p]))
             scene.sums[s] = scene.sums[s] + total
             scene.rest_adj[s] = scene.rest_adj[s] + by_rest
-
-    @cached_property
-    def add_sums(self) -> Kernel:
-        """Adjoints of stiffness, width and radius, each pair at one corner, and of the rest shape, after `products`.
-
-        The rest shape moves the corners, and makes the widths of pairs that are near in it.
-        """
-        own = dict.fromkeys(("numbers", "sums", "rest_adj"), "vectors")
-        return self.kernel("add_sums", self.add_all_sums, dict(out="vectors"), own)

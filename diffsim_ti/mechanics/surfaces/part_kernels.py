@@ -6,14 +6,13 @@ gradients with a diagonal preconditioner: pairs are few, and as stiff as they ma
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.mechanics.surfaces import host_geometry as host
 from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, behind, first_of, three
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE, Pair
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, as_kernel
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.friction import KERNELS, slip_in_kernels
 
@@ -258,8 +257,10 @@ class PartKernels(Pair):
             k += 1
         return out
 
-    @ti.func
-    def choose_all(self, list: A, pairs: A, nodes: A, state: A, work: A, plan: A):
+    @as_kernel("choose_near", dict(list=dict(near="ints")))
+    def choose(self, list: A, pairs: A, nodes: A, state: A, work: A, plan: A):
+        """Choose those of the pairs that the list flags which come near between x and x + motion, by looks so often that
+        none misses a crossing; result: how many are new, where in `acting` those chosen of each kind end."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.place_points(work.at_begin, nodes.x, nodes, plan)
@@ -275,12 +276,6 @@ class PartKernels(Pair):
                         count += 1
                 state.result[1 + kind] = count
             state.result[0] = more
-
-    @cached_property
-    def choose(self) -> Kernel:
-        """Choose those of the pairs that the list flags which come near between x and x + motion, by looks so often that
-        none misses a crossing; result: how many are new, where in `acting` those chosen of each kind end."""
-        return self._kernel("choose_near", self.choose_all, dict(list=dict(near="ints")))
 
     def _kernel(self, name: str, body, more: dict | None = None, **numbers) -> Kernel:
         arrays = (more or {}) | dict(pairs=PAIRS, nodes=NODES, state=STATE | RESULT, work=WORK)
@@ -511,8 +506,14 @@ class PartKernels(Pair):
                 out = ti.max(out, ti.abs(x[0]), ti.abs(x[1]), ti.abs(x[2]))
         return out
 
-    @ti.func
-    def take_all(self, pairs: A, nodes: A, state: A, work: A, plan: A):
+    @as_kernel(
+        "take_part",
+        rough="int",
+        **dict.fromkeys(("begin", "share", "h", "alpha", "damping", "wall", "rounding"), "float"),
+    )
+    def take(self, pairs: A, nodes: A, state: A, work: A, plan: A):
+        """The part `begin` .. `begin + share` of a pass of length h; result: what came of it; numbers: its damping, and
+        the work of all parts since `NearSet.start`."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             c, result, step, room, done = plan.damping, TOO_LONG, LOOK, ti.cast(0, self.fp), ti.cast(0, self.fp)
@@ -555,10 +556,3 @@ class PartKernels(Pair):
                         if step == CHECK_END:
                             work.at_look[i] = work.at_end[i]
             state.result[0], state.numbers[0] = result, c
-
-    @cached_property
-    def take(self) -> Kernel:
-        """The part `begin` .. `begin + share` of a pass of length h; result: what came of it; numbers: its damping, and
-        the work of all parts since `NearSet.start`."""
-        numbers = dict.fromkeys(("begin", "share", "h", "alpha", "damping", "wall", "rounding"), "float")
-        return self._kernel("take_part", self.take_all, rough="int", **numbers)
