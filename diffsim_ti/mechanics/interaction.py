@@ -95,6 +95,20 @@ class ItemForce(ForceKernel):
         adjoint.rate_corner, and adds the adjoints of numbers."""
 
 
+@ti.func
+def edges(corners: A, t, x: A, rest: A, s):
+    """x_1 - x_0 and x_2 - x_0 of the corners of triangle t, of rest + x in slot s."""
+    i, j, k = corners[3 * t], corners[3 * t + 1], corners[3 * t + 2]
+    return (rest[j] - rest[i]) + (x[s, j] - x[s, i]), (rest[k] - rest[i]) + (x[s, k] - x[s, i])
+
+
+@ti.func
+def store_alike(force, corner: A, first, t):
+    """The same force for all corners of triangle t."""
+    for a in ti.static(range(3)):
+        corner[first + 3 * t + a] = force
+
+
 @dataclass(frozen=True)
 class VertexwiseForce(ForceKernel):
     """Forces at each vertex i by its own displacement u and velocity v."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.fluid import drag
-from diffsim_ti.mechanics.interaction import ItemForce
+from diffsim_ti.mechanics.interaction import ItemForce, edges, store_alike
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.surface_drag import SurfaceDrag
 
@@ -33,12 +33,6 @@ class DraggedTriangle(ItemForce):
     @ti.func
     def number(self, x: ti.template()):
         return ti.cast(x, self.fp)
-
-    @ti.func
-    def edges(self, t, x: A, rest: A, s, scene: A):
-        """x_1 - x_0 and x_2 - x_0 of rest + x in slot s."""
-        i, j, k = scene.dragged[3 * t], scene.dragged[3 * t + 1], scene.dragged[3 * t + 2]
-        return (rest[j] - rest[i]) + (x[s, j] - x[s, i]), (rest[k] - rest[i]) + (x[s, k] - x[s, i])
 
     @ti.func
     def speed(self, t, v: A, s, parameters: A, scene: A):
@@ -65,7 +59,7 @@ class DraggedTriangle(ItemForce):
     @ti.func
     def known(self, t, scene: A, state: A, s):
         """(e, f, v, |v|, N, L, s, B)"""
-        e, f = self.edges(t, state.u, scene.rest, s, scene)
+        e, f = edges(scene.dragged, t, state.u, scene.rest, s)
         v = self.speed(t, state.v, s, scene.parameters, scene)
         rho, c, k = self.numbers(t, scene.parameters, scene)
         N = self.cross(e, f)
@@ -73,28 +67,23 @@ class DraggedTriangle(ItemForce):
         return e, f, v, ti.sqrt(v.dot(v)), N, L, along, pull(c, k, v, N, L, along, self.inverse(L))
 
     @ti.func
-    def store(self, t, first, force, corner: A):
-        for a in ti.static(range(3)):
-            corner[first + 3 * t + a] = force
-
-    @ti.func
     def forces(self, t, now: A, scene: A, state: A, s, plan: A):
         rho, c, k = self.numbers(t, scene.parameters, scene)
         e, f, v, size, N, L, along, B = self.known(t, scene, state, s)
-        self.store(t, self.first(plan), -rho * size * B, scene.corner)
+        store_alike(-rho * size * B, scene.corner, self.first(plan), t)
 
     @ti.func
     def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, plan: A):
         rho, c, k = self.numbers(t, scene.parameters, scene)
         drho, dc, dk = self.numbers(t, tangent.parameters, scene)
         e, f, v, size, N, L, along, B = self.known(t, scene, state, s)
-        de, df = self.edges(t, tangent.u, tangent.rest, 0, scene)
+        de, df = edges(scene.dragged, t, tangent.u, tangent.rest, 0)
         dv = self.speed(t, tangent.v, 0, tangent.parameters, scene)
         dN, over = self.cross(de, f) + self.cross(e, df), self.inverse(L)
         dL, dalong, dsize = N.dot(dN) * over, dv.dot(N) + v.dot(dN), v.dot(dv) * self.inverse(size)
         dB = pull_jvp(c, k, v, N, L, along, over, dc, dk, dv, dN, dL, dalong)
         change = rho * (dsize * B + size * dB) + drho * size * B
-        self.store(t, self.first(plan), self.number(-1) * change, scene.corner)
+        store_alike(self.number(-1) * change, scene.corner, self.first(plan), t)
 
     @ti.func
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):

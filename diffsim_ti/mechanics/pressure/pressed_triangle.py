@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.mechanics.interaction import ItemForce
+from diffsim_ti.mechanics.interaction import ItemForce, edges, store_alike
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
 from diffsim_ti.runtime import traced
 
@@ -30,39 +30,28 @@ class PressedTriangle(StepNumbers, ItemForce):
         return super().sizes(plan) | dict(pressure_adjoint=plan.num_pressed, pressed_rest=self.nodes * plan.num_pressed)
 
     @ti.func
-    def edges(self, t, x: A, rest: A, s, scene: A):
-        """x_1 - x_0 and x_2 - x_0 of rest + x in slot s."""
-        i, j, k = scene.pressed[3 * t], scene.pressed[3 * t + 1], scene.pressed[3 * t + 2]
-        return (rest[j] - rest[i]) + (x[s, j] - x[s, i]), (rest[k] - rest[i]) + (x[s, k] - x[s, i])
-
-    @ti.func
     def factor(self, t, now: A, rows: A, scene: A):
         """-p / 6, by which the product of edges gives the force of a corner."""
         return self.mean(scene.pressed_load[t], now, rows) * ti.cast(-1.0 / 6.0, self.fp)
 
     @ti.func
-    def store(self, t, first, force, corner: A):
-        for a in ti.static(range(3)):
-            corner[first + 3 * t + a] = force
-
-    @ti.func
     def forces(self, t, now: A, scene: A, state: A, s, plan: A):
-        e, f = self.edges(t, state.u, scene.rest, s, scene)
-        self.store(t, self.first(plan), self.factor(t, now, scene.follower, scene) * self.cross(e, f), scene.corner)
+        e, f = edges(scene.pressed, t, state.u, scene.rest, s)
+        store_alike(self.factor(t, now, scene.follower, scene) * self.cross(e, f), scene.corner, self.first(plan), t)
 
     @ti.func
     def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, plan: A):
-        e, f = self.edges(t, state.u, scene.rest, s, scene)
-        de, df = self.edges(t, tangent.u, tangent.rest, 0, scene)
+        e, f = edges(scene.pressed, t, state.u, scene.rest, s)
+        de, df = edges(scene.pressed, t, tangent.u, tangent.rest, 0)
         p, dp = self.factor(t, now, scene.follower, scene), self.factor(t, now, tangent.follower, scene)
         change = p * (self.cross(de, f) + self.cross(e, df)) + dp * self.cross(e, f)
-        self.store(t, self.first(plan), change, scene.corner)
+        store_alike(change, scene.corner, self.first(plan), t)
 
     @ti.func
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
         """Products of the transposed derivative with adjoint.w, to corners; adds the adjoints of pressures to
         adjoint.pressure_adjoint and, if `shape`, those of places to adjoint.pressed_rest."""
-        e, f = self.edges(t, state.u, scene.rest, s, scene)
+        e, f = edges(scene.pressed, t, state.u, scene.rest, s)
         w = adjoint.w[0, scene.pressed[3 * t]]
         for a in ti.static((1, 2)):
             w += adjoint.w[0, scene.pressed[3 * t + a]]

@@ -8,7 +8,7 @@ import taichi as ti
 from diffsim_ti.mechanics.obstacles.outside_work import with_drag
 from diffsim_ti.mechanics.reduced.body_adjoint import BodyStage
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
-from diffsim_ti.runtime import Bundle, Kernel, let, traced
+from diffsim_ti.runtime import Bundle, Kernel, as_kernel, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.solvers.explicit.vertex_parts import ItemForces
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, adjoints, needed, with_state
@@ -73,6 +73,11 @@ class ExplicitKernels:
     def with_record(self, arrays: dict) -> dict:
         """The same, with the impulses of obstacles where they are recorded."""
         return self.with_state(arrays) | (dict(impulse="vectors2") if self.vertex.features.recorded else {})
+
+    def along_record(self) -> dict:
+        """What a tangent reads and changes."""
+        changed = self.with_record(CHANGE) | TANGENT | LED | self.items.tangent
+        return dict(state=self.with_record(STATE), tangent=changed)
 
     @property
     def corners(self) -> dict:
@@ -201,9 +206,10 @@ class ExplicitKernels:
         if ti.static(self.element.has_state):
             self.element.move_on(item, of, state, s, s + plan.stride, self.onwards(now))
 
-    @ti.func
-    def passes(self, scene: A, state: A, table: A, plan: A):
-        """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
+    @as_kernel("step", lambda self: dict(state=self.with_record(STATE)), lambda self: self.repeated, stride="int")
+    def step(self, scene: A, state: A, table: A, plan: A):
+        """`count` passes from pass `first` on. Slot 0 holds the state before pass `base`; with stride 1 each pass writes the
+        next slot, and its forces."""
         if ti.static(self.parallel):
             num_items, num_vertices = self.after(plan), self.num_vertices(plan)  # both bounds are read by one task
             for e in range(num_items):
@@ -232,11 +238,6 @@ class ExplicitKernels:
                     for b in range(plan.num_bodies):
                         self.bodies.step(b, j, now, scene, state, plan)
 
-    @cached_property
-    def step(self) -> Kernel:
-        """`count` passes from pass `first` on."""
-        return self._kernel("step", self.passes, dict(state=self.with_record(STATE)), self.repeated, stride="int")
-
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
     @ti.func
@@ -258,8 +259,10 @@ class ExplicitKernels:
         if ti.static(self.element.has_state):
             self.element.move_on_jvp(item, of, state, s, tangent, dots, self.onwards(now))
 
-    @ti.func
-    def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
+    @as_kernel("step_jvp", along_record, lambda self: self.repeated, rate_dot="float")
+    def step_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
+        """The tangent of passes first .. first + count - 1 along recorded slots; the change of the state is advanced in
+        place."""
         if ti.static(self.parallel):
             num_items, num_vertices = self.after(plan), self.num_vertices(plan)
             for e in range(num_items):
@@ -289,40 +292,24 @@ class ExplicitKernels:
                     for b in range(plan.num_bodies):
                         self.bodies.step_jvp(b, j, now, scene, state, tangent, plan)
 
-    @cached_property
-    def step_jvp(self) -> Kernel:
-        """The tangent of passes first .. first + count - 1 along recorded slots; the change of the state is advanced in
-        place."""
-        own = dict(state=self.with_record(STATE), tangent=self.with_record(CHANGE) | TANGENT | LED | self.items.tangent)
-        return self._kernel("step_jvp", self.passes_jvp, own, self.repeated, rate_dot="float")
-
     # ---- vertices again, where joints of robots meet them (mechanics/joints/explicit.py) --------------------------------
 
-    @ti.func
-    def press_all(self, scene: A, state: A, table: A, plan: A):
+    @as_kernel("press", lambda self: dict(state=self.with_record(STATE)), False, stride="int")
+    def press(self, scene: A, state: A, table: A, plan: A):
         num_vertices = self.num_vertices(plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(num_vertices):
             now = self.vertex.obstacles.counted(self.numbers_of(0, plan.first, table, plan))
             self.vertex.press(i, now, scene, state, plan)
 
-    @cached_property
-    def press(self) -> Kernel:
-        return self._kernel("press", self.press_all, dict(state=self.with_record(STATE)), False, stride="int")
-
-    @ti.func
-    def press_all_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
+    @as_kernel("press_jvp", along_record, False, rate_dot="float")
+    def press_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
+        """Its change where only the rows of obstacles change."""
         num_vertices = self.num_vertices(plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(num_vertices):
             now = unseen(self.vertex.obstacles.counted(self.numbers_of(0, plan.first, table, plan)))
             self.vertex.go_on_jvp(i, plan.base, self.vertex.vector(0), now, scene, state, tangent, plan)
-
-    @cached_property
-    def press_jvp(self) -> Kernel:
-        """Its change where only the rows of obstacles change."""
-        own = dict(state=self.with_record(STATE), tangent=self.with_record(CHANGE) | TANGENT | LED | self.items.tangent)
-        return self._kernel("press_jvp", self.press_all_jvp, own, False, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
