@@ -274,7 +274,7 @@ def test_inputs_in_a_crowd_that_acts_on_faces(solver, names):
 
 @solvers
 def test_a_rough_belt_pushes_no_vertex_through_a_wall(solver):
-    """Friction with one obstacle leads to another: of that way a vertex takes a share (limited_displacement.py)."""
+    """Friction with one obstacle leads to another: of that way a vertex takes a share (contact_friction.py)."""
     belt = ds.Ground(-0.011, stiffness=1e6, width=0.01, friction=1.5, path=lambda t: [-20 * t, 0, 0])
     wall = ds.HalfSpace([-0.011, 0, 0], [1, 0.2, 0.1], stiffness=1e6, width=0.01, friction=0.3)
     options = dict(fixed=[1, 2, 3], initial_velocities=[-1.0, -6.0, 0.3], precision="f64")

@@ -2,7 +2,7 @@
 
 from diffsim_ti.mechanics.chambers.interaction import FilledChambers, Gases
 from diffsim_ti.mechanics.constraints import Constraints
-from diffsim_ti.mechanics.fluid.interaction import FluidDrag
+from diffsim_ti.mechanics.fluid import FluidDrag
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.lines.interaction import Foundations, SpringsAndCables

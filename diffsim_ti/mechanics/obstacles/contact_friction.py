@@ -1,13 +1,19 @@
 """Friction of the contact stage: that of each obstacle, one after the other, with the pushes that the stage has noted.
 
 Friction with one obstacle may lead a vertex towards another one, which the stage has not asked. With e the way that friction
-adds and y_o > 0 the distances to which the stage leads, the vertex takes the share c(x) of all friction
-(limited_displacement.py). A vertex that is fixed in some directions takes of each friction what lies in the others, and
-along the obstacle there: what would lead it to or from the obstacle is left out, as if it were across the normal.
+adds, n_o the normals of tangent planes that obstacles have where the pass begins, and y_o > 0 the distances from these to
+which the stage leads (contact_stage.py), the vertex takes the share c(x) of all friction:
+
+    x = max_o -e . n_o / y_o,    c(x) = 1 for x <= 1/2,    c(x) = (1 - exp(1 - 2 x) / 2) / x beyond,
+
+which leaves it y_o exp(1 - 2 x) / 2 or more of each. The slope of c is continuous; where x <= 1/2 nothing is changed.
+Planes that a vertex is behind, since it went past an obstacle, do not count.
+
+A vertex that is fixed in some directions takes of each friction what lies in the others, and along the obstacle there: what
+would lead it to or from the obstacle is left out, as if it were across the normal.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import taichi as ti
 
@@ -17,9 +23,9 @@ from diffsim_ti.mechanics.obstacles.contact_impulses import (
     note_friction_jvp,
     seed_of_friction,
 )
-from diffsim_ti.mechanics.obstacles.limited_displacement import LimitedDisplacement
 from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, VELOCITY, ObstacleStages
-from diffsim_ti.terms.obstacles import stage
+from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.terms.obstacles import stage, turning
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
@@ -27,10 +33,6 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 @dataclass(frozen=True)
 class ContactFriction(ObstacleStages):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
-
-    @cached_property
-    def limited_displacement(self) -> LimitedDisplacement:
-        return LimitedDisplacement(self.features, self.precision)
 
     @ti.func
     def led_normal(self, i, n, scene: A):
@@ -112,6 +114,60 @@ class ContactFriction(ObstacleStages):
     # ---- what of it a vertex takes -------------------------------------------------------------------------------------
 
     @ti.func
+    def share_and_slope(self, x):
+        """(c, dc / dx); the slope is 0 where nothing is changed."""
+        half, c, slope = ti.cast(0.5, self.fp), ti.cast(1, self.fp), ti.cast(0, self.fp)
+        if x > half:
+            left = ti.exp(1 - (x + x))
+            c = (1 - half * left) / x
+            slope = (left - c) / x
+        return c, slope
+
+    @ti.func
+    def way_to(self, g: A, k, i, u, z, now: A, scene: A):
+        """A move z from u as the obstacle sees it."""
+        return z - now.h * self.v_obstacle(g, k, self.seen_now(g, k, scene.rest[i], now, scene), u, now, scene)
+
+    @ti.func
+    def change_of_x(self, g: A, k, i, u, du, z, dz, e, de, x, now: A, scene: A, tangent: A):
+        """Change of x, which obstacle k has, for a vertex that the stage has moved by z from u."""
+        first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
+        moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+        plane = g.force.contact_plane(scene.parameters, first, X, u)
+        turned = g.force.contact_plane_jvp(scene.parameters, first, X, u, moved, tangent.parameters)
+        n, dn, way = self.normal(plane), self.normal(turned), self.way_to(g, k, i, u, z, now, scene)
+        dway = dz - now.h * self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+        dy = turned.w + dn.dot(way) + n.dot(dway)
+        return -(dn.dot(e) + n.dot(de) + x * dy) / (plane.w + n.dot(way))
+
+    @ti.func
+    def adjoint_of_x(self, g: A, k, i, column, u, z, e, x, by_x, now: A, scene: A, adjoint: A, out: A):
+        """(adjoints of e, z, u) for that of x; adds those of the obstacle's numbers, and of its path to out.path_adjoint.
+
+        The change of n by u is symmetric.
+        """
+        first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
+        plane = g.force.contact_plane(scene.parameters, first, X, u)
+        n, way = self.normal(plane), self.way_to(g, k, i, u, z, now, scene)
+        ratio = by_x / (plane.w + n.dot(way))
+        by_y = -ratio * x
+        by_e, by_z, seed = -ratio * n, by_y * n, by_y * way + -ratio * e
+        seed.w = by_y
+        turned = g.force.contact_plane_jvp(scene.parameters, first, X, u, seed)
+        g.force.contact_plane_vjp(scene.parameters, first, X, u, seed, adjoint.sums, i)
+        by_place = self.turn_of_plane(g, self.normal(turned) + by_y * n, n, seed)
+        by_u = self.spread(g, k, i, X, u, by_place, -now.h * by_z, now, scene, adjoint, out, column)
+        return by_e, by_z, by_u
+
+    @traced
+    def turn_of_plane(self, g, by_place, n, seed):
+        """With the adjoint of theta by that of n, of an obstacle that turns."""
+        if not g.force.turns:
+            return by_place
+        by_theta = turning.cross([at(n, d) for d in range(3)], [at(seed, d) for d in range(3)])
+        return self.turned.joined(by_place, let(ti.types.vector(3, self.fp)(*by_theta)))
+
+    @ti.func
     def crowding(self, i, v, after, z, now: A, state: A):
         """(x, number of the obstacle that has it, or -1) for the velocities before and after friction and the move z."""
         most, number, e = ti.cast(0, self.fp), -1, now.alpha * (after - v)
@@ -131,7 +187,7 @@ class ContactFriction(ObstacleStages):
         """Velocity after friction."""
         after = self.slide_all(i, v, ratio, scene, state)
         x, _ = self.crowding(i, v, after, z, now, state)
-        c, slope = self.limited_displacement.share_and_slope(x)
+        c, slope = self.share_and_slope(x)
         if slope < 0:
             after = v + c * (after - v)
         return after
@@ -175,7 +231,7 @@ class ContactFriction(ObstacleStages):
         """Velocity after friction, and its change."""
         after, change = self.slide_all_jvp(i, u, du, v, dv, ratio, dratio, now, scene, state, tangent)
         x, number = self.crowding(i, v, after, z, now, state)
-        c, slope = self.limited_displacement.share_and_slope(x)
+        c, slope = self.share_and_slope(x)
         dc, start, dstart = ti.cast(0, self.fp), v, dv
         if slope < 0:
             way, dway, dx = after - v, change - dv, ti.cast(0, self.fp)
@@ -183,7 +239,7 @@ class ContactFriction(ObstacleStages):
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    dx = self.limited_displacement.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
+                    dx = self.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
             dc = slope * dx
             after, change = v + c * way, dv + c * dway + dc * way
         if ti.static(self.features.recorded):
@@ -239,7 +295,7 @@ class ContactFriction(ObstacleStages):
         """(adjoints of v before friction, of h / m, of the move z, of alpha, of u); notes or adds those of all else."""
         after, by_z, by_u = self.slide_all(i, v, ratio, scene, state), self.vector(0), self.vector(0)
         x, number = self.crowding(i, v, after, z, now, state)
-        c, slope = self.limited_displacement.share_and_slope(x)
+        c, slope = self.share_and_slope(x)
         displacement_adj, own, by_alpha = v_adj, self.vector(0), ti.cast(0, self.fp)
         if slope < 0:
             way = after - v
@@ -250,7 +306,7 @@ class ContactFriction(ObstacleStages):
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    of_e, of_z, of_u = self.limited_displacement.adjoint_of_x(
+                    of_e, of_z, of_u = self.adjoint_of_x(
                         g, k, i, i, u, z, now.alpha * way, x, by_x, now, scene, adjoint, adjoint
                     )
                     displacement_adj += now.alpha * of_e

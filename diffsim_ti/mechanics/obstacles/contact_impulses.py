@@ -18,7 +18,7 @@ def note_impulses(self: A, i, v_plus, z, ratio, now: A, scene: A, state: A):
     """Add what the noted pushes, and the frictions on v+, are."""
     if now.into >= 0:
         x, _ = self.crowding(i, v_plus, self.slide_all(i, v_plus, ratio, scene, state), z, now, state)
-        share, _ = self.limited_displacement.share_and_slope(x)
+        share, _ = self.share_and_slope(x)
         v = v_plus
         for c in range(ti.static(self.features.num_staged)):
             o = ti.static(self.features.first_staged) + c

@@ -1,1 +1,0 @@
-"""Drag and lift of a fluid on the surface."""
