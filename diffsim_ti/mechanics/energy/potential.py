@@ -11,7 +11,7 @@ from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mechanics.energy.kernels import PotentialKernels
 from diffsim_ti.mechanics.host_force import NONE
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
-from diffsim_ti.mechanics.stress.patch_coupling import PatchCoupling
+from diffsim_ti.mechanics.stress.patched_tetrahedron import PatchCoupling
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
