@@ -11,6 +11,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.inputs.rigid_start import nearest_rotation
 from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.supports.free import Free, FreeBodies, FreeDirections, mask_of
 from diffsim_ti.runtime import kernels_of
@@ -158,7 +159,7 @@ class BodyBlocks(BlockJacobi):
         for body, G in self._at_rest:
             own, n = body.vertices, body.count
             if body.per_component:
-                R, m = turn_of(rest[own], rest[own] + u[own]), n // 3
+                R, m = nearest_rotation(body.apart(rest + u).T @ body.apart(rest)), n // 3
                 G = np.einsum("ia,jakb,lb->jikl", R, G.reshape(m, 3, m, 3), R, optimize=True).reshape(n, n)
             self._bodies.append((body, self._inverse_with(G, own, body.fields(), contact)))
 
@@ -199,13 +200,6 @@ def _reduced(K, vertices: np.ndarray, fields: np.ndarray) -> np.ndarray:
     B = fields.reshape(len(rows), -1)
     G = B.T @ (K[rows][:, rows] @ B)
     return 0.5 * (G + G.T)
-
-
-def turn_of(X: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The rotation that takes points X nearest to x, about their centres."""
-    U, _, Vt = np.linalg.svd((x - x.mean(0)).T @ (X - X.mean(0)))
-    U[:, 2] *= np.sign(np.linalg.det(U @ Vt)) or 1.0
-    return U @ Vt
 
 
 def size_of(blocks: np.ndarray) -> np.ndarray:
