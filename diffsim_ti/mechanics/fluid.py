@@ -18,10 +18,8 @@ from diffsim_ti.differentiation.arrays import ratio, summed_at
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction, ItemForce, add_at, edges, store_alike
 from diffsim_ti.mesh.geometry import triangle_normals
-from diffsim_ti.runtime import traced
+from diffsim_ti.runtime import A, traced
 from diffsim_ti.terms import SurfaceDrag
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 def pull(c, k, v, N, L, s, per_L):

@@ -16,13 +16,11 @@ import taichi as ti
 
 from diffsim_ti.inputs import Derived, Link
 from diffsim_ti.mechanics.host_force import HostForce
-from diffsim_ti.runtime import cross, number_type, traced, vector_type
+from diffsim_ti.runtime import A, cross, number_type, traced, vector_type
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
     from diffsim_ti.terms import Term
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

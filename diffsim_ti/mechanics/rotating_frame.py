@@ -9,10 +9,8 @@ from diffsim_ti.differentiation.arrays import cross
 from diffsim_ti.inputs.consistent_mass import consistent
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction, VertexwiseForce
-from diffsim_ti.runtime import traced
+from diffsim_ti.runtime import A, traced
 from diffsim_ti.terms import RotatingFrame
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,11 @@ from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.mechanics.workspace import Workspace
-from diffsim_ti.runtime import Kernel, as_kernel, assign, kernels_of, traced
+from diffsim_ti.runtime import A, Kernel, as_kernel, assign, kernels_of, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, needed, with_state
 
-A = ti.template()
 FIELDS = dict(energy="scalars", von_mises="scalars", J="scalars")
 
 

@@ -15,7 +15,7 @@ from diffsim_ti.mechanics.host_force import HostForces, Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import Kernel, as_kernel
+from diffsim_ti.runtime import A, Kernel, as_kernel
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, Adjoint, Tangent, with_state
@@ -23,7 +23,6 @@ from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.terms import Chamber, Gravity, Growth
 
 STEPS = EqualSteps(1.0, 1)  # a pass for each step
-A = ti.template()
 STATE = dict(u="vectors2", v="vectors2")
 CORNERS = dict(corner="vectors", rate_corner="vectors")
 

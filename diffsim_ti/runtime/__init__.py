@@ -33,7 +33,7 @@ from diffsim_ti.runtime.arrays import to_numpy_dtype, upload, view
 from diffsim_ti.runtime.device import device_name, use_device
 from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
 from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, Repeated, array_types, as_kernel, kernel, kernels_of
-from diffsim_ti.runtime.language import Bundle, Expr, assign, at, each_lane, let, spread, traced, variable
+from diffsim_ti.runtime.language import A, Bundle, Expr, assign, at, each_lane, let, spread, traced, variable
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
 from diffsim_ti.runtime.piecewise import Piecewise
 from diffsim_ti.runtime.repeated_loops import can_repeat

@@ -10,6 +10,7 @@ from taichi.types import vector
 
 from diffsim_ti.runtime.start import PRECISIONS
 
+A = ti.template()  # of an argument that is an array, or a Bundle, or known when kernels compile
 made = {"variables": 0}  # in all of this process: what decides how long kernels take to compile (tracer.py counts)
 
 

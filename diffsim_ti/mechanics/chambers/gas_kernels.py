@@ -15,11 +15,10 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
-from diffsim_ti.runtime import Kernel, as_kernel, at, cross, let, traced
+from diffsim_ti.runtime import A, Kernel, as_kernel, at, cross, let, traced
 from diffsim_ti.state.pass_table import pass_at
 from diffsim_ti.terms.chambers import gas_law
 
-A = ti.template()
 CHAMBERS = dict.fromkeys(("triangles", "chamber", "begins", "anchor", "first_row"), "ints") | dict(
     point="vectors", volume="scalars", by_pressure="scalars", weight="scalars", push="scalars"
 )

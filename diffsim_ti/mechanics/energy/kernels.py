@@ -8,12 +8,11 @@ import taichi as ti
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import Bundle, Kernel, as_kernel, assign, kernels_of, let, traced
+from diffsim_ti.runtime import A, Bundle, Kernel, as_kernel, assign, kernels_of, let, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed, with_frozen, with_pass
 
-A = ti.template()
 PASS = dict(poses="vectors", lag="vectors2")  # what contact sees of a pass (obstacles.py)
 NUMBERS = dict(num_items="int", num_tetrahedra="int", num_vertices="int", per_gamma="float")
 

@@ -8,9 +8,7 @@ import taichi as ti
 from diffsim_ti.differentiation.arrays import summed_at
 from diffsim_ti.mechanics.host_force import VertexwiseHostForce
 from diffsim_ti.mechanics.interaction import VertexwiseForce
-from diffsim_ti.runtime import traced
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
+from diffsim_ti.runtime import A, traced
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,8 @@ import taichi as ti
 from diffsim_ti.mechanics.interaction import ItemForce
 from diffsim_ti.mechanics.lines import pull
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
-from diffsim_ti.runtime import LANES, assign, at, let, traced
+from diffsim_ti.runtime import LANES, A, assign, at, let, traced
 from diffsim_ti.state.pass_table import between
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
-
 
 tension, tension_jvp, across = (ti.func(f) for f in (pull.tension, pull.tension_jvp, pull.across))
 

@@ -4,11 +4,9 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import number_type, traced, vector_type
+from diffsim_ti.runtime import A, number_type, traced, vector_type
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.pass_table import between, kicks
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

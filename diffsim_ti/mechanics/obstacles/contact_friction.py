@@ -24,10 +24,8 @@ from diffsim_ti.mechanics.obstacles.contact_impulses import (
     seed_of_friction,
 )
 from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, VELOCITY, ObstacleStages
-from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.runtime import A, at, let, traced
 from diffsim_ti.terms.obstacles import stage, turning
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

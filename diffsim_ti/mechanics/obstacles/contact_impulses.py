@@ -9,8 +9,7 @@ now.into + 2 o and now.into + 2 o + 1 of `impulse`; now.into is negative in pass
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_stages import PLANE, PUSH, ROWS, SEED
-
-A = ti.template()
+from diffsim_ti.runtime import A
 
 
 @ti.func

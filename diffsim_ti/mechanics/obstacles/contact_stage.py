@@ -25,9 +25,9 @@ from diffsim_ti.mechanics.obstacles.contact_friction import ContactFriction
 from diffsim_ti.mechanics.obstacles.contact_impulses import note_impulses, note_pushes_jvp, seed_impulses
 from diffsim_ti.mechanics.obstacles.obstacle_stages import NUMBERS, PLANE, PUSH, ROWS, SEED, VELOCITY, ObstacleStages
 from diffsim_ti.mechanics.obstacles.outside_work import add_work, work_of_lead, work_of_stage
+from diffsim_ti.runtime import A
 from diffsim_ti.terms.obstacles import secant, stage
 
-A = ti.template()  # an array or Bundle handed to a Taichi function
 MOST_ROUNDS = 60
 
 

@@ -6,11 +6,9 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.turned import Turned
-from diffsim_ti.runtime import PRECISIONS, traced
+from diffsim_ti.runtime import PRECISIONS, A, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.obstacle_poses import MORE
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,10 @@ from functools import lru_cache
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
-from diffsim_ti.runtime import Kernel, as_kernel, traced
+from diffsim_ti.runtime import A, Kernel, as_kernel, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed
 
-A = ti.template()
 PASS = dict(poses="vectors", lag="vectors2")
 NUMBERS = dict(num_vertices="int", per_gamma="float")
 

@@ -16,12 +16,11 @@ import taichi as ti
 from diffsim_ti.inputs.poses import COLUMNS
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
 from diffsim_ti.mechanics.supports.sliding_supports import SlidingSupports
-from diffsim_ti.runtime import Bundle, at, let, traced
+from diffsim_ti.runtime import A, Bundle, at, let, traced
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, RATE
 from diffsim_ti.state.pass_table import pass_at
 from diffsim_ti.terms.obstacles import turning
 
-A = ti.template()  # an array or Bundle handed to a Taichi function
 # what a contact stage notes of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu,
 # friction speed); its velocity; (P, -dP/dy, adjoint of mu, of the friction speed); change or adjoint of (n, P)
 PLANE, NUMBERS, VELOCITY, PUSH, SEED = range(5)

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
-from diffsim_ti.runtime import assign, at, let, traced
+from diffsim_ti.runtime import A, assign, at, let, traced
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE, RATE, TAU
 from diffsim_ti.terms.obstacles import turning
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,7 @@ that of forces which are the body's own.
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_stages import PLANE, PUSH, ROWS, VELOCITY
-from diffsim_ti.runtime import Bundle, at, let, traced
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
+from diffsim_ti.runtime import A, Bundle, at, let, traced
 
 
 @ti.func

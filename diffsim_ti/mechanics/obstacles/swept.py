@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
-from diffsim_ti.runtime import Kernel, as_kernel, traced
+from diffsim_ti.runtime import A, Kernel, as_kernel, traced
 from diffsim_ti.state.numbers import SCENE, needed
 from diffsim_ti.state.obstacle_poses import MORE
 from diffsim_ti.terms.obstacles import turning
 
-A = ti.template()
 MARCHES = 200  # halts on a way
 TINY = 1e-3  # share of the distance, or of the width if that is less: what counts as met
 

@@ -16,10 +16,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, at, let, traced
+from diffsim_ti.runtime import PRECISIONS, A, at, let, traced
 from diffsim_ti.terms.obstacles import turning
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,7 @@ from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.mechanics.interaction import ItemForce, edges, store_alike
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
 from diffsim_ti.mesh import reference_face
-from diffsim_ti.runtime import assign, at, let, traced
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
+from diffsim_ti.runtime import A, assign, at, let, traced
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,8 @@ import taichi as ti
 from diffsim_ti.mechanics.reduced import body_motion as motion
 from diffsim_ti.mechanics.reduced.body_motion import VECTOR
 from diffsim_ti.mechanics.reduced.explicit import Bodies
-from diffsim_ti.runtime import let, traced
+from diffsim_ti.runtime import A, let, traced
 from diffsim_ti.state.bodies import NUMBERS, PAIRS, SUMS
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.obstacle_stages import ObstacleStages
+from diffsim_ti.runtime import A
 from diffsim_ti.terms.obstacles import grip
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

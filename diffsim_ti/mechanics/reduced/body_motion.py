@@ -18,10 +18,9 @@ body, revisited, doi:10.1007/s10208-004-0118-6.
 
 import taichi as ti
 
-from diffsim_ti.runtime import Bundle, cross, let, traced
+from diffsim_ti.runtime import A, Bundle, cross, let, traced
 
 VECTOR = ti.types.vector(4, ti.f64)
-A = ti.template()  # columns, a Bundle of x, y, z
 
 
 @traced

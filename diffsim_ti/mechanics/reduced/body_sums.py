@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 import taichi as ti
 
 from diffsim_ti.mechanics.reduced.body_motion import VECTOR, columns
-from diffsim_ti.runtime import Bundle, at, let, traced
+from diffsim_ti.runtime import A, Bundle, at, let, traced
 from diffsim_ti.state.bodies import NUMBERS, PAIRS, SIZE, SUMS
 
 if TYPE_CHECKING:
     from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 
-A = ti.template()  # an array or Bundle handed to a Taichi function
 INVERSE, MOMENTS = 4, 10  # where they begin among a body's numbers
 
 

@@ -21,10 +21,8 @@ from diffsim_ti.mechanics.reduced import body_motion as motion
 from diffsim_ti.mechanics.reduced.body_friction import BodyFriction
 from diffsim_ti.mechanics.reduced.body_motion import VECTOR
 from diffsim_ti.mechanics.reduced.body_sums import INVERSE, MOMENTS, BodySums
-from diffsim_ti.runtime import Bundle, at, let, traced
+from diffsim_ti.runtime import A, Bundle, at, let, traced
 from diffsim_ti.state.bodies import NUMBERS, PAIRS
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,11 @@ from diffsim_ti.materials.calculus.tensor import (
     six_adjoint,
 )
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import Kernel, as_kernel, kernels_of, traced
+from diffsim_ti.runtime import A, Kernel, as_kernel, kernels_of, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import OF_TETRAHEDRA, SCENE, TANGENT
 from diffsim_ti.state.stage import Stage
 
-A = ti.template()
 AT = dict(u="vectors2")  # u in slot 0, u- in slot 1
 NUMBERS = dict(num_items="int", num_vertices="int", a0="float", a1="float")
 

@@ -10,12 +10,11 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
-from diffsim_ti.runtime import Bundle, Kernel, as_kernel, traced
+from diffsim_ti.runtime import A, Bundle, Kernel, as_kernel, traced
 from diffsim_ti.runtime.slots import add_slot, copy_slot
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import OF_TETRAHEDRA, SCENE, TANGENT
 
-A = ti.template()
 AT = dict(u="vectors2", z="blocks2")
 NUMBERS = dict(num_items="int", num_vertices="int", slot="int", end="int", h="float")
 

@@ -18,8 +18,8 @@ import taichi as ti
 
 from diffsim_ti.materials.calculus.tensor import inner, sum_of
 from diffsim_ti.materials.patch_law import PatchLaw
-from diffsim_ti.mechanics.stress.tetrahedron import A, Tetrahedron
-from diffsim_ti.runtime import LANES, Bundle, let, traced
+from diffsim_ti.mechanics.stress.tetrahedron import Tetrahedron
+from diffsim_ti.runtime import LANES, A, Bundle, let, traced
 from diffsim_ti.runtime import at as entry
 
 MOST = 6  # numbers of an item that its patch sums up

@@ -4,10 +4,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import number_type, traced, vector_type
+from diffsim_ti.runtime import A, number_type, traced, vector_type
 from diffsim_ti.state.pass_table import between, kicks
-
-A = ti.template()
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,9 @@ from diffsim_ti.materials.calculus.tensor import Tensor, inner, sum_of
 from diffsim_ti.materials.law import Law
 from diffsim_ti.mechanics.stress.items import Block, Single
 from diffsim_ti.mechanics.stress.nodes import Nodes, nodes_of
-from diffsim_ti.runtime import Bundle, assign, let, traced, variable
+from diffsim_ti.runtime import A, Bundle, assign, let, traced, variable
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.pass_table import kicks
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @traced

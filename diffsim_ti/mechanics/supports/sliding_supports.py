@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import vector_type
+from diffsim_ti.runtime import A, vector_type
 
-A = ti.template()  # an array or Bundle handed to a Taichi function
 SLIDING_SUPPORTS = dict(sliding_slot="ints", sliding_supports="vectors")
 
 

@@ -16,9 +16,8 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import put
 from diffsim_ti.mesh.geometry import curve_order
-from diffsim_ti.runtime import LANES, NUMPY, Kernel, kernels_of, number_type, vector_type
+from diffsim_ti.runtime import LANES, NUMPY, A, Kernel, kernels_of, number_type, vector_type
 
-A = ti.template()
 GROUP = LANES  # primitives in a leaf
 SUBTREES = 64  # that a CPU's threads gather up, each by itself; a GPU has so many leaves in each
 MARGIN = 1.01  # of the widening; a hundredth more than the exact distances of the pairs take

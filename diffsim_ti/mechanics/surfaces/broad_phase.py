@@ -18,9 +18,7 @@ from diffsim_ti.mechanics.surfaces.box_tree import BoxTree
 from diffsim_ti.mechanics.surfaces.broad_phase_kernels import Piercing, Search, sort
 from diffsim_ti.mechanics.surfaces.buffers import Buffers, Launches
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, PARALLEL, VERTEX_TRIANGLE
-from diffsim_ti.runtime import Kernel, as_kernel, kernels_of
-
-A = ti.template()
+from diffsim_ti.runtime import A, Kernel, as_kernel, kernels_of
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.box_tree import GROUP, TREE, beyond, overlap, overlapping
 from diffsim_ti.mechanics.surfaces.listed_pair import at_rest, between
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE, Pair
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import A, Kernel
 
-A = ti.template()
 PLACE = dict(rest="vectors", u="vectors2")  # u[slot] holds the displacements
 
 

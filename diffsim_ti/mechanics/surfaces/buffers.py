@@ -9,9 +9,8 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.runtime import Kernel, kernels_of
+from diffsim_ti.runtime import A, Kernel, kernels_of
 
-A = ti.template()
 BLOCK = 256  # numbers that one thread sums
 Parts = list[tuple]  # kernels to launch one after the other: (kernel, records, numbers)
 

@@ -14,10 +14,9 @@ from diffsim_ti.mechanics.surfaces.near_corners import NearCorners
 from diffsim_ti.mechanics.surfaces.obstacle_corners import ObstacleMotion, SurfaceWithObstacles
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.mesh.geometry import edges_of
-from diffsim_ti.runtime import Kernel, as_kernel, kernels_of, vector_type
+from diffsim_ti.runtime import A, Kernel, as_kernel, kernels_of, vector_type
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
-A = ti.template()
 ROWS = dict(start="ints", index="ints", weight="scalars")
 
 

@@ -6,11 +6,10 @@ import taichi as ti
 
 from diffsim_ti.mechanics.surfaces.listed_pair import ListedPair, behind, first_of, three
 from diffsim_ti.mechanics.surfaces.proximity import BY_FIRST, BY_SECOND, EDGE_EDGE, VERTEX_TRIANGLE
-from diffsim_ti.runtime import as_kernel
+from diffsim_ti.runtime import A, as_kernel
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.self_contact import SelfContact
 
-A = ti.template()
 OWN = dict(weights="vectors", pressing="vectors", label="ints", row_of="ints")
 DOT = dict(weights_dot="vectors", pressing_dot="vectors")
 SUMS = dict(numbers="vectors", mu_adj="scalars", sums="vectors", rest_adj="vectors")

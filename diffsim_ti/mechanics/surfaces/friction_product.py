@@ -9,10 +9,9 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.buffers import Parts, put
 from diffsim_ti.mechanics.surfaces.listed_pair import three
-from diffsim_ti.runtime import Kernel, as_kernel, kernels_of, number_type, vector_type
+from diffsim_ti.runtime import A, Kernel, as_kernel, kernels_of, number_type, vector_type
 from diffsim_ti.terms.obstacles.friction import KERNELS, dissipated_in_kernels, slip_in_kernels
 
-A = ti.template()
 SUMS = dict(pairs="ints", weights="vectors", pull="vectors", row="ints", corner_of="ints")
 OWN = SUMS | dict(pressing="vectors", speed="scalars", origin="vectors", turned="ints", stiffness="vectors")
 

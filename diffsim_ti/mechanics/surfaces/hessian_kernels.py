@@ -12,10 +12,9 @@ import taichi as ti
 from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, SAFE, ListedPair, between, three
 from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE
-from diffsim_ti.runtime import Kernel, as_kernel, kernels_of
+from diffsim_ti.runtime import A, Kernel, as_kernel, kernels_of
 from diffsim_ti.terms.obstacles import barrier
 
-A = ti.template()
 MOST_PLANES = 50  # that part a pair on its way
 ACTING = dict(acting="ints", nearest="vectors", inverse="vectors")
 

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE, Pair
-from diffsim_ti.runtime import Kernel, traced
+from diffsim_ti.runtime import A, Kernel, traced
 from diffsim_ti.terms.self_contact import SelfContact
 
-A = ti.template()
 MARGIN = 1.001
 MANY = -1
 SAFE = 0.9  # share of its gap by which a pair may close on the way of one step

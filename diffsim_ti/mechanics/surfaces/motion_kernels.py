@@ -11,9 +11,8 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, between, three
-from diffsim_ti.runtime import Kernel, as_kernel
+from diffsim_ti.runtime import A, Kernel, as_kernel
 
-A = ti.template()
 BLOCK = 256  # vertices whose motion one thread compares
 AT = dict(u="vectors2")
 FOLLOWED = dict(body="ints", marked="ints", flags="ints", slack="vectors", frame="vectors", farthest="scalars")

@@ -10,9 +10,7 @@ import taichi as ti
 
 from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN, OPPOSITE, ListedPair, three
 from diffsim_ti.mechanics.surfaces.proximity import VERTEX_TRIANGLE
-from diffsim_ti.runtime import Kernel, as_kernel
-
-A = ti.template()
+from diffsim_ti.runtime import A, Kernel, as_kernel
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ import taichi as ti
 from diffsim_ti.mechanics.surfaces import host_geometry as host
 from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE, behind, first_of, three
 from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE, Pair
-from diffsim_ti.runtime import Kernel, as_kernel
+from diffsim_ti.runtime import A, Kernel, as_kernel
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.friction import KERNELS, slip_in_kernels
 
-A = ti.template()
 WALL = 1e-3  # share of the width beneath which a second barrier begins
 LONGEST, RESOLVED = 0.2, 0.02  # of the width that near surfaces move in a part; and where it need not be resolved
 HALF = 0.5  # share of a distance by which a resolved part may close it before normals are taken

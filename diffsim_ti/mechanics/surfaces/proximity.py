@@ -20,10 +20,9 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import number_type, vector_type
+from diffsim_ti.runtime import A, number_type, vector_type
 from diffsim_ti.terms.obstacles import barrier
 
-A = ti.template()
 VERTEX_TRIANGLE, EDGE_EDGE = 0, 1
 PARALLEL = 1e-3  # threshold of q, in squared lengths at rest
 ROOM = 1e-3  # of an edge's length or of the reach, that the cheap test of nearness leaves for rounding

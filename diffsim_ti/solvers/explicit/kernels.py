@@ -8,13 +8,12 @@ import taichi as ti
 from diffsim_ti.mechanics.obstacles.outside_work import with_drag
 from diffsim_ti.mechanics.reduced.body_adjoint import BodyStage
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
-from diffsim_ti.runtime import Bundle, Kernel, as_kernel, let, traced
+from diffsim_ti.runtime import A, Bundle, Kernel, as_kernel, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.solvers.explicit.vertex_parts import ItemForces
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, adjoints, needed, with_state
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
-A = ti.template()
 STATE = dict.fromkeys(("u", "v", "f", "frames_u", "frames_v"), "vectors2")
 STATE |= dict(seen="scalars2", stage="vectors2", work="scalars", own_work="scalars")
 RECORDED = {name: STATE[name] for name in ("u", "v", "f", "stage")}  # what the way back reads of it

@@ -20,11 +20,8 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.outside_work import add_work_of_pass, work_of_own_forces
-from diffsim_ti.runtime import let, traced
+from diffsim_ti.runtime import A, let, traced
 from diffsim_ti.solvers.explicit.vertex_parts import VertexParts
-
-A = ti.template()  # an array or Bundle handed to a Taichi function
-
 
 # ---- formulas, of vectors or, component by component, of eight scenes in lanes (batch/free_vertices.py) -------------------
 

@@ -11,12 +11,11 @@ from diffsim_ti.mechanics.obstacles.contact_stage import ContactStage
 from diffsim_ti.mechanics.obstacles.obstacle_stages import ObstacleStages
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.mechanics.supports.sliding_supports import SLIDING_SUPPORTS, SlidingSupports
-from diffsim_ti.runtime import let, number_type, traced, vector_type
+from diffsim_ti.runtime import A, let, number_type, traced, vector_type
 from diffsim_ti.state.bodies import BODIES
 from diffsim_ti.state.features import Features
 
 OF_BODIES = "body_place", "body_mass", "body_numbers", "body_force"  # of which there are changes
-A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,8 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, Kernel
+from diffsim_ti.runtime import PRECISIONS, A, Kernel
 
-A = ti.template()
 ROTATIONS = 18  # the last ones change nothing
 LEAST = 1e-9  # determinant of a block over its largest number, cubed, below which the host inverts it
 

@@ -8,9 +8,8 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.runtime import ROWS, Kernel, kernels_of
+from diffsim_ti.runtime import ROWS, A, Kernel, kernels_of
 
-A = ti.template()
 ROUNDS, NEAR = 8, 1e-7  # of Newton's iteration for rotations, at most; the square of a change that makes it the last
 
 

@@ -15,11 +15,11 @@ from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.mesh.geometry import edges_of
-from diffsim_ti.runtime import assign, at, let, traced, variable
+from diffsim_ti.runtime import A, assign, at, let, traced, variable
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import BOW, Obstacle, ObstacleForce, ObstacleOptions, longest_edge
 from diffsim_ti.terms.obstacles.primitives import Primitives
-from diffsim_ti.terms.obstacles.surface_distance import ENERGY, FORCE, JVP, VJP, A, SurfaceDistance
+from diffsim_ti.terms.obstacles.surface_distance import ENERGY, FORCE, JVP, VJP, SurfaceDistance
 from diffsim_ti.terms.obstacles.surface_mesh import SurfaceMesh
 from diffsim_ti.terms.obstacles.surface_tree import SurfaceTree
 from diffsim_ti.terms.obstacles.turning import rotation_matrix

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import number_type
+from diffsim_ti.runtime import A, number_type
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.surface_tree import FLAT, GROUP, HEADER, NODE
 
-A = ti.template()  # an array handed to a Taichi function
 ENERGY, FORCE, JVP, VJP = range(4)
 
 
