@@ -6,7 +6,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.obstacles.turned import Turned
-from diffsim_ti.runtime import PRECISIONS, A, traced
+from diffsim_ti.runtime import A, number_type, traced, vector_type
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.obstacle_poses import MORE
 
@@ -18,13 +18,7 @@ class ObstacleFunctions:
     features: Features
     precision: str
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
+    fp, vector = number_type, vector_type
 
     @cached_property
     def turned(self) -> Turned:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, A, at, let, traced
+from diffsim_ti.runtime import A, at, let, number_type, traced
 from diffsim_ti.terms.obstacles import turning
 
 
@@ -26,9 +26,7 @@ class Turned:
 
     precision: str
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
+    fp = number_type
 
     @traced
     def short(self, x, begin=0):
