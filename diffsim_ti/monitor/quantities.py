@@ -1,7 +1,6 @@
 """What can be read off a state: energies, stress, volume ratio."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,26 +12,18 @@ from diffsim_ti.inputs import kinetic_energy, ratios_at_corners
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
-from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.stress.patched_tetrahedron import ElementKernels
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.runtime import A, Kernel, as_kernel, assign, kernels_of, traced
 from diffsim_ti.runtime import at as entry
-from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, needed, with_state
 
 FIELDS = dict(energy="scalars", von_mises="scalars", J="scalars")
 
 
 @dataclass(frozen=True)
-class ObserverKernels:
+class ObserverKernels(ElementKernels):
     """What the tetrahedra show at a displacement."""
-
-    law: object
-    features: Features
-
-    @cached_property
-    def element(self):
-        return functions_of(self.law, self.features, False)
 
     @traced
     def observe_points(self, e, scene, at, out):
@@ -81,7 +72,7 @@ class ObserverKernels:
 
 
 def _kernels(arrays) -> ObserverKernels:
-    return kernels_of(ObserverKernels, arrays.law, arrays.features().of_elements())
+    return kernels_of(ObserverKernels, arrays.law, arrays.features().of_elements(), True, False)
 
 
 class Energy(float):

@@ -1,7 +1,6 @@
 """Forces at the states that frames show, with derivatives, for outputs: of loads, and of the body's own stress."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,10 +13,9 @@ from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
 from diffsim_ti.mechanics.host_force import HostForces, Instant
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
-from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.stress.patched_tetrahedron import ElementKernels
 from diffsim_ti.runtime import A, Kernel, as_kernel
 from diffsim_ti.state.arrays import SceneArrays
-from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, Adjoint, Tangent, with_state
 from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.terms import Chamber, Gravity, Growth
@@ -118,16 +116,8 @@ class AppliedLoads:
 
 
 @dataclass(frozen=True)
-class BodyForceKernels:
+class BodyForceKernels(ElementKernels):
     """At the displacement and velocity in slot 0 of `at`."""
-
-    law: object
-    features: Features
-    lanes: bool
-
-    @cached_property
-    def element(self):
-        return functions_of(self.law, self.features, self.lanes)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         own = (
@@ -189,7 +179,7 @@ class BodyForces:
         """The same, of what kernels read."""
         self.arrays.load(derived)
         a = self.arrays
-        self.kernels = runtime.kernels_of(BodyForceKernels, a.law, a.features().of_elements(), a.in_lanes)
+        self.kernels = runtime.kernels_of(BodyForceKernels, a.law, a.features().of_elements(), True, a.in_lanes)
         return derived
 
     def at_frames(self, derived: Derived, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> np.ndarray:

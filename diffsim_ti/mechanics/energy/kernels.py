@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
 from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
-from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.stress.patched_tetrahedron import ElementKernels, functions_of
 from diffsim_ti.runtime import A, Bundle, Kernel, as_kernel, assign, kernels_of, let, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
@@ -18,21 +18,12 @@ NUMBERS = dict(num_items="int", num_tetrahedra="int", num_vertices="int", per_ga
 
 
 @dataclass(frozen=True)
-class PotentialKernels:
+class PotentialKernels(ElementKernels):
     """Energy, forces, products of their derivatives, block diagonal: at displacement `at.u`, in the pass `pass_`."""
-
-    law: object
-    features: Features
-    parallel: bool
-    lanes: bool
 
     @property
     def fp(self):
         return self.law.fp
-
-    @cached_property
-    def element(self):
-        return functions_of(self.law, self.features, self.lanes)
 
     @cached_property
     def single(self):

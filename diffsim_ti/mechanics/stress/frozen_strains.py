@@ -6,7 +6,6 @@ strains of two states do not differ by a rigid turn, so that there is no rate th
 
 import weakref
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import taichi as ti
@@ -19,9 +18,8 @@ from diffsim_ti.materials.calculus.tensor import (
     six,
     six_adjoint,
 )
-from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.stress.patched_tetrahedron import ElementKernels
 from diffsim_ti.runtime import A, Kernel, as_kernel, kernels_of, traced
-from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import OF_TETRAHEDRA, SCENE, TANGENT
 from diffsim_ti.state.stage import Stage
 
@@ -30,17 +28,8 @@ NUMBERS = dict(num_items="int", num_vertices="int", a0="float", a1="float")
 
 
 @dataclass(frozen=True)
-class FrozenStrainKernels:
+class FrozenStrainKernels(ElementKernels):
     """The frozen strains, their change, and their adjoint."""
-
-    law: object
-    features: Features
-    parallel: bool
-    lanes: bool
-
-    @cached_property
-    def element(self):
-        return functions_of(self.law, self.features, self.lanes)
 
     @traced
     def put(self, e, held, q, E):

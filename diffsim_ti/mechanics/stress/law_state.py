@@ -2,17 +2,15 @@
 the frames of a run."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.stress.patched_tetrahedron import ElementKernels
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import A, Bundle, Kernel, as_kernel, traced
 from diffsim_ti.runtime.slots import add_slot, copy_slot
-from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import OF_TETRAHEDRA, SCENE, TANGENT
 
 AT = dict(u="vectors2", z="blocks2")
@@ -20,17 +18,8 @@ NUMBERS = dict(num_items="int", num_vertices="int", slot="int", end="int", h="fl
 
 
 @dataclass(frozen=True)
-class LawStateKernels:
+class LawStateKernels(ElementKernels):
     """From z in slot `slot` and u in slot `end`, over the length h [s]: forward, tangent and adjoint."""
-
-    law: object
-    features: Features
-    parallel: bool
-    lanes: bool
-
-    @cached_property
-    def element(self):
-        return functions_of(self.law, self.features, self.lanes)
 
     @traced
     def onwards(self, plan) -> Onwards:

@@ -11,6 +11,7 @@ F-bar-based linear triangles and tetrahedra for finite strain analysis of nearly
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,8 +22,23 @@ from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mechanics.stress.tetrahedron import Tetrahedron
 from diffsim_ti.runtime import LANES, A, Bundle, let, traced
 from diffsim_ti.runtime import at as entry
+from diffsim_ti.state.features import Features
 
 MOST = 6  # numbers of an item that its patch sums up
+
+
+@dataclass(frozen=True)
+class ElementKernels:
+    """What kernels of elements are compiled for. parallel: loops run on all threads; lanes: items are blocks."""
+
+    law: object
+    features: Features
+    parallel: bool
+    lanes: bool
+
+    @cached_property
+    def element(self) -> Tetrahedron:
+        return functions_of(self.law, self.features, self.lanes)
 
 
 class PatchCoupling:
