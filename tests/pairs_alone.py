@@ -43,7 +43,7 @@ class EvaluateKernel(Pair):
             scale, stiffness, width, zero = at.scale[p], plan.stiffness, plan.width, ti.cast(0, self.fp)
             energy, n, d, g1, g2, g3 = self.gradient(self.kind, w, r, y1, y2, y3, scale, stiffness, width, zero)
             h1, h2, h3, by_stiffness, by_width, _ = self.gradient_jvp(
-                self.kind, w, r, g, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, zero, zero, zero, zero
+                self.kind, w, r, g, (y1, y2, y3), (dy1, dy2, dy3), (scale, stiffness, width, zero), (zero, zero, zero)
             )
             out.numbers[p] = self.vec4(d, energy, by_stiffness, by_width)
             self.write(out.gradient, p, g1, g2, g3)

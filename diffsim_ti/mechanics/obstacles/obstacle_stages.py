@@ -369,19 +369,9 @@ class ObstacleStages(ObstacleFunctions):
                     lighter = -h_over_m * inverse * tangent.mass[i]
                     if ti.static(g.force.per_area):
                         lighter += now.h * inverse * tangent.surface[i]
+                    both, changes = ti.static((v, v_obstacle), (dv, dv_obstacle))
                     dv = g.force.slide_jvp(
-                        scene.parameters,
-                        first,
-                        X,
-                        u,
-                        v,
-                        v_obstacle,
-                        h_over_m,
-                        tangent.parameters,
-                        moved,
-                        dv,
-                        dv_obstacle,
-                        lighter,
+                        scene.parameters, first, X, u, both, h_over_m, tangent.parameters, moved, changes, lighter
                     )
                     v = g.force.slide(scene.parameters, first, X, u, v, v_obstacle, h_over_m)
         return dv

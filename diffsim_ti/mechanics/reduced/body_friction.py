@@ -71,22 +71,10 @@ class BodyFriction(ObstacleStages):
                     v_obstacle = self.v_obstacle(g, k, X, u, now, scene)
                     dv_obstacle = self.obstacle_velocity_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
                     time, dtime = self.time(g, i, now, scene), self.dtime(g, i, now, tangent)
+                    both, changes = ti.static((v, v_obstacle), (dv, dv_obstacle))
+                    numbers, by = ti.static((time, total), (dtime, dtotal))
                     out += grip.impulse_jvp(
-                        g.force,
-                        scene.parameters,
-                        first,
-                        X,
-                        u,
-                        v,
-                        v_obstacle,
-                        time,
-                        total,
-                        tangent.parameters,
-                        moved,
-                        dv,
-                        dv_obstacle,
-                        dtime,
-                        dtotal,
+                        g.force, scene.parameters, first, X, u, both, numbers, tangent.parameters, moved, changes, by
                     )
         return out
 

@@ -94,24 +94,9 @@ class HessianKernels(ListedPair):
             stiffness, width = self.numbers(p, scene)
             scale, radius, none = self.scale_of(kind, p, scene, plan), self.radius_of(p, scene), ti.cast(0, self.fp)
             w, r = self.nearest_of(p, scene, y1, y2, y3)
+            g = three(scene.inverse[p])
             h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp(
-                kind,
-                w,
-                r,
-                three(scene.inverse[p]),
-                y1,
-                y2,
-                y3,
-                dy1,
-                dy2,
-                dy3,
-                scale,
-                stiffness,
-                width,
-                radius,
-                none,
-                none,
-                none,
+                kind, w, r, g, (y1, y2, y3), (dy1, dy2, dy3), (scale, stiffness, width, radius), (none, none, none)
             )
             self.store(p, scene, h1, h2, h3)
 

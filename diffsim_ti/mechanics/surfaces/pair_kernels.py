@@ -122,7 +122,7 @@ class PairKernels(ListedPair):
             radius = self.radius_of(p, scene)
             w, r, g = self.nearest(kind, y1, y2, y3)
             h1, h2, h3, by_stiffness, by_width, by_radius = self.gradient_jvp(
-                kind, w, r, g, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, radius, dk, dw, d_radius
+                kind, w, r, g, (y1, y2, y3), (dy1, dy2, dy3), (scale, stiffness, width, radius), (dk, dw, d_radius)
             )
             by_k, by_W, by_D = self.numbers_vjp(p, scene, by_stiffness, by_width)
             numbers = self.vec4(0 - by_k, 0 - by_W, 0 - by_D, 0 - by_radius)  # the force is minus the gradient

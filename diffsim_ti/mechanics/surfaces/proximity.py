@@ -221,28 +221,14 @@ class Pair:
         return energy, n, d, g1, g2, g3
 
     @ti.func
-    def gradient_jvp(
-        self,
-        kind: A,
-        w,
-        r,
-        g,
-        y1,
-        y2,
-        y3,
-        dy1,
-        dy2,
-        dy3,
-        scale,
-        stiffness,
-        width,
-        radius,
-        d_stiffness,
-        d_width,
-        d_radius,
-    ):
+    def gradient_jvp(self, kind: A, w, r, g, y: A, dy: A, numbers: A, changes: A):
         """(h1, h2, h3, by_stiffness, by_width, by_radius): change of the gradient of corners 1 to 3 (0 balances them) for
-        changes of corners, stiffness, width and radius; and the products of dy with the gradient's derivatives by these."""
+        changes dy of corners y and those of the last of the numbers (scale, stiffness, width, radius); and the products of
+        dy with the gradient's derivatives by these."""
+        y1, y2, y3 = ti.static(y)
+        dy1, dy2, dy3 = ti.static(dy)
+        scale, stiffness, width, radius = ti.static(numbers)
+        d_stiffness, d_width, d_radius = ti.static(changes)
         length = ti.sqrt(r.norm_sqr())
         d = length - radius
         h1, h2, h3 = self.vec3(0), self.vec3(0), self.vec3(0)

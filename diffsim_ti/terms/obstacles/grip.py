@@ -54,13 +54,11 @@ def load_jvp(force, parameters, first, X, u, time, parameters_dot, du, dtime):
 
 
 @traced
-def impulse_jvp(
-    force, parameters, first, X, u, v, v_obstacle, time, total, parameters_dot, du, dv, dv_obstacle, dtime, dtotal
-):
-    """Change of p."""
-    g, p, moved, before, obstacle, numbers, _, out = _record(force, parameters, first, X, u, v, v_obstacle, time, total)
-    dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (obstacle, dv_obstacle))
-    return force.vector_of(g.forward([*zip(numbers, (dtime, dtotal)), *dots], out))
+def impulse_jvp(force, parameters, first, X, u, velocities, numbers, parameters_dot, du, changes, by_numbers):
+    """Change of p; velocities: v and v_obstacle, numbers: time and total, with their changes."""
+    g, p, moved, *both, own, _, out = _record(force, parameters, first, X, u, *velocities, *numbers)
+    dots = all_changes(p, parameters_dot, first, (moved, du), *zip(both, changes))
+    return force.vector_of(g.forward([*zip(own, by_numbers), *dots], out))
 
 
 @traced

@@ -271,14 +271,10 @@ class ObstacleForce(VertexForce):
         )
 
     @traced
-    def slide_jvp(
-        self, parameters, first, X, u, v, v_obstacle, h_over_m, parameters_dot, du, dv, dv_obstacle, dh_over_m
-    ):
-        """Its change."""
-        g, p, moved, before, obstacle, ratio, after = self._record_slide(
-            parameters, first, X, u, v, v_obstacle, h_over_m
-        )
-        dots = all_changes(p, parameters_dot, first, (moved, du), (before, dv), (obstacle, dv_obstacle))
+    def slide_jvp(self, parameters, first, X, u, velocities, h_over_m, parameters_dot, du, changes, dh_over_m):
+        """Its change; velocities: v and v_obstacle, and changes of both."""
+        g, p, moved, *both, ratio, after = self._record_slide(parameters, first, X, u, *velocities, h_over_m)
+        dots = all_changes(p, parameters_dot, first, (moved, du), *zip(both, changes))
         return self.vector_of(g.forward([(ratio, dh_over_m), *dots], after))
 
     @traced
