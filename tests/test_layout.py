@@ -141,9 +141,7 @@ def classes() -> dict[tuple[Path, str], ast.ClassDef]:
 
 OF_BATCHES = "elements of a batch are those of one scene with other places of their numbers"
 DEEP = {  # classes that may stand more than three deep, and why
-    **dict.fromkeys(
-        "TetrahedronOfEight PatchOfScenes PatchOfEight".split(), "elements of a batch read elements of one scene"
-    ),
+    "PatchOfEight": "elements of a batch read elements of one scene",
     "HeldPressure": "of the pressures in chambers those that are found with a volume, told apart by their class",
     "PressedFace": "a curved face stores and sums what a flat one does",
     "JoinedWorkspace": "the scenes of a batch, solved together, are a run of an implicit solver",
