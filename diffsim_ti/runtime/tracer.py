@@ -7,17 +7,19 @@ Taichi copies the value of an assignment, `x = f(y)`, twice, and each argument o
 a kernel were such copies, and the time of Taichi's first pass grows with their number squared. Here an assignment makes one
 variable, or none where its value is one that never changes, such as another function's `let`; and a function takes such an
 argument as it is, unless it changes its parameter. What functions change by reference must be a `variable`. Functions from
-elsewhere, of laws and obstacles that users write, keep Taichi's copies.
+elsewhere, of laws and obstacles that users write, keep Taichi's copies; a scalar product or a norm, which take Taichi eight
+variables, takes two everywhere.
 """
 
 import ast
 import inspect
 import operator
-from functools import lru_cache
+from functools import lru_cache, reduce
 from pathlib import Path
 
+import numpy as np
 from taichi._lib import core
-from taichi.lang import impl, ops
+from taichi.lang import impl, matrix_ops, ops
 from taichi.lang.any_array import AnyArray
 from taichi.lang.ast import ast_transformer
 from taichi.lang.ast.ast_transformer import ASTTransformer, build_stmt
@@ -28,11 +30,11 @@ from taichi.lang.matrix_ops import matmul
 from taichi.types import primitive_types
 from taichi.types.annotations import template
 
-from diffsim_ti.runtime.language import let, made
+from diffsim_ti.runtime.language import at, let, made, traced
 
 _any_node, _any_expr, _any_binary = Builder.__call__, Expr.__init__, ops._binary_operation
 _any_subscript, _any_variable, _any_builtin = impl.subscript, impl.expr_init, ASTTransformer.build_call_if_is_builtin
-_PLAIN, _INTEGERS = (int, float), range(-(2**31), 2**31)
+_PLAIN, _NUMBERS, _INTEGERS = (int, float), (int, float, bool, Expr), range(-(2**31), 2**31)
 _OPERATORS = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -210,6 +212,14 @@ def _subscript(builder, value, *indices, skip_reordered=False):
     return Expr(impl.pytaichi.compiling_callable.ast_builder().expr_subscript(value.ptr, group, _record()))
 
 
+@traced
+def _reduce(values, function):
+    """function(... function(values[0], values[1]) ...), for sums, scalar products and norms."""
+    values, shape = let(values), values.get_shape()
+    first, *others = (at(values, *index) for index in np.ndindex(*shape))
+    return let(reduce(function, others, first))
+
+
 def _variable(value):
     """A new variable."""
     if type(value) is not Expr:
@@ -219,8 +229,8 @@ def _variable(value):
 
 
 def may_share(file: str) -> bool:
-    """Whether functions of a file are written for it: those of this package."""
-    return _PACKAGE in Path(file).resolve().parents
+    """Whether functions of a file are written for it: those of this package, and Taichi's own of vectors and matrices."""
+    return file == matrix_ops.__file__ or _PACKAGE in Path(file).resolve().parents
 
 
 def changed_names(function: ast.FunctionDef) -> set[str]:
@@ -237,6 +247,11 @@ def changed_names(function: ast.FunctionDef) -> set[str]:
             if named.startswith("atomic_"):
                 changed |= {name.id for name in ast.walk(node.args[0]) if isinstance(name, ast.Name)}
     return changed
+
+
+def _never_changes(value) -> bool:
+    """Whether a value is a number, or a variable that nobody changes."""
+    return type(value) in _PLAIN or getattr(value, "is_let", False)
 
 
 def arguments(function, values: tuple, changed: set[str]) -> tuple:
@@ -261,19 +276,31 @@ def _build_assign(context, node: ast.Assign) -> None:
     value, target = node.value.ptr, node.targets[0]
     is_static = isinstance(node.value, ast.Call) and node.value.func.ptr is impl.static
     if not is_static and len(node.targets) == 1 and vars(context).get("changed") is not None:
-        if type(value) is Expr and _is_new(context, target):
-            _store(context, target.id, value, may_share=not isinstance(node.value, ast.Name))
+        if type(value) in _NUMBERS and not isinstance(target, ast.Tuple):
+            _store(context, target, value, may_share=not isinstance(node.value, ast.Name))
             return
-        if type(value) is Expr and not isinstance(target, ast.Tuple):
-            ASTTransformer.build_assign_basic(context, target, value, False)
-            return
-        if _are_new(context, target, value):
-            for name, part in zip(target.elts, value):
-                _store(context, name.id, part, may_share=isinstance(node.value, ast.Call))
+        if _is_unpacked(target, value):
+            _store_all(context, target.elts, value, may_share=isinstance(node.value, ast.Call))
             return
     value = value if is_static else impl.expr_init(value)
     for target in node.targets:
         ASTTransformer.build_assign_unpack(context, target, value, is_static)
+
+
+def _is_unpacked(target, values) -> bool:
+    """Whether `target = values` gives a number each to as many names or places, of which none is named twice."""
+    if not isinstance(target, ast.Tuple) or type(values) not in (tuple, list) or len(values) != len(target.elts):
+        return False
+    names = [name.id for name in target.elts if isinstance(name, ast.Name)]
+    return all(type(v) in _NUMBERS for v in values) and len(set(names)) == len(names)
+
+
+def _store_all(context, targets: list, values, may_share: bool) -> None:
+    """All values are those before the first of them is stored."""
+    if not all(_is_new(context, target) for target in targets):
+        values = [value if _never_changes(value) else let(value) for value in values]
+    for target, value in zip(targets, values):
+        _store(context, target, value, may_share)
 
 
 def _is_new(context, target) -> bool:
@@ -282,23 +309,14 @@ def _is_new(context, target) -> bool:
     )
 
 
-def _are_new(context, target, values) -> bool:
-    """Whether `target = values` gives a number each to as many new names."""
-    if not isinstance(target, ast.Tuple) or type(values) not in (tuple, list) or len(values) != len(target.elts):
-        return False
-    if not all(type(v) is Expr for v in values) or not all(_is_new(context, name) for name in target.elts):
-        return False
-    return len({name.id for name in target.elts}) == len(values)
-
-
-def _store(context, name: str, value: Expr, may_share: bool) -> None:
+def _store(context, target, value, may_share: bool) -> None:
     """A new name for a value; what nobody changes is as good as a `let`, and stands for itself if a function made it."""
-    if name in context.changed:
-        own = impl.expr_init(value)
-    else:
-        own = let(value) if may_share else impl.expr_init(value)
-        own.is_let = True
-    context.create_variable(name, own)
+    if not _is_new(context, target):
+        ASTTransformer.build_assign_basic(context, target, value, False)
+        return
+    own = let(value) if may_share and target.id not in context.changed else impl.expr_init(value)
+    own.is_let = target.id not in context.changed
+    context.create_variable(target.id, own)
 
 
 CHANGES = {  # (owner, name) of a function of Taichi's -> what sources.py puts in its place while a kernel of ours is traced
@@ -311,5 +329,6 @@ CHANGES = {  # (owner, name) of a function of Taichi's -> what sources.py puts i
     (Expr, "__init__"): _expr,
     (ops, "_binary_operation"): _binary,
     (impl, "subscript"): _subscript,
+    (matrix_ops, "_reduce"): _reduce,
     (impl, "expr_init"): _variable,
 }
