@@ -136,7 +136,9 @@ class Inverse:
         label, place, self._bodies = connected_components(graph, directed=False)[1], np.zeros(k, int), []
         sizes = np.bincount(label)
         start = np.concatenate([[0], np.cumsum(sizes[label])])
-        nodes, entries = (np.split(np.argsort(x, kind="stable"), np.cumsum(np.bincount(x))[:-1]) for x in (label, label[rows]))
+        nodes, entries = (
+            np.split(np.argsort(x, kind="stable"), np.cumsum(np.bincount(x))[:-1]) for x in (label, label[rows])
+        )
         for own, mine in zip(nodes, entries):
             place[own] = np.arange(len(own))
             there = start[own][:, None] + np.arange(len(own))

@@ -76,12 +76,12 @@ class Multigrid(Preconditioner):
     price = 40, 50_000
     # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
     usual, strained = (1.5, 3.0), 0.1
-    # vertices from which on coarse levels take contact; what its stiffness over that of a vertex, times those along an edge
-    # of a cube, has to be, for smoothing sees to what is less; the change of its share of the stiffness that they take
-    large, stiff, changed = 1000, 100, 0.25
+    # vertices of all scenes from which on coarse levels take contact; how many times as stiff as a vertex it is then at least,
+    # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take
+    large, stiff, changed = 1000, 100, 0.5
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
-        """run: what has the `following` of a run."""
+        """run: what has the `following` of a run; on one thread a cycle is where threads take scenes."""
         self.potential, self.mass, self.free = potential, mass, free
         self.run = run or SimpleNamespace(following=Following())
         self._ties = getattr(free, "elimination", None)
@@ -89,7 +89,7 @@ class Multigrid(Preconditioner):
         self._follows = (
             potential.z is None and potential.held is None and not potential.hosts and a.values.growths is None
         ) and (a.num_scenes == 1 and not a.law.linear)
-        self.frames = Frames(potential, parallel)
+        self.frames, within = Frames(potential, parallel), parallel and not a.by_scene
         self.frames.allowed = upload_rows(projectors_of(free))
         self._aggregates = None
         with potential.at_rest():
@@ -97,7 +97,7 @@ class Multigrid(Preconditioner):
             matrices, ways = self._levels()
         self.place = None
         self._forget_contact(matrices, ways)
-        self.cycle = Cycle(matrices, ways, self.frames, parallel)
+        self.cycle = Cycle(matrices, ways, self.frames, within)
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
         if self._changes:
             self._make_join(parallel)
@@ -159,12 +159,12 @@ class Multigrid(Preconditioner):
         scenes, n = self.potential.arrays.num_scenes, self.potential.arrays.vertices_of_one
         self._made, self._below, self._contact = (matrices[1:], ways), matrices[1:], np.zeros((scenes, n))
 
-    def _bring_contact_down(self) -> None:
+    def _bring_contact_down(self, met: bool) -> None:
         """The levels below the finest one take contact with obstacles, where it has changed by much or a solve begins."""
         a = self.potential.arrays
-        if not a.contacts or a.vertices_of_one <= self.large or self._ties is not None:
+        if not a.contacts or a.num_vertices <= self.large or self._ties is not None:
             return
-        blocks, known = self.potential.obstacle_blocks(), self._contact.any(1)
+        blocks, known = self.potential.obstacle_blocks(met), self._contact.any(1)
         size, stiffness = (np.abs(np.einsum("kii->k", D)).reshape(a.num_scenes, -1) for D in (blocks, self._diagonal))
         soft = ~(size * a.vertices_of_one ** (1 / 3) > self.stiff * stiffness).any(1)
         size[soft & (self._is_new | ~known)] = 0
@@ -258,19 +258,21 @@ class Multigrid(Preconditioner):
             ([self.frames.part, self._join], self._joined) if self._changes else ([self.frames.part], self.frames.body)
         )
 
-    def follow(self, u: np.ndarray) -> None:
+    def follow(self, u: np.ndarray, met: bool = False) -> None:
         if self._is_poor(u):
             self.run.following = Following(u.copy())
             self._go_to(self.run.following.place)
-        self._bring_contact_down()
+            if self._changes:
+                self.potential.put_contact_blocks()
+        self._bring_contact_down(met)
 
-    def update(self, u: np.ndarray) -> None:
-        """Adapt to the displacement at which the potential is placed."""
-        self.follow(u)
+    def update(self, u: np.ndarray, met: bool = False) -> None:
+        self.follow(u, met)
         self.frames.update()
         if not self._changes:
             return
-        self.potential.put_contact_blocks()
+        if not met or self.potential.hosts:
+            self.potential.put_contact_blocks()
         self._launch(**self._join[2])
         hard = np.flatnonzero(runtime.fetch(self._joined.hard))
         if len(hard):
