@@ -76,7 +76,7 @@ class Multigrid(Preconditioner):
     price = 40, 50_000
     # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
     usual, strained = (1.5, 3.0), 0.1
-    # vertices of all scenes from which on coarse levels take contact; how many times as stiff as a vertex it is then at least,
+    # vertices of all scenes from which on coarse levels take contact; how many times as stiff as a vertex it is at least,
     # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take
     large, stiff, changed = 1000, 100, 0.5
 
