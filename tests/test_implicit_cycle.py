@@ -463,7 +463,7 @@ def test_matrices_of_the_strained_state(monkeypatch):
 
 
 def test_coarse_levels_take_stiff_contact_of_those_scenes_that_have_it():
-    """Of five cubes two are thrown at a rough floor, whose stiffness then is in their inverse; the others keep what they have."""
+    """Of five cubes two are thrown at a rough floor: its stiffness is in their inverse, the others keep what they have."""
     mesh = ds.TetrahedralMesh.create_cube(6, 0.1)
     terms = [ds.Gravity(), ds.Ground(-4e-3, 1e3, 2e-3, friction=0.3)]
     scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, terms, precision="f64")
