@@ -134,8 +134,7 @@ class Inverse:
         k, rows = nodes_of(M), np.repeat(np.arange(nodes_of(M)), np.diff(M.indptr))
         graph = csr_matrix((np.ones(len(rows)), M.indices, M.indptr), shape=(k, k))
         label, place, self._bodies = connected_components(graph, directed=False)[1], np.zeros(k, int), []
-        sizes = np.bincount(label)
-        start = np.concatenate([[0], np.cumsum(sizes[label])])
+        start = np.concatenate([[0], np.cumsum(np.bincount(label)[label])])
         nodes, entries = (
             np.split(np.argsort(x, kind="stable"), np.cumsum(np.bincount(x))[:-1]) for x in (label, label[rows])
         )
@@ -143,28 +142,26 @@ class Inverse:
             place[own] = np.arange(len(own))
             there = start[own][:, None] + np.arange(len(own))
             self._bodies.append((own, mine, place[rows[mine]], place[M.indices[mine]], there))
-        column = np.concatenate([nodes[body] for body in label]) if k else []
+        column = np.concatenate([nodes[body] for body in label])
         self._rows = np.zeros((start[-1], M.blocksize[0], ROWS[M.blocksize[0]].n), np.float32)
         self.start, self.column = runtime.upload(start, ti.i32), runtime.upload(column, ti.i32)
         self.values = runtime.array(ROWS[M.blocksize[0]], self._rows[..., 0].size)
         self.data, self.shape, self.blocksize = self._rows, M.shape, M.blocksize  # as of a matrix
         self.put(M)
 
-    def put(self, M, anew=None) -> None:
-        """anew: of which nodes numbers are others; None: of all."""
+    def put(self, M, anew=(True,)) -> None:
+        """anew: of which of so many scenes numbers are others."""
         b = M.blocksize[0]
         for own, mine, row, column, there in self._bodies:
-            if anew is not None and not anew[own[0]]:
+            if not anew[own[0] * len(anew) // nodes_of(M)]:
                 continue
             dense = np.zeros((len(own), b, len(own), b))
             dense[row, :, column] = M.data[mine]
             dense = dense.reshape(b * len(own), -1)
-            moves = np.flatnonzero(np.diagonal(dense))
-            if len(moves) == len(dense):
-                inverse = positive_inverse(dense)
-            else:
-                inverse, at = np.zeros_like(dense), np.ix_(moves, moves)
-                inverse[at] = positive_inverse(dense[at])
+            still = np.flatnonzero(np.diagonal(dense) == 0)
+            dense[still, still] = dense.max() or 1.0
+            inverse = positive_inverse(dense)
+            inverse[still, still] = 0.0
             self._rows[there, :, :b] = inverse.reshape(len(own), b, len(own), b).transpose(2, 0, 1, 3)  # symmetric
         runtime.fill(self.values, self._rows.reshape(-1, self._rows.shape[2]))
 
@@ -220,14 +217,12 @@ class Cycle:
         self.put_below(matrices[1:])
         return True
 
-    def put_below(self, matrices: list, anew=None) -> None:
-        """Set the numbers of the levels below the finest one, if there are any, and of the inverse; anew: of which scenes
-        these are others, None: of all."""
+    def put_below(self, matrices: list, anew=(True,)) -> None:
+        """Set the numbers of the levels below the finest one, if there are any, and of the inverse; anew: as of that."""
         for level, M in zip(self.levels[1:-1], matrices):
             level.put_numbers(M)
         if matrices:
-            nodes = None if anew is None else np.repeat(anew, nodes_of(matrices[-1]) // len(anew))
-            self._inverse.put(matrices[-1], nodes)
+            self._inverse.put(matrices[-1], anew)
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""
