@@ -78,7 +78,7 @@ class Multigrid(Preconditioner):
     usual, strained = (1.5, 3.0), 0.1
     # vertices of all scenes from which on coarse levels take contact; how many times as stiff as a vertex it is at least,
     # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take
-    large, stiff, changed = 1000, 100, 0.5
+    large, stiff, changed = 1000, 50, 0.5
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
         """run: what has the `following` of a run; on one thread a cycle is where threads take scenes."""
