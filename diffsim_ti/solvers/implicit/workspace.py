@@ -61,7 +61,14 @@ class TwoStepHistory(History):
             copy_slot(source.v, s, target.before.v, to)
 
 
-BODY = "coefficients", "mass", "parameters", "rest", "gradients", "volumes", "element_masses"
+GIVEN = (
+    "displacement",
+    "velocity",
+    "forces",
+    "motion",
+    "path",
+    "growths",
+)  # other numbers of these leave a body what it is
 
 
 class ImplicitWorkspace(PrescribedInPasses):
@@ -85,16 +92,17 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.overlaps = {}  # where equilibria are looked for from, as bytes: what was found there
         if self._has_bodies_of(derived) and not self.arrays.load(derived):  # a control loop
             self.restart()
-            self.check_apart()
         else:
             self.load_bodies(derived)
+        self.approach, self.closing = Approach(self), Closing(self)
+        self.check_apart()
 
     def _has_bodies_of(self, values) -> bool:
         """Whether only states and what is given by steps are other than those that are loaded."""
-        if not self.potential or self.pairs or self.joints or self.volumes or self.strains or self.scene.reduced:
+        if not self.potential or self.pairs or self.joints or self.volumes or self.scene.reduced:
             return False
-        known = self.arrays.values
-        return values.growths is None and all(np.array_equal(getattr(known, x), getattr(values, x)) for x in BODY)
+        known = self.arrays.values.parts()
+        return all(name in GIVEN or np.array_equal(x, known[name]) for name, x in values.parts().items())
 
     def load_bodies(self, derived) -> None:
         """All of `load`."""
@@ -133,8 +141,6 @@ class ImplicitWorkspace(PrescribedInPasses):
         finders, more = (self.collisions.past, self.preconditioner), (others, self.volumes)
         self.newton = self.newton_kind(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
         self.newton.detection = self.collisions.detection
-        self.approach, self.closing = Approach(self), Closing(self)
-        self.check_apart()
 
     @property
     def mass(self) -> Mass:
