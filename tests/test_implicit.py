@@ -430,6 +430,23 @@ def test_elimination_knows_which_matrices_have_an_eigenvalue_below_a_bound():
         np.testing.assert_array_equal(given, C[:count])
 
 
+def test_runs_from_other_starts_keep_the_bodies_that_are_loaded():
+    """A loop of one step each makes no preconditioner anew, and finds the bits of a run that knows of none before it."""
+    scene = ds.Scene(
+        cube(4), ds.StableNeoHookean(E, 0.3), RHO, [ds.Gravity(), ds.Ground(-0.02, 1e5, 0.01, friction=0.3)]
+    )
+    loop, fresh = (ds.Rollout(ds.ImplicitEulerSolver(scene, dt=0.02), 1) for _ in range(2))
+    start, known = {}, []
+    for _ in range(4):
+        frames = loop.forward(**start)
+        fresh.sweep.workspace = None
+        np.testing.assert_array_equal(frames.positions, fresh.forward(**start).positions)
+        start = dict(initial_positions=frames.positions[-1], initial_velocities=frames.velocities[-1])
+        known.append(loop.sweep.workspace.preconditioner)
+    assert all(x is known[0] for x in known)
+    assert loop.forward(**start, youngs_modulus=2 * E) and loop.sweep.workspace.preconditioner is not known[0]
+
+
 def test_steps_by_a_simulator_are_those_of_a_rollout():
     """Also for BDF2, which looks back one step, and again after a reset."""
     scene = oscillator()

@@ -462,6 +462,27 @@ def test_matrices_of_the_strained_state(monkeypatch):
         other.resume(state | dict(preconditioner=np.zeros(3)))
 
 
+def test_coarse_levels_take_stiff_contact_of_those_scenes_that_have_it():
+    """Of five cubes two are thrown at a rough floor: its stiffness is in their inverse, the others keep what they have."""
+    mesh = ds.TetrahedralMesh.create_cube(6, 0.1)
+    terms = [ds.Gravity(), ds.Ground(-4e-3, 1e3, 2e-3, friction=0.3)]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, terms, precision="f64")
+    batch, n = ds.Batch(ds.ImplicitEulerSolver(scene, dt=5e-3), 1, 5), mesh.num_vertices
+    thrown = np.array([False, True, False, False, True])
+    batch.forward(
+        initial_velocities=np.where(thrown[:, None, None], [0.5, -1.0, 0], [0.5, 0.1, 0]) * np.ones((5, n, 3))
+    )
+    own = batch.sweep.workspace.newton.preconditioner
+    inverse, before, k = own.cycle._inverse, own._made[0][-1].toarray(), own.cycle.levels[-1].nodes // 5
+    start, column, rows = (runtime.fetch(x) for x in (inverse.start, inverse.column, inverse.values))
+    found = np.zeros((5 * k, 6, 5 * k, 6))
+    found[np.repeat(np.arange(5 * k), np.diff(start)), :, column] = rows.reshape(-1, 6, 8)[..., :6].swapaxes(1, 2)
+    found, M = found.reshape(30 * k, -1), own._below[-1].toarray()
+    np.testing.assert_allclose(found, np.linalg.inv(M), atol=1e-6 * np.abs(found).max())
+    changed = np.abs(M - before).reshape(5, 6 * k, -1).max((1, 2)) > 0.1 * np.abs(before).max()
+    assert list(changed) == list(thrown)
+
+
 def test_contact_joins_the_finest_level_turned_back_without_what_is_negative():
     """Blocks of full rank, of rank one, none; an axis that is held; a block that only the host can invert."""
     rng, n = np.random.default_rng(0), 60

@@ -249,7 +249,6 @@ class JoinedPreconditioners(Preconditioners):
     """As those of one scene, whose linear systems are solved together."""
 
     def make(self, kind, how, mass):
-        ws = self.ws
-        made = kind(ws.potential, mass, ws.free, how, ws.parallel and not ws.arrays.by_scene)
+        made = super().make(kind, how, mass)
         made.solver = JoinedCG(made.potential, getattr(made, "cycle", None), made.free, self.ws.parallel)
         return made

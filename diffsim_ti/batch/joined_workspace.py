@@ -17,8 +17,6 @@ from diffsim_ti.solvers.implicit.adjoint import ImplicitAdjoint
 from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
 from diffsim_ti.state.watch import limits
 
-BODY = "coefficients", "mass", "parameters", "rest", "gradients", "volumes", "element_masses"
-
 
 class JoinedWorkspace(ImplicitWorkspace):
     """left: (scenes,), those that are to be run alone, for they left the usual course of a solve (joined_newton.py)."""
@@ -32,18 +30,12 @@ class JoinedWorkspace(ImplicitWorkspace):
         self.energy_watch = None
 
     def load(self, each: list[Derived]) -> None:
-        self.each, values = each, joined_derived(each)
-        if self.potential and self._same_bodies(values) and not self.arrays.load(values):  # a control loop
-            self.restart()
-            self.check_apart()
-            return
-        self.hosts = joined_hosts(self.scene.one, self.num_scenes)
-        super().load(values)
+        self.each = each
+        super().load(joined_derived(each))
 
-    def _same_bodies(self, values: Derived) -> bool:
-        """Whether only states and what is given by steps are other than those that are loaded."""
-        known = self.arrays.values
-        return all(np.array_equal(getattr(known, name), getattr(values, name)) for name in BODY)
+    def load_bodies(self, derived: Derived) -> None:
+        self.hosts = joined_hosts(self.scene.one, self.num_scenes)
+        super().load_bodies(derived)
 
     def restart(self) -> None:
         self.left[:] = False

@@ -70,7 +70,7 @@ def x_minus_log1p(x: Number) -> Number:
 @ti.func
 def x_minus_log1p_value(x, fp: ti.template()):
     """x - log(1 + x) with all its digits: plain subtraction loses the leading x^2 / 2, and Taichi has no log1p."""
-    y = x - ti.log(1 + x)
+    y = 0 * x
     if ti.abs(x) * 5 < 1:
         # log(1 + x) = 2 artanh(z) = 2 z (1 + w/3 + w^2/5 + ...); eight terms leave 1e-17 at |x| = 1/5
         z = x / (2 + x)
@@ -79,6 +79,8 @@ def x_minus_log1p_value(x, fp: ti.template()):
         for k in ti.static(range(8)):
             series = ti.cast(1 / (17 - 2 * k), fp) + w * series
         y = z * (x - 2 * w * series)
+    else:
+        y = x - ti.log(1 + x)
     return y
 
 

@@ -70,7 +70,7 @@ class SceneArrays:
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
         self.rows: dict[str, np.ndarray | None] = {}  # numbers as the device has them, of steps too
 
-    num_scenes = 1  # whose bodies are pieces of the mesh (batch/joined_scene.py)
+    num_scenes, by_scene = 1, False  # whose bodies are pieces of the mesh (batch/joined_scene.py)
 
     @property
     def vertices_of_one(self) -> int:

@@ -7,6 +7,7 @@ the sum of squared final positions, the gradients are by both Lame parameters of
     python examples/benchmarks/speed.py --common [--json] [--sizes 6 11 21] [--precision f32] [--repeats 20]
     python examples/benchmarks/speed.py --growth          # cost per tetrahedron from 6 000 to 1 000 000 tetrahedra
     python examples/benchmarks/speed.py --batch [--json] [--batches 6x64 11x16]    # many scenes at once, against one
+    python examples/benchmarks/speed.py --batch --implicit --precision f64         # the same in steps of backward Euler
 """
 
 import argparse
@@ -93,9 +94,24 @@ def batch_work(resolution: int, scenes: int, precision: str, contact: bool) -> t
     return ds.Batch(one.solver, BATCH_STEPS, scenes, gradients=rollout.wanted), rollout, values
 
 
-def measure_batch(resolution: int, scenes: int, precision: str, contact: bool, repeats: int) -> dict:
+def implicit_work(resolution: int, scenes: int, precision: str, contact: bool) -> tuple:
+    """As `batch_work`: soft cubes of 0.1 m in steps of 5 ms, free or thrown at a rough floor."""
+    mesh, terms = ds.TetrahedralMesh.create_cube(resolution, 0.1), [ds.Gravity(-9.8)]
+    terms += [ds.Ground(-1e-3, 1e3, 2e-3, friction=0.3)] if contact else []
+    start = np.tile([0.5, -0.2, 0.1], (mesh.num_vertices, 1))
+    material = ds.StableNeoHookean(5e4, 0.3)
+    scene = ds.Scene(mesh, material, 1000.0, terms, initial_velocities=start, precision=precision)
+    solver, wanted = ds.ImplicitEulerSolver(scene, dt=5e-3), ["youngs_modulus"]
+    values = {"youngs_modulus": np.random.default_rng(0).uniform(4e4, 6e4, scenes)}
+    batch = ds.Batch(solver, BATCH_STEPS, scenes, save_every=BATCH_STEPS, gradients=wanted)
+    return batch, ds.Rollout(solver, BATCH_STEPS, save_every=BATCH_STEPS, gradients=wanted), values
+
+
+def measure_batch(
+    resolution: int, scenes: int, precision: str, contact: bool, repeats: int, work_of=batch_work, substeps=SUBSTEPS
+) -> dict:
     """Nanoseconds per tetrahedron, substep and scene of a batch and of one of its scenes, runs back to back."""
-    batch, rollout, values = batch_work(resolution, scenes, precision, contact)
+    batch, rollout, values = work_of(resolution, scenes, precision, contact)
     own = {name: x[0] for name, x in values.items()}
     seeds = np.zeros((scenes, 2, batch.scene.mesh.num_vertices, 3))
     seeds[:, -1] = 1.0
@@ -107,7 +123,7 @@ def measure_batch(resolution: int, scenes: int, precision: str, contact: bool, r
     for _ in range(repeats + 1):  # the first round compiles
         for name, (*calls, count) in work.items():
             best[name] = [min(b, best_seconds(call, 1) / count) for b, call in zip(best[name], calls)]
-    scale = 1e9 / (SUBSTEPS * BATCH_STEPS * batch.scene.mesh.num_tetrahedra)
+    scale = 1e9 / (substeps * BATCH_STEPS * batch.scene.mesh.num_tetrahedra)
     row = {"tets": batch.scene.mesh.num_tetrahedra, "scenes": scenes, "contact": contact, "precision": precision}
     for k, what in enumerate(("forward", "forward_backward")):
         row |= {f"{what}_ns": round(best["batch"][k] * scale, 2), f"{what}_alone_ns": round(best["one"][k] * scale, 2)}
@@ -120,6 +136,7 @@ def main() -> None:
     parser.add_argument("--common", action="store_true", help="the common work (default)")
     parser.add_argument("--growth", action="store_true", help="6 000 to 1 000 000 tetrahedra")
     parser.add_argument("--batch", action="store_true", help="many scenes at once, against one")
+    parser.add_argument("--implicit", action="store_true", help="in steps of backward Euler")
     parser.add_argument("--batches", nargs="+", default=["6x64", "11x16", "6x8"], help="vertices a side x scenes")
     parser.add_argument("--json", action="store_true", help="one JSON line per size")
     parser.add_argument("--sizes", type=int, nargs="+", default=[6, 11, 21], help="vertices a side")
@@ -132,7 +149,8 @@ def main() -> None:
         for size in options.batches:
             for contact in (False, True):
                 resolution, scenes = map(int, size.split("x"))
-                row = measure_batch(resolution, scenes, options.precision, contact, max(2, options.repeats // 4))
+                how = (implicit_work, 1) if options.implicit else (batch_work, SUBSTEPS)
+                row = measure_batch(resolution, scenes, options.precision, contact, max(2, options.repeats // 4), *how)
                 print(json.dumps(row) if options.json else "  ".join(f"{k} {x}" for k, x in row.items()), flush=True)
         return
     sizes = [11, 21, 31, 45, 56] if options.growth else options.sizes

@@ -317,7 +317,8 @@ class Potential:
         if self.pairs:
             self.pairs.launch(self.pairs.adding_blocks(self.u, self.barriers.blocks))
 
-    def obstacle_blocks(self) -> np.ndarray:
-        """The part of obstacles at vertices in `blocks`."""
-        self.launch("contact_blocks", lanes=False, out=self.barriers)
+    def obstacle_blocks(self, met: bool = False) -> np.ndarray:
+        """The part of obstacles at vertices in `blocks`; met: whether `put_contact_blocks` was called here."""
+        if not met or self.pairs or self.hosts:
+            self.launch("contact_blocks", lanes=False, out=self.barriers)
         return np.swapaxes(runtime.fetch(self.barriers.blocks).astype(np.float64), 0, 1)

@@ -113,41 +113,57 @@ def positive_inverse(A: np.ndarray) -> np.ndarray:
     raised to a millionth of the largest, which float32 resolves."""
     from scipy.linalg.lapack import dpotrf, dpotri
 
-    factor, fails = dpotrf(A, lower=1)
+    factor, fails = dpotrf(A.T, lower=1)
     if not fails:
-        lower = np.tril(dpotri(factor, lower=1)[0])
-        inverse = lower + np.tril(lower, -1).T
+        half = dpotri(factor, lower=1, overwrite_c=1)[0]
+        half[np.diag_indices_from(half)] *= 0.5
+        inverse = half.T + half
         if np.abs(A).sum(0).max() * np.abs(inverse).sum(0).max() < 1e10:  # which is at least its condition
             return inverse
     values, vectors = np.linalg.eigh(A)
     return (vectors / np.maximum(np.abs(values), 1e-6 * np.abs(values).max())) @ vectors.T
 
 
-def inverse_matrix(M):
-    """The inverse of a matrix of blocks, body by body, as one; motions that a block has not stay zero."""
-    from scipy.sparse import bsr_matrix
-    from scipy.sparse.csgraph import connected_components
+class Inverse:
+    """The inverse of a matrix of blocks, body by body, as one on the device; motions that a block has not stay zero."""
 
-    k, b = nodes_of(M), M.blocksize[0]
-    graph = bsr_matrix((np.ones((len(M.indices), 1, 1)), M.indices, M.indptr), shape=(k, k)).tocsr()
-    count, label = connected_components(graph, directed=False)
-    at, place, rows, columns, data = np.repeat(np.arange(k), np.diff(M.indptr)), np.zeros(k, int), [], [], []
-    for own in np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1]) if count else []:
-        place[own] = np.arange(len(own))
-        mine = label[at] == label[own[0]]
-        dense = np.zeros((len(own), len(own), b, b))
-        dense[place[at[mine]], place[M.indices[mine]]] = M.data[mine]
-        dense = dense.swapaxes(1, 2).reshape(b * len(own), -1)
-        there = np.ix_(*2 * (np.abs(np.diagonal(dense)) > 0,))
-        inverse = np.zeros_like(dense)
-        inverse[there] = positive_inverse(dense[there])
-        rows.append(np.repeat(own, len(own)))
-        columns.append(np.tile(own, len(own)))
-        data.append(inverse.reshape(len(own), b, len(own), b).transpose(0, 2, 1, 3).reshape(-1, b, b))
-    rows, columns, data = (np.concatenate(parts) for parts in (rows, columns, data))
-    order = np.argsort(rows, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=k))])
-    return bsr_matrix((data[order], columns[order], start), shape=(k * b, k * b))
+    def __init__(self, M):
+        from scipy.sparse import csr_matrix
+        from scipy.sparse.csgraph import connected_components
+
+        k, rows = nodes_of(M), np.repeat(np.arange(nodes_of(M)), np.diff(M.indptr))
+        graph = csr_matrix((np.ones(len(rows)), M.indices, M.indptr), shape=(k, k))
+        label, place, self._bodies = connected_components(graph, directed=False)[1], np.zeros(k, int), []
+        start = np.concatenate([[0], np.cumsum(np.bincount(label)[label])])
+        nodes, entries = (
+            np.split(np.argsort(x, kind="stable"), np.cumsum(np.bincount(x))[:-1]) for x in (label, label[rows])
+        )
+        for own, mine in zip(nodes, entries):
+            place[own] = np.arange(len(own))
+            there = start[own][:, None] + np.arange(len(own))
+            self._bodies.append((own, mine, place[rows[mine]], place[M.indices[mine]], there))
+        column = np.concatenate([nodes[body] for body in label])
+        self._rows = np.zeros((start[-1], M.blocksize[0], ROWS[M.blocksize[0]].n), np.float32)
+        self.start, self.column = runtime.upload(start, ti.i32), runtime.upload(column, ti.i32)
+        self.values = runtime.array(ROWS[M.blocksize[0]], self._rows[..., 0].size)
+        self.data, self.shape, self.blocksize = self._rows, M.shape, M.blocksize  # as of a matrix
+        self.put(M)
+
+    def put(self, M, anew=(True,)) -> None:
+        """anew: of which of so many scenes numbers are others."""
+        b = M.blocksize[0]
+        for own, mine, row, column, there in self._bodies:
+            if not anew[own[0] * len(anew) // nodes_of(M)]:
+                continue
+            dense = np.zeros((len(own), b, len(own), b))
+            dense[row, :, column] = M.data[mine]
+            dense = dense.reshape(b * len(own), -1)
+            still = np.flatnonzero(np.diagonal(dense) == 0)
+            dense[still, still] = dense.max() or 1.0
+            inverse = positive_inverse(dense)
+            inverse[still, still] = 0.0
+            self._rows[there, :, :b] = inverse.reshape(len(own), b, len(own), b).transpose(2, 0, 1, 3)  # symmetric
+        runtime.fill(self.values, self._rows.reshape(-1, self._rows.shape[2]))
 
 
 class Cycle:
@@ -167,8 +183,8 @@ class Cycle:
         self._entries = [len(M.data) for M in (*matrices, *ways)]
         self._down, self._up = [], []  # (kernel, records, numbers)
         downs = [P.T.tobsr(P.blocksize[::-1]) for P in ways]
-        last, inverse = self.levels[-1], inverse_matrix(matrices[-1])
-        within = [level.threads for level in self.levels[:-1]] + [threads_of(inverse)]
+        last, self._inverse = self.levels[-1], Inverse(matrices[-1])
+        within = [level.threads for level in self.levels[:-1]] + [threads_of(self._inverse)]
         for level, threads, above in zip(self.levels, within, [1, *map(threads_of, downs)]):
             if max(threads, above) > 1:
                 level.part = runtime.array(ROWS[level.numbers], level.nodes * max(threads, above))
@@ -180,7 +196,6 @@ class Cycle:
             more = dict(below=below.nodes, shares_below=threads[1] * below.nodes)
             self._down.append((kernels.down, between, own | more))
             self._up.insert(0, (kernels.up, between, own))
-        self._inverse = block_matrix(inverse)
         kernels = kernels_of(LevelKernels, last.numbers, "f32", last.parallel, within[-1])
         numbers = dict(nodes=last.nodes, shares=within[-1] * last.nodes)
         self._solve = kernels.solve, dict(level=last, inverse=self._inverse), numbers
@@ -202,12 +217,12 @@ class Cycle:
         self.put_below(matrices[1:])
         return True
 
-    def put_below(self, matrices: list) -> None:
-        """Set the numbers of the levels below the finest one, if there are any, and of the inverse."""
+    def put_below(self, matrices: list, anew=(True,)) -> None:
+        """Set the numbers of the levels below the finest one, if there are any, and of the inverse; anew: as of that."""
         for level, M in zip(self.levels[1:-1], matrices):
             level.put_numbers(M)
         if matrices:
-            runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
+            self._inverse.put(matrices[-1], anew)
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""

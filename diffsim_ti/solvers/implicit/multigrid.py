@@ -76,11 +76,12 @@ class Multigrid(Preconditioner):
     price = 40, 50_000
     # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
     usual, strained = (1.5, 3.0), 0.1
-    # vertices from which on coarse levels take contact, and the change of its share of the stiffness there that they take
-    large, changed = 1000, 0.25
+    # vertices of all scenes from which on coarse levels take contact; how many times as stiff as a vertex it is at least,
+    # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take
+    large, stiff, changed = 1000, 50, 0.5
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
-        """run: what has the `following` of a run."""
+        """run: what has the `following` of a run; on one thread a cycle is where threads take scenes."""
         self.potential, self.mass, self.free = potential, mass, free
         self.run = run or SimpleNamespace(following=Following())
         self._ties = getattr(free, "elimination", None)
@@ -88,15 +89,15 @@ class Multigrid(Preconditioner):
         self._follows = (
             potential.z is None and potential.held is None and not potential.hosts and a.values.growths is None
         ) and (a.num_scenes == 1 and not a.law.linear)
-        self.frames = Frames(potential, parallel)
+        self.frames, within = Frames(potential, parallel), parallel and not a.by_scene
         self.frames.allowed = upload_rows(projectors_of(free))
         self._aggregates = None
         with potential.at_rest():
             self.frames.update()
             matrices, ways = self._levels()
         self.place = None
-        self._made, self._contact = (matrices[1:], ways), None
-        self.cycle = Cycle(matrices, ways, self.frames, parallel)
+        self._forget_contact(matrices, ways)
+        self.cycle = Cycle(matrices, ways, self.frames, within)
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
         if self._changes:
             self._make_join(parallel)
@@ -120,7 +121,7 @@ class Multigrid(Preconditioner):
 
     def begin(self) -> None:
         super().begin()
-        self._is_new = True
+        self._is_new = np.ones(self.potential.arrays.num_scenes, bool)
         place = self.run.following.place if self._follows else None
         if self.place is not place:
             self._go_to(place)
@@ -150,36 +151,48 @@ class Multigrid(Preconditioner):
         self.potential.place(u)
 
     def _put(self, matrices: list, ways: list) -> bool:
-        self._made, self._contact = (matrices[1:], ways), None
+        self._forget_contact(matrices, ways)
         return self.cycle.put(matrices, ways)
 
-    def _bring_contact_down(self) -> None:
+    def _forget_contact(self, matrices: list, ways: list) -> None:
+        """Levels below the finest one have none."""
+        scenes, n = self.potential.arrays.num_scenes, self.potential.arrays.vertices_of_one
+        self._made, self._below, self._contact = (matrices[1:], ways), matrices[1:], np.zeros((scenes, n))
+
+    def _bring_contact_down(self, met: bool) -> None:
         """The levels below the finest one take contact with obstacles, where it has changed by much or a solve begins."""
         a = self.potential.arrays
-        if not a.contacts or a.vertices_of_one <= self.large or self._ties is not None:
+        if not a.contacts or a.num_vertices <= self.large or self._ties is not None:
             return
-        blocks, stiffness = self.potential.obstacle_blocks(), np.abs(np.einsum("kii->k", self._diagonal))
-        size = np.abs(np.einsum("kii->k", blocks))
-        share, before = size / (size + stiffness + 1e-300), 0.0 if self._contact is None else self._contact
-        few = np.abs(share - before).sum() <= self.changed * np.maximum(share, before).sum()
+        blocks, known = self.potential.obstacle_blocks(met), self._contact.any(1)
+        size, stiffness = (np.abs(np.einsum("kii->k", D)).reshape(a.num_scenes, -1) for D in (blocks, self._diagonal))
+        soft = ~(size * a.vertices_of_one ** (1 / 3) > self.stiff * stiffness).any(1)
+        size[soft & (self._is_new | ~known)] = 0
+        share = size / (size + stiffness + 1e-300)
+        change, most = np.abs(share - self._contact), np.maximum(share, self._contact)
+        anew = change.sum(1) > self.changed * most.sum(1)
+        anew |= self._is_new & (size.any(1) | known)
         if self.potential.pairs:
             self.potential.put_contact_blocks()
-        if few and not (self._is_new and (size.any() or self._contact is not None)):
+        if not anew.any():
             return
         from scipy.sparse import bsr_matrix
 
-        self._is_new, self._contact = False, share if size.any() else None
+        self._is_new, self._contact[anew] = self._is_new & ~anew, share[anew]
         self.frames.update()
-        at, (matrices, ways) = np.flatnonzero(size), self._made
+        at, (matrices, ways), scenes = np.flatnonzero(size * anew[:, None]), self._made, a.num_scenes
         turns = projectors_of(self.free)[at] @ self.frames.matrices()[at]
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-        start = np.searchsorted(at, np.arange(len(size) + 1))
-        more, levels = bsr_matrix((roots @ np.swapaxes(roots, 1, 2), at, start), shape=2 * (3 * len(size),)), []
-        for M, P in zip(matrices, ways):
+        start = np.searchsorted(at, np.arange(size.size + 1))
+        more, levels = bsr_matrix((roots @ np.swapaxes(roots, 1, 2), at, start), shape=2 * (3 * size.size,)), []
+        for M, P, before in zip(matrices, ways, self._below):
             more = (P.T @ (more @ P)).tobsr(M.blocksize)
             levels.append(with_blocks(M, more))
-        self.cycle.put_below(levels)
+            stay = ~np.repeat(anew, len(M.data) // scenes)
+            levels[-1].data[stay] = before.data[stay]
+        self._below = levels
+        self.cycle.put_below(levels, anew)
 
     def _levels(self, more=()) -> tuple[list, list]:
         """(matrices of all levels, ways from each to the one before) where the potential stands, turned back by frames."""
@@ -245,19 +258,21 @@ class Multigrid(Preconditioner):
             ([self.frames.part, self._join], self._joined) if self._changes else ([self.frames.part], self.frames.body)
         )
 
-    def follow(self, u: np.ndarray) -> None:
+    def follow(self, u: np.ndarray, met: bool = False) -> None:
         if self._is_poor(u):
             self.run.following = Following(u.copy())
             self._go_to(self.run.following.place)
-        self._bring_contact_down()
+            if self._changes:
+                self.potential.put_contact_blocks()
+        self._bring_contact_down(met)
 
-    def update(self, u: np.ndarray) -> None:
-        """Adapt to the displacement at which the potential is placed."""
-        self.follow(u)
+    def update(self, u: np.ndarray, met: bool = False) -> None:
+        self.follow(u, met)
         self.frames.update()
         if not self._changes:
             return
-        self.potential.put_contact_blocks()
+        if not met or self.potential.hosts:
+            self.potential.put_contact_blocks()
         self._launch(**self._join[2])
         hard = np.flatnonzero(runtime.fetch(self._joined.hard))
         if len(hard):

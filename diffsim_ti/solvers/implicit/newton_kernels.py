@@ -320,9 +320,11 @@ class NewtonKernels:
             if self.is_tried(b, cg):
                 self.decide(b, cg, plan)
         ti.loop_config(serialize=not self.parallel)
-        for k in range(plan.points):
-            if cg.state[self.cg.system(k, plan.points, plan), ACCEPTED] == 1:
-                newton.J[k] = at.J[k]
+        for c in range(plan.chunks):
+            if cg.state[self.cg.system(c, plan.chunks, plan), ACCEPTED] == 1:
+                first, last = self.cg.span(c, plan.points_length, plan.points, plan)
+                for k in range(first, last):
+                    newton.J[k] = at.J[k]
 
     @cached_property
     def choose(self) -> Kernel:

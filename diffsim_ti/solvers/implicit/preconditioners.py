@@ -35,8 +35,11 @@ class Preconditioner:
     def learn(self, residual: float, iterations: int) -> None:
         """What a linear solve took, to a relative residual."""
 
-    def follow(self, u: np.ndarray) -> None:
+    def follow(self, u: np.ndarray, met: bool = False) -> None:
         """What `update` makes anew now and then, before what it does each time."""
+
+    def update(self, u: np.ndarray, met: bool = False) -> None:
+        """Adapt to the displacement at which the potential is placed; met: whether its contact blocks are there."""
 
     def updating(self) -> tuple[list, object]:
         """(what `update` does, as [(kernel, records, numbers)] of `Repeated`; whose `hard` is not zero where a vertex needs
@@ -67,8 +70,7 @@ class BlockJacobi(Preconditioner):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
         self.solver = DeviceCG(potential, None, free, parallel)
 
-    def update(self, u: np.ndarray) -> None:
-        """Adapt to the displacement at which the potential is placed."""
+    def update(self, u: np.ndarray, met: bool = False) -> None:
         if self._is_found_on_device():
             return
         D = self.potential.blocks() + self.mass[:, :, None] * np.eye(3)
@@ -152,7 +154,7 @@ class BodyBlocks(BlockJacobi):
         """Where there are only ties the factorisation takes its place, else nothing does."""
         return super().patience if self.free.elimination is not None else 10**9
 
-    def update(self, u: np.ndarray) -> None:
+    def update(self, u: np.ndarray, met: bool = False) -> None:
         super().update(u)
         contact, rest, self._bodies = self.potential.contact_blocks(), self.potential.arrays.values.rest, []
         self._rigid = [(own, self._inverse_of(own, G, contact)) for own, G in self._rigid_at_rest]

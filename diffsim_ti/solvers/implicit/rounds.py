@@ -303,7 +303,7 @@ class Rounds:
             served = bool(self._update) and (self.whole or updates or ahead)
             if served and not self.whole:
                 if self._steps:
-                    self.preconditioner.follow(self._here())
+                    self.preconditioner.follow(self._here(), met=True)
                 self._update(1, **numbers)
             if self.whole or not solves:
                 self._receive()
@@ -316,7 +316,7 @@ class Rounds:
     def _follow(self) -> None:
         """The preconditioner goes to where steps that were taken led, and conjugate gradients begin."""
         here = self.potential.place(runtime.fetch(self.u).astype(np.float64)) if self.several else self._here()
-        self.preconditioner.update(here)
+        self.preconditioner.update(here, met=self.contact)
         if self.beside and self.state[:, LIMIT].any():
             mass, self._more = self.newton.system()
             self.cg.put_system(mass, self._more)
