@@ -1,20 +1,26 @@
 """Conjugate gradients of all scenes of a batch at once: each has its own numbers alpha, beta and end."""
 
-from diffsim_ti.mechanics.energy.kernels import PotentialKernels
-from diffsim_ti.runtime import Piecewise, kernels_of
-from diffsim_ti.solvers.implicit.cg_kernels import STOPPED, CGKernels
+from diffsim_ti.runtime.piecewise import Pieces
+from diffsim_ti.solvers.implicit.cg_kernels import STOPPED
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 
 COUNTS = "nodes", "below", "shares", "shares_below", "chunks", "systems"  # of all scenes
-COUNTS += "num_items", "num_tetrahedra", "num_vertices"
+COUNTS += "num_items", "num_tetrahedra", "num_vertices", "vertices", "points", "count"
 
 # what scenes share, or is found by what `start` says, in kernels of one scene
 WHOLE = {(m, a) for m in ("level", "down", "up", "inverse") for a in ("column", "values")}
-WHOLE |= {("cg", "column"), ("cg", "blocks"), ("cg", "held"), ("scene", "corner_of"), ("at", "rate")}
+WHOLE |= {("cg", "column"), ("cg", "blocks"), ("cg", "held"), ("scene", "corner_of"), ("at", "rate"), ("body", "point")}
 # which of their numbers are places in which arrays
 COUNTING = {("level", "column"): ("level", "x"), ("down", "column"): ("level", "x"), ("up", "column"): ("below", "x")}
 COUNTING |= {("inverse", "column"): ("level", "x"), ("cg", "column"): ("cg", "x"), ("scene", "tets"): ("at", "u")}
-COUNTING |= {("scene", "corner_of"): ("scene", "corner")}
+COUNTING |= {("scene", "corner_of"): ("scene", "corner"), ("way", "vertices"): ("at", "u")}
+COUNTING |= {("body", "nodes"): ("at", "u"), ("body", "point"): ("body", "strains")}
+
+
+def pieces_of(uniform: bool) -> Pieces:
+    """Of scenes; uniform: whether all tetrahedra of all share the law's numbers."""
+    whole = WHOLE | ({("scene", "coefficients")} if uniform else set())
+    return Pieces(frozenset(whole), tuple(COUNTING.items()), frozenset({("cg", "state")}), COUNTS)
 
 
 class JoinedCG(DeviceCG):
@@ -23,27 +29,9 @@ class JoinedCG(DeviceCG):
 
     several = True
 
-    def __init__(self, potential, cycle, free, parallel: bool):
+    def __init__(self, potential, *more):
         self.systems, self.by_scene = potential.arrays.num_scenes, potential.arrays.by_scene
-        super().__init__(potential, cycle, free, parallel)
-        self._look = self.many if self.by_scene else 0
-
-    def _iteration(self, more: bool, convex: bool, products: list):
-        if not self.by_scene:
-            return super()._iteration(more, convex, products)
-        a, own, per = self.potential.arrays, dict(cg=self, at=self.potential), self.systems
-        kernels = kernels_of(CGKernels, a.precision, self.precision, False, self.guided, more)
-        before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, dict(nodes=self.nodes))]
-        product = kernels_of(PotentialKernels, a.law, a.features().of_state(), False, a.in_lanes).product
-        parts = [(kernels.wanted, own, {}), *before, (kernels.turn, own, self._sizes)]
-        parts += [(product, products[0][1], self.potential.sizes()), (kernels.step, own, self._sizes)]
-        whole = WHOLE | ({("scene", "coefficients")} if a.features().uniform else set())
-        run = Piecewise("cg_of_scenes", [x[:2] for x in parts], per, whole, COUNTING, True, {("cg", "state")})
-        each = [{n: x // per if n in COUNTS else x for n, x in numbers.items()} for _, _, numbers in parts]
-        last = dict(each.pop())
-        return lambda times, rounding: run(
-            times, *each[:-1], each[-1] | dict(per_gamma=self.potential.per_gamma), last | dict(rounding=rounding)
-        )
+        super().__init__(potential, *more)
 
     def __call__(self, mass, more, b, tolerances, going, max_iterations: int, eps: float):
         """(x, solved, negative) of each scene, as `solve`."""

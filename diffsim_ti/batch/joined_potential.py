@@ -7,7 +7,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.batch.joined_cg import COUNTING, COUNTS, WHOLE, JoinedCG
+from diffsim_ti.batch.joined_cg import JoinedCG, pieces_of
 from diffsim_ti.batch.joined_scene import of_scenes
 from diffsim_ti.mechanics.energy.kernels import PotentialKernels
 from diffsim_ti.mechanics.energy.potential import Potential
@@ -141,14 +141,26 @@ class JoinedPotential(Potential):
     def launch(self, name, lanes=True, **records):
         if name not in BY_SCENE or not self.arrays.by_scene:
             return super().launch(name, lanes, **records)
-        a, count = self.arrays, self.arrays.num_scenes
         if name not in self._launches:
-            one = kernels_of(PotentialKernels, a.law, a.features().of_state(), False, a.in_lanes)
-            parts = [(self.kernels.wanted, self._records), (getattr(one, name), self._records | records)]
-            whole = WHOLE | ({("scene", "coefficients")} if a.features().uniform else set())
-            self._launches[name] = Piecewise(f"{name}_of_scenes", parts, count, whole, COUNTING, lanes and a.in_vectors)
-        sizes = {n: x // count if n in COUNTS else x for n, x in self.sizes().items()}
-        self._launches[name](1, {}, sizes)
+            parts = [
+                (self.kernels.wanted, self._records, None),
+                (getattr(self.of_one, name), self._records | records, None),
+            ]
+            self._launches[name] = self.repeated(f"{name}_of_scenes", [parts], False, lanes and self.arrays.in_vectors)
+        self._launches[name](1, **self.sizes())
+
+    @property
+    def of_one(self) -> PotentialKernels:
+        a = self.arrays
+        if not a.by_scene:
+            return self.kernels
+        return kernels_of(PotentialKernels, a.law, a.features().of_state(), False, a.in_lanes)
+
+    def repeated(self, name, groups, parallel, vectorized=True):
+        a = self.arrays
+        if not a.by_scene:
+            return super().repeated(name, groups, parallel, vectorized)
+        return Piecewise(name, groups, a.num_scenes, pieces_of(a.features().uniform), vectorized)
 
     def only(self, scenes: np.ndarray) -> None:
         """Let what follows be of some scenes, a mask; of others what was found before stays."""
@@ -165,6 +177,7 @@ class JoinedPotential(Potential):
 
 class JoinedDetection(CollisionDetection):
     kernels_kind = SweptOfScenes
+    of_one = property(lambda self: kernels_of(SweptKernels, self.a.features().of_state(), self.a.precision, False))
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)

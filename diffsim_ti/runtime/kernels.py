@@ -165,21 +165,25 @@ class Repeated:
     argument; numbers: None where they are those of the launch, else a dictionary, of which they are taken then. The body
     of the first of a group says whether the others are wanted. On one thread of the processor it is asked each time;
     elsewhere the others themselves do nothing once they are not wanted, in a list of tasks that names them so often
-    (repeated_loops.py).
+    (repeated_loops.py). pieces: how kernels of one of many bodies see the arrays of all (piecewise.py).
     """
 
-    def __init__(self, name: str, groups: list[list], parallel: bool, vectorized: bool = False):
+    def __init__(self, name: str, groups: list[list], parallel: bool, vectorized: bool = False, pieces=None):
         parts = [part for group in groups for part in group]
         names, arrays = named_arrays([(kernel, records) for kernel, records, _ in parts])
         kernels, own_numbers = tuple(kernel for kernel, *_ in parts), [numbers for *_, numbers in parts]
         one_thread, shared = runs_on_cpu() and not parallel, tuple(numbers is None for numbers in own_numbers)
-        made, numbers = _repeated_kernel(name, kernels, names, shared, tuple(map(len, groups)), one_thread)
+        made, numbers = _repeated_kernel(name, kernels, names, shared, tuple(map(len, groups)), one_thread, pieces)
         title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
         options = dict(title=title, loops=0 if one_thread else -1)
         launch = Launch(made, *arrays, vectorized=vectorized, **options)
         own = [(n, None if k is None else own_numbers[k]) for k, n in numbers]
-        self._launch = lambda times, given: launch(*((given if x is None else x)[n] for n, x in own), times)
+        self._launch = lambda times, given: launch(
+            *((given if x is None else x)[n] for n, x in own), *self._more, times
+        )
         self._sizes = None if one_thread else (16, 4, 1)  # of launches: the driver compiles each number of times anew
+
+    _more = ()  # numbers before the last one
 
     @staticmethod
     def is_possible(parallel: bool) -> bool:
@@ -194,7 +198,9 @@ class Repeated:
 
 
 @lru_cache(maxsize=None)
-def _repeated_kernel(name: str, kernels: tuple, names: tuple, shared: tuple, sizes: tuple, one_thread: bool):
+def _repeated_kernel(
+    name: str, kernels: tuple, names: tuple, shared: tuple, sizes: tuple, one_thread: bool, pieces=None
+):
     """(the kernel, its numbers as (place of the part that they are of, name)); shared: whether those of a part are not its
     own, so that the place is None; sizes: of the groups."""
     lines, calls, arrays, numbers, scope = [], [], {}, {}, {}
@@ -204,15 +210,19 @@ def _repeated_kernel(name: str, kernels: tuple, names: tuple, shared: tuple, siz
         of_numbers = {prefix + n: (None if shared[k] else k, n) for n in kernel.numbers}
         arrays |= {a: kind for a, kind in arguments.items() if a not in of_numbers and a not in arrays}
         numbers |= {a: (arguments[a], place) for a, place in of_numbers.items()}
-        scope[f"body{k}"] = kernel.body
+        scope[f"body{k}"] = pieces.body_of(kernel) if pieces else kernel.body
+        call = call.replace("(", f"({pieces.arguments}, ", 1) if pieces else call
         lines, calls = lines + [line for line in first if line not in lines], [*calls, call]
-    if one_thread:
+    more, space = dict.fromkeys((*(pieces.numbers if pieces else ()), "times"), ti.i32), "    "
+    if pieces:
+        lines, space = [*lines, *pieces.loop, "        for _ in range(times):"], 3 * space
+    elif one_thread:
         lines += ["ti.loop_config(serialize=True)", "for _ in range(times):"]
     for size in sizes:
         (asks, *own), calls = calls[:size], calls[size:]
-        lines += [f"    if {asks}:", *(f"        {call}" for call in own)] if one_thread else own
+        lines += [f"{space}if {asks}:", *(f"{space}    {call}" for call in own)] if one_thread else own
     kinds = {a: kind for a, (kind, _) in numbers.items()}
-    return _compiled(name, arrays | kinds | dict(times=ti.i32), lines, scope), [place for _, place in numbers.values()]
+    return _compiled(name, arrays | kinds | more, lines, scope), [place for _, place in numbers.values()]
 
 
 @lru_cache(maxsize=None)

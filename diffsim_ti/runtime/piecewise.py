@@ -1,13 +1,11 @@
 """Kernels of one body that go through many bodies of equal size, whose arrays stand one after the other: a thread takes a
 body through all of them, as often as that is wanted, while its arrays lie in the caches."""
 
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass
 
-import taichi as ti
-
-from diffsim_ti.runtime.kernels import _compiled, named_arrays
+from diffsim_ti.runtime.kernels import Repeated
 from diffsim_ti.runtime.language import Bundle, at, let, traced
-from diffsim_ti.runtime.launch import Launch
 
 SPREAD = 1024  # items of a loop at least, for Taichi keeps fewer on one thread
 
@@ -15,12 +13,12 @@ SPREAD = 1024  # items of a loop at least, for Taichi keeps fewer on one thread
 @traced
 class Piece:
     """`array[k]`, or `array[slot, k]`, of an array from its entry `first` on; its entries are whole numbers that count from
-    `zero`, if that is given. row: of its rows the only one."""
+    `zero`, if that is given. row: of its rows the only one; size: of its entries."""
 
     _data_oriented = True  # Taichi hands it on as it is
 
-    def __init__(self, array, first, zero=None, row=None):
-        self._array, self._first, self._zero, self._row = array, first, zero, row
+    def __init__(self, array, first, zero=None, row=None, size=None):
+        self._array, self._first, self._zero, self._row, self.shape = array, first, zero, row, (size,)
 
     def __getitem__(self, index):
         *slot, k = index if isinstance(index, tuple) else (index,)
@@ -29,71 +27,71 @@ class Piece:
         return entry if self._zero is None else entry - self._zero
 
 
-class Piecewise:
-    """Kernels one after the other, again and again in one launch, for each of `count` bodies: `launch(times, numbers of each
-    kernel)`, as of one body.
+@dataclass(frozen=True)
+class Pieces:
+    """How kernels of one thread and one body see arrays of all bodies.
 
-    parts: [(kernel, records)] as of `Repeated`, with kernels of one thread and the arrays of all bodies. The body of the
-    first says whether the others are still wanted of a body. whole: {(bundle, array)} that bodies share, or to which the
-    `start`s of rows lead. counting: {(bundle, array): (bundle, array)}, whole numbers that say places in the second one.
-    rows: {(bundle, array)} that have a row for each body.
+    whole: {(bundle, array)} that bodies share, or to which the `start`s of rows lead. counting: (((bundle, array), (bundle,
+    array)), ...), whole numbers that say places in the second one. rows: {(bundle, array)} that have a row for each body.
+    counts: names of numbers that are of all bodies.
     """
 
-    def __init__(
-        self, name: str, parts: list, count: int, whole: set, counting: dict, vectorized: bool, rows=frozenset()
-    ):
-        kernels, (names, arrays) = [kernel for kernel, _ in parts], named_arrays(parts)
-        self._names, self._count = [kernel.numbers for kernel in kernels], count
-        made = _kernel(name, tuple(kernels), names, frozenset(whole), tuple(counting.items()), frozenset(rows))
-        title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
-        self._launch = Launch(made, *arrays, vectorized=vectorized, title=title)
+    whole: frozenset
+    counting: tuple
+    rows: frozenset
+    counts: tuple
 
-    def __call__(self, times: int, *numbers: dict) -> None:
-        own = (of[n] for names, of in zip(self._names, numbers, strict=True) for n in names)
-        self._launch(*own, self._count, max(SPREAD // self._count, 1), times)
-
-
-def _of_body(kernel, whole: frozenset, counting: dict, rows: frozenset):
-    """body(b, count, bundles of the arrays of all bodies, numbers) -> what the kernel's body does with those of body b."""
-
-    @traced
-    def body(b, count, *bundles):
-        records = dict(zip(kernel.arrays, bundles))
-        first = lambda bundle, array: let(b * (getattr(records[bundle], array).shape[-1] // count))  # noqa: E731
-
-        def seen(bundle, a):
-            array, place = getattr(records[bundle], a), (bundle, a)
-            zero = first(*counting[place]) if place in counting else None
-            if place in rows:
-                return Piece(array, None, row=b)
-            if place in whole:
-                return array if zero is None else Piece(array, None, zero)
-            return Piece(array, first(bundle, a), zero)
-
-        own = [Bundle(**{a: seen(bundle, a) for a in of}) for bundle, of in kernel.arrays.items()]
-        return kernel.body(*own, *bundles[len(own) :])
-
-    return body
-
-
-@lru_cache(maxsize=None)
-def _kernel(name: str, kernels: tuple, names: tuple, whole: frozenset, counting: tuple, rows: frozenset):
-    calls, arrays, numbers, scope = [], {}, {}, {}
-    for k, (kernel, own) in enumerate(zip(kernels, names)):
-        _, call, arguments = kernel.call(f"body{k}", dict(own), f"k{k}_")
-        of_numbers = {f"k{k}_{n}" for n in kernel.numbers}
-        arrays |= {a: kind for a, kind in arguments.items() if a not in of_numbers and a not in arrays}
-        numbers |= {a: kind for a, kind in arguments.items() if a in of_numbers}
-        scope[f"body{k}"] = _of_body(kernel, whole, dict(counting), rows)
-        calls.append(call.replace("(", "(b, count, ", 1))
-    lines = [
-        "for t in range(spread * count):",
+    numbers, arguments = ("bodies", "spread"), "b, bodies"
+    loop = (
+        "for t in range(spread * bodies):",
         "    if t % spread == 0:",
         "        b = 2 * (t // spread)",  # neighbours, which take as long, go to different threads
-        "        b = b % count + b // count * (1 - count % 2)",
-        "        for _ in range(times):",
-        f"            if {calls[0]}:",
-        *(f"                {call}" for call in calls[1:]),
-    ]
-    more = dict.fromkeys(("count", "spread", "times"), ti.i32)
-    return _compiled(name, arrays | numbers | more, lines, scope)
+        "        b = b % bodies + b // bodies * (1 - bodies % 2)",
+    )
+
+    def body_of(self, kernel) -> Callable:
+        """body(b, bodies, bundles of the arrays of all, numbers) -> what the kernel's body does with those of body b."""
+        counting = dict(self.counting)
+
+        @traced
+        def body(b, bodies, *bundles):
+            records = dict(zip(kernel.arrays, bundles))
+            size = lambda bundle, array: let(getattr(records[bundle], array).shape[-1] // bodies)  # noqa: E731
+
+            def seen(bundle, a):
+                array, place = getattr(records[bundle], a), (bundle, a)
+                zero = let(b * size(*counting[place])) if place in counting else None
+                if place in self.rows:
+                    return Piece(array, None, row=b)
+                if place in self.whole:
+                    return array if zero is None else Piece(array, None, zero)
+                own = size(bundle, a)
+                return Piece(array, let(b * own), zero, size=own)
+
+            own = [Bundle(**{a: seen(bundle, a) for a in of}) for bundle, of in kernel.arrays.items()]
+            return kernel.body(*own, *bundles[len(own) :])
+
+        return body
+
+
+class OfOne:
+    """Numbers of one body, as a dictionary of those of all has them when they are asked for."""
+
+    def __init__(self, of_all: dict, count: int, counts: tuple):
+        self.of_all, self.count, self.counts = of_all, count, counts
+
+    def __getitem__(self, name):
+        return self.of_all[name] // self.count if name in self.counts else self.of_all[name]
+
+
+class Piecewise(Repeated):
+    """Kernels as of `Repeated`, for each of `count` bodies: a thread takes a body through all of them."""
+
+    def __init__(self, name: str, groups: list[list], count: int, pieces: Pieces, vectorized: bool):
+        self._more = count, max(SPREAD // count, 1)
+        of_one = self._of_one = lambda of: OfOne(of, count, pieces.counts)  # noqa: E731
+        groups = [[(kernel, records, of and of_one(of)) for kernel, records, of in group] for group in groups]
+        super().__init__(name, groups, False, vectorized, pieces)
+
+    def __call__(self, times: int, **numbers) -> None:
+        self._launch(times, self._of_one(numbers))

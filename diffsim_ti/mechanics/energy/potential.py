@@ -12,7 +12,7 @@ from diffsim_ti.mechanics.energy.kernels import PotentialKernels
 from diffsim_ti.mechanics.host_force import NONE
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.patched_tetrahedron import PatchCoupling
-from diffsim_ti.runtime import kernels_of
+from diffsim_ti.runtime import Repeated, kernels_of, runs_on_cpu
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.obstacle_poses import AT_BEGIN, AT_STAGE
 
@@ -206,7 +206,16 @@ class Potential:
     def multiplying(self, convex: bool = False) -> list[tuple]:
         """`multiply` where the potential stands, as [(kernel, records, numbers)]; the last takes `sizes`."""
         own = self.pairs.multiplying(self.u, self.w, convex) if self.pairs else []
-        return [*own, (self.kernels.product, self._records, None)]
+        return [*own, (self.of_one.product, self._records, None)]
+
+    @property
+    def of_one(self) -> PotentialKernels:
+        """Those that `repeated` takes; of a batch they are of one body."""
+        return self.kernels
+
+    def repeated(self, name: str, groups: list[list], parallel: bool, vectorized: bool = True) -> Repeated:
+        """Kernels that see the body, as one."""
+        return Repeated(name, groups, parallel, vectorized and runs_on_cpu())
 
     def find_blocks(self) -> None:
         """`blocks` on the device, without host forces, ten nodes and patches."""

@@ -52,6 +52,8 @@ class CollisionDetection:
         self._launches = {}
         self.met: Met | None = None  # what the last detection found
 
+    of_one = property(lambda self: self.kernels, doc="As of the potential.")
+
     def share(
         self, u: np.ndarray, step: np.ndarray, places: np.ndarray, drifts=0.0, most: float = 1.0, kept=kept
     ) -> float:

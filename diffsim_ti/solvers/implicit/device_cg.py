@@ -22,7 +22,8 @@ class DeviceCG:
     An iteration is one kernel, but on Vulkan, and a launch makes many.
     """
 
-    systems, several = 1, False  # how many; whether there may be more than one
+    # how many; whether there may be more than one; whether a thread takes one of them at a time
+    systems, several, by_scene = 1, False, False
     many = 50  # iterations in a launch on one thread, which stops by itself
     ahead = 16  # iterations before a card is asked for the residual
 
@@ -47,8 +48,8 @@ class DeviceCG:
         if cycle is None:
             self.inverse = runtime.array(self._vector, 3, n)
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n, systems=self.systems)
-        self.is_one_kernel = Repeated.is_possible(parallel)
-        whole = runs_on_cpu() and not parallel and self.is_one_kernel
+        self.is_one_kernel = self.by_scene or Repeated.is_possible(parallel)
+        whole = self.by_scene or runs_on_cpu() and not parallel
         # iterations between looks at the state; on a card as many as seem to be left
         self._look = self.many if whole else 1 if runs_on_cpu() else 0
         # (with a matrix, convex) -> iterate(times, rounding), what tells whether arrays are others
@@ -86,8 +87,8 @@ class DeviceCG:
     def parts(self, more: bool, products: list) -> list:
         """An iteration, as [(kernel, records, numbers)] of `Repeated`; products: those of the potential."""
         potential, own = self.potential, dict(cg=self, at=self.potential)
-        how = potential.arrays.precision, self.precision, self.parallel, self.guided, more
-        kernels = kernels_of(CGKernels, *how, self.several)
+        how = potential.arrays.precision, self.precision, self.parallel and not self.by_scene, self.guided, more
+        kernels = kernels_of(CGKernels, *how, self.several and not self.by_scene)
         before = self.cycle.parts(self) if self.cycle else [(kernels.scale, own, None)]
         before = [(kernels.wanted, own, None), *before, (kernels.turn, own, None)]
         return [*before, *products, (kernels.step, own, None)]
@@ -100,7 +101,7 @@ class DeviceCG:
         """(times, rounding) -> so many iterations."""
         parts, potential, lanes = self.parts(more, products), self.potential, runs_on_cpu()
         if self.is_one_kernel:
-            repeated = Repeated("cg", [parts], self.parallel, lanes)
+            repeated = potential.repeated("cg", [parts], self.parallel)
             return lambda times, rounding: repeated(times, **potential.sizes(), **self._sizes, rounding=rounding)
         launches = [
             (kernel.bind(lanes, **records), numbers or self._sizes)

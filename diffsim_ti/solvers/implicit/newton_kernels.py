@@ -37,7 +37,8 @@ LONGEST_STEP = 64.0  # along an indefinite direction, which is doubled while Phi
 class NewtonKernels:
     """scene: precision of displacements and energies; vectors: of all else; guided: whether vertices are fixed in some
     directions only; contact: whether there is contact; beside: whether the host says the residual; several: whether there
-    are several bodies, each with its row of `state` (cg_kernels.py); pairs: whether there are pairs of surfaces."""
+    are several bodies, each with its row of `state` (cg_kernels.py); pairs: whether there are pairs of surfaces; noted:
+    whether each round's residual is."""
 
     scene: str
     vectors: str
@@ -47,6 +48,7 @@ class NewtonKernels:
     beside: bool
     several: bool = False
     pairs: bool = False
+    noted: bool = True
 
     @property
     def fp(self):
@@ -375,7 +377,7 @@ class NewtonKernels:
         cg.state[b, ACCEPTED], cg.state[b, BEFORE] = one, cg.state[b, NORM]
         norm, size, floor = ti.sqrt(cg.part[0, c]), ti.sqrt(cg.part[1, c]), ti.sqrt(cg.part[2, c]) * 4
         cg.state[b, NORM], cg.state[b, FLOOR] = norm, floor
-        if ti.static(not self.several):
+        if ti.static(self.noted):
             relative = norm
             if size > 0:
                 relative = norm / size
@@ -467,7 +469,7 @@ class NewtonKernels:
         """R where something is tried, its forces being there; if that is taken, what the round solves: r = R / |R|."""
         cg, values = dict(free="scalars", r="vectors2"), self.values
         own = dict.fromkeys(("far", "stiffness"), "scalars") | dict.fromkeys(("u", "d", "R"), "vectors")
-        own |= {} if self.several else dict(history="scalars")
+        own |= dict(history="scalars") if self.noted else {}
         own, at = own | dict(J=values), dict(u=f"vectors2_{self.scene}", J=values)
         if not self.beside:
             cg |= dict(mass="scalars") | (dict(guide="ints", held="vectors2") if self.guided else {})

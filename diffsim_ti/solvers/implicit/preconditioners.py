@@ -89,9 +89,9 @@ class BlockJacobi(Preconditioner):
     def _on_device(self) -> tuple | None:
         """(kernel, records) that invert the blocks that the device has found; None where the host has a part in them."""
         a, p, solver, n = self.potential.arrays, self.potential, self.solver, len(self.mass)
-        if not isinstance(self.free, np.ndarray) or a.points > 1 or a.patches is not None or p.hosts or solver.several:
+        if not isinstance(self.free, np.ndarray) or a.points > 1 or a.patches is not None or p.hosts:
             return None
-        kernels = kernels_of(CGKernels, a.precision, solver.precision, solver.parallel, False, False)
+        kernels = kernels_of(CGKernels, a.precision, solver.precision, solver.parallel and not a.by_scene, False, False)
         kind = runtime.PRECISIONS[solver.precision]
         body = SimpleNamespace(hard=runtime.array(ti.i32, n), mass=runtime.array(kind, n), least=runtime.array(kind, n))
         runtime.fill(body.mass, self.mass[:, 0])
@@ -112,7 +112,7 @@ class BlockJacobi(Preconditioner):
         if self._on_device is None:
             return [], None
         (invert, records), p, pairs = self._on_device, self.potential, self.potential.pairs
-        own = [(p.kernels.blocks, dict(scene=p.arrays, pass_=p, at=p, out=p.block_arrays), None)]
+        own = [(p.of_one.blocks, dict(scene=p.arrays, pass_=p, at=p, out=p.block_arrays), None)]
         own += pairs.adding_blocks(p.u, p.block_arrays.blocks) if pairs else []
         return [*own, (invert, records, None)], records["body"]
 

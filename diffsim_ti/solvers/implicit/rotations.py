@@ -31,8 +31,8 @@ class FrameKernels:
     def strain(self, p, at: A, body: A, plan: A):
         """Volume times du/dX at a point, by columns."""
         h = ti.Matrix.zero(ti.f32, 3, 3)
-        for a in range(plan.nodes):
-            N, u = body.gradients[plan.nodes * p + a], at.u[0, body.nodes[plan.nodes * p + a]]
+        for a in range(plan.each):
+            N, u = body.gradients[plan.each * p + a], at.u[0, body.nodes[plan.each * p + a]]
             for i, j in ti.static(ti.ndrange(3, 3)):
                 h[i, j] += ti.cast(u[i], ti.f32) * N[j]
         for j in ti.static(range(3)):
@@ -68,7 +68,7 @@ class FrameKernels:
             F = ti.Matrix.identity(ti.f32, 3)
             for k in range(body.start[i], body.start[i + 1]):
                 for j in ti.static(range(3)):
-                    column = body.strains[3 * body.point[k] + j]
+                    column = body.strains[body.point[k] + j]
                     for d in ti.static(range(3)):
                         F[d, j] += column[d] * body.share[i]
             R = self.rotation(F, i, body)
@@ -80,7 +80,7 @@ class FrameKernels:
         """The rotation next to the mean of du/dX + 1 around each vertex, by columns."""
         body = dict(nodes="ints", gradients="rows3", strains="rows3", start="ints", point="ints", share="singles")
         arrays = dict(at=dict(u="vectors2"), body=body | dict(hard="ints"), frames=dict(turned="rows3"))
-        numbers = dict(points="int", nodes="int", vertices="int")
+        numbers = dict(points="int", each="int", vertices="int")
         return Kernel("frames", self.turn, self.precision, arrays, numbers)
 
 
@@ -101,17 +101,14 @@ class Frames:
             gradients=runtime.upload(gradients.reshape(-1, 3), ROWS[3]),
             strains=runtime.array(ROWS[3], 3 * len(points.volumes)),
             start=runtime.upload(np.concatenate([[0], np.cumsum(around)]), ti.i32),
-            point=runtime.upload(order // self.count[1], ti.i32),
+            point=runtime.upload(3 * (order // self.count[1]), ti.i32),  # where its strains begin
             share=runtime.upload(np.where(around > 0, share, 0), ti.f32),
             hard=runtime.array(ti.i32, n),
         )
-        kernel = kernels_of(FrameKernels, potential.arrays.precision, parallel).frames
-        self.part = (
-            kernel,
-            dict(at=potential, body=self.body, frames=self),
-            dict(zip(("points", "nodes", "vertices"), self.count)),
-        )
-        self._launch = kernel.bind(**self.part[1])
+        a, records = potential.arrays, dict(at=potential, body=self.body, frames=self)
+        kernel = lambda parallel: kernels_of(FrameKernels, a.precision, parallel).frames  # noqa: E731
+        self.part = kernel(parallel and not a.by_scene), records, dict(zip(("points", "each", "vertices"), self.count))
+        self._launch = kernel(parallel).bind(**records)
 
     def update(self) -> None:
         """To the displacement at which the potential is placed."""
@@ -133,7 +130,7 @@ class Frames:
     def _means(self) -> np.ndarray:
         """Mean deformation gradients."""
         b = {name: runtime.fetch(getattr(self.body, name)) for name in ("strains", "point", "start", "share")}
-        columns = b["strains"].reshape(-1, 9)[b["point"]]
+        columns = b["strains"].reshape(-1, 9)[b["point"] // 3]
         at = np.repeat(np.arange(self.count[2]), np.diff(b["start"]))
         sums = np.stack([np.bincount(at, columns[:, k], self.count[2]) for k in range(9)], 1) * b["share"][:, None]
         return np.swapaxes(sums.reshape(-1, 3, 3), 1, 2) + np.eye(3)

@@ -50,8 +50,12 @@ class Rounds:
         self.solves_on_host = newton.system() is None
         self.contact = bool(a.contacts or self.pairs or potential.hosts)
         slides = isinstance(free, FreeDirections) and not potential.joints  # whose directions are the host's
-        how = a.precision, cg.precision, cg.parallel, slides, self.contact, self.beside, self.several, bool(self.pairs)
-        self._kernels = kernels_of(NewtonKernels, *how)
+        self.whole = runs_on_cpu() and cg.is_one_kernel and (cg.by_scene or not cg.parallel)
+        self.whole &= a.vertices_of_one <= self.small and not (self.beside or (self.pairs and self.pairs.asks))
+        self.whole &= potential.kernels.blocks.variables <= self.short
+        how = cg.parallel and not self.whole, slides, self.contact, self.beside, self.several and not self.whole
+        how += bool(self.pairs), not self.several
+        self._kernels = kernels_of(NewtonKernels, a.precision, cg.precision, *how)
         fp, vector = runtime.PRECISIONS[cg.precision], runtime.array_types(cg.precision)["vectors"].dtype
         self.u, self.d, self.R, self.inertial, self.loads = (runtime.array(vector, n) for _ in range(5))
         self.far, self.stiffness, self.history = (runtime.array(fp, k) for k in (n, n, self.most_rounds + 1))
@@ -60,9 +64,6 @@ class Rounds:
         self.sizes |= dict(points=points, points_length=-(-(points // cg.systems) // (cg.chunks // cg.systems)))
         self._always = self.sizes | dict(kept=detection.kept)
         self.next = runtime.array(a.vector, 1, n) if self.pairs else None  # where the longest step leads
-        self.whole = runs_on_cpu() and cg.is_one_kernel and not cg.parallel and n <= self.small
-        self.whole &= potential.kernels.blocks.variables <= self.short and not (self.beside or self.several)
-        self.whole &= not (self.pairs and self.pairs.asks)
         self.places = runtime.array(a.vector, 2, n if self.whole else 1)  # of which rises are asked in one kernel
         self._bind()
         if self.whole:
@@ -80,31 +81,34 @@ class Rounds:
         one = lambda kernel, records: [(kernel, records, None)]  # noqa: E731
         tries, judges, updates, solves, fresh = (one(kernel, own) for kernel in kernels.wanted)
         direction, residual, holds, near, place = one(kernels.direction, own), [], [], [], []
+        of_body = potential.of_one if self.whole else potential.kernels
         if a.contacts and not potential.joints:
             of_way = dict(scene=a, way=way, at=potential, out=detection.found)
-            direction += one(detection.kernels.shares, of_way) + one(kernels.bound, own)
+            swept = detection.of_one if self.whole else detection.kernels
+            direction += one(swept.shares, of_way) + one(kernels.bound, own)
         if not beside:
-            residual += one(potential.kernels.forces, of_potential)
+            residual += one(of_body.forces, of_potential)
             if self.contact:
-                residual += one(potential.kernels.contact_blocks, of_potential | dict(out=barriers))
+                residual += one(of_body.contact_blocks, of_potential | dict(out=barriers))
         if pairs:
             u, step, halt = potential.u, way.step, one(kernels.halt, dict(cg=cg, near=pairs.inner))
             holds = [*one(kernels.lead, own), *pairs.holding(self.next, step), *halt]
             near, place = pairs.turning(u, step), pairs.placing(u)
             residual += pairs.adding_blocks(u, barriers.blocks)
-        move, energy = one(kernels.move, own), one(potential.kernels.energy, of_potential)
+        move, energy = one(kernels.move, own), one(of_body.energy, of_potential)
         compare, judge = one(kernels.choose, own), one(kernels.judge, own)
         first, trial = [*tries, *direction, *holds], [*move, *place, *energy, *compare]
         groups = [first, [*fresh, *near], [*tries, *trial]] if near else [[*first, *trial]]
         groups.append([*judges, *residual, *judge])
-        update, hard = ([], None) if beside or self.several else preconditioner.updating()
+        by_host = beside or self.several and not self.whole
+        update, hard = ([], None) if by_host else preconditioner.updating()
         update = [*update, (kernels.ready, dict(cg=cg, body=hard), None)] if update else []
         self._update = self._in_turn(update)
         self._trial = self._residual = self._steps = self._more = None
         if self.whole:
             groups += [[*updates, *update]] if update else []
             groups.append([*solves, *cg.parts(False, potential.multiplying())[1:]])
-            self._trial = Repeated("newton", groups, cg.parallel, vectorized=True)
+            self._trial = potential.repeated("newton", groups, cg.parallel)
         elif beside or pairs or self.several or runs_on_cpu() or not cg.is_one_kernel:
             self._steps = [self._in_turn(group) for group in (direction, holds, near, move, place, compare, judge)]
         else:
@@ -182,9 +186,10 @@ class Rounds:
         if self.whole:
             runtime.fill(self.places, np.stack([places[0], places[-1]]))
             self.state = self._based
-            self.state[0, nk.PROBES], self.state[0, nk.PROBED] = len(places), 0
+            self.state[:, nk.PROBES], self.state[:, nk.PROBED] = len(places), 0
+            asked = self.state[:, nk.PHASE] != nk.DONE
             self.advance()
-            self.state[0, nk.PHASE] = nk.PROBE
+            self.state[asked, nk.PHASE] = nk.PROBE
             self._based = self.state
             return self.state[:, [nk.RISE, nk.SECOND_RISE]][:, : len(places)].T
         found = []
