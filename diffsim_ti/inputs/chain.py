@@ -38,16 +38,34 @@ class Link(ABC):
 
 class Recording:
     """The part of a link whose value takes arrays that record, from which its derivatives are found
-    (differentiation/arrays.py)."""
+    (differentiation/arrays.py). What the last few numbers left behind is kept while they stay the same arrays."""
+
+    _record, few = None, 20_000  # (x, arrays that record in their place, y)
+
+    def recorded(self, x: Arrays) -> tuple[list, Arrays]:
+        """(arrays that record in the place of x, what they lead to)"""
+        known = self._record
+        if known is not None and all(map(is_, known[0], x)):
+            return known[1:]
+        leaves = [Recorded(part) for part in x]
+        found = leaves, self.value(*leaves)
+        keeps = sum(map(np.size, x)) <= self.few and all(map(is_fixed, x))
+        self._record = (x, *found) if keeps else None
+        return found
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
-        leaves = [Recorded(part) for part in x]
-        return [forward(y, zip(leaves, dx)) for y in self.value(*leaves)]
+        leaves, values = self.recorded(x)
+        return [forward(y, zip(leaves, dx)) for y in values]
 
     def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
-        leaves = [Recorded(part) for part in x]
-        found = reverse_of_all(zip(self.value(*leaves), y_adj), leaves)
+        leaves, values = self.recorded(x)
+        found = reverse_of_all(zip(values, y_adj), leaves)
         return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
+
+
+def is_fixed(x) -> bool:
+    """Whether an array has its numbers for good: what may be written to may change and stay the same array."""
+    return isinstance(x, np.ndarray) and not x.flags.writeable
 
 
 class Chain:
@@ -93,7 +111,7 @@ class Chain:
         if before is not None and all(map(is_, before[0], x)):
             return before[1]
         y = [frozen(part) for part in link.value(*x)]
-        if not any(part.flags.writeable for part in x):  # what may be written to may change and stay the same array
+        if all(map(is_fixed, x)):
             self._kept[link] = x, y
         return y
 
