@@ -221,7 +221,7 @@ class JoinedAdjoint(ImplicitAdjoint):
         of_vertices = runtime.fetch(self.numbers.sums).astype(np.float64)[rows.of("parameters")]
         out.parameters[:, : features.num_parameters] = of_scenes(of_vertices, count, axis=1).sum(2)
         if features.gravity >= 0:
-            out.parameters[:, features.gravity :][:, :3] = self.gravity
+            out.parameters[:, features.gravity :][:, :3] = self.gravity_adj
         if features.drag >= 0:
             out.parameters[:, features.drag] = self.rate
         for name in ("forces", "motion", "path"):
