@@ -38,9 +38,11 @@ class Link(ABC):
 
 class Recording:
     """The part of a link whose value takes arrays that record, from which its derivatives are found
-    (differentiation/arrays.py). What the last few numbers left behind is kept while they stay the same arrays."""
+    (differentiation/arrays.py). What was recorded is kept while x, of up to `few` numbers, stays the same arrays; of up to
+    `fewest` the matrix of derivatives, too, which takes a sweep for each, once it was asked for `often`."""
 
-    _record, few = None, 20_000  # (x, arrays that record in their place, y)
+    few, fewest, often = 20_000, 16, 10
+    _record, _slopes, _uses = None, None, 0  # (x, arrays that record in their place, y); dy/dx; adjoints asked for so far
 
     def recorded(self, x: Arrays) -> tuple[list, Arrays]:
         """(arrays that record in the place of x, what they lead to)"""
@@ -50,8 +52,18 @@ class Recording:
         leaves = [Recorded(part) for part in x]
         found = leaves, self.value(*leaves)
         keeps = sum(map(np.size, x)) <= self.few and all(map(is_fixed, x))
-        self._record = (x, *found) if keeps else None
+        self._record, self._slopes, self._uses = (x, *found) if keeps else None, None, 0
         return found
+
+    def _matrix(self, x: Arrays, y_adj: Arrays) -> np.ndarray | None:
+        """dy/dx, a row for each number of x; None where it is not worth it."""
+        size = sum(map(np.size, x))
+        self._uses += self._record is not None
+        if self._uses == self.often and size <= self.fewest and size * sum(map(np.size, y_adj)) <= 5000:
+            ends = np.cumsum([0, *map(np.size, x)])
+            changes = [[e[a:b].reshape(np.shape(p)) for p, a, b in zip(x, ends, ends[1:])] for e in np.eye(size)]
+            self._slopes = np.array([np.concatenate([*map(np.ravel, self.jvp(x, dx))]) for dx in changes])
+        return self._slopes
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
         leaves, values = self.recorded(x)
@@ -59,6 +71,13 @@ class Recording:
 
     def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
         leaves, values = self.recorded(x)
+        slopes = self._matrix(x, y_adj)
+        if slopes is not None:
+            flat, at, out = slopes @ np.concatenate([*map(np.ravel, y_adj)]), 0, []
+            for part in x:
+                out.append(flat[at : at + part.size].reshape(part.shape))
+                at += part.size
+            return out
         found = reverse_of_all(zip(values, y_adj), leaves)
         return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
 
