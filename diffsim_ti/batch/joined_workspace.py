@@ -208,7 +208,9 @@ class JoinedAdjoint(ImplicitAdjoint):
         """The scenes are the first axis."""
         ws, features, count = self.ws, self.features, self.ws.num_scenes
         found, rows = self.numbers.collect(), features.sums()
-        found.displacement, found.velocity, found.mass = self.p, self.q, self.mass_adj
+        found.displacement, found.velocity = self.p, self.q
+        if features.density:
+            found.mass = self.mass_adj
         found.element_masses = self.element_masses
         found.rest = self.frames[0].sum(0) + self.rest_adj + (0.0 if found.rest is None else found.rest)
         if self.motion is not None:

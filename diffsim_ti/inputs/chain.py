@@ -42,7 +42,11 @@ class Recording:
     `fewest` the matrix of derivatives, too, which takes a sweep for each, once it was asked for `often`."""
 
     few, fewest, often = 20_000, 16, 10
-    _record, _slopes, _uses = None, None, 0  # (x, arrays that record in their place, y); dy/dx; adjoints asked for so far
+    _record, _slopes, _uses = (
+        None,
+        None,
+        0,
+    )  # (x, arrays that record in their place, y); dy/dx; adjoints asked for so far
 
     def recorded(self, x: Arrays) -> tuple[list, Arrays]:
         """(arrays that record in the place of x, what they lead to)"""
@@ -55,15 +59,16 @@ class Recording:
         self._record, self._slopes, self._uses = (x, *found) if keeps else None, None, 0
         return found
 
-    def _matrix(self, x: Arrays, y_adj: Arrays) -> np.ndarray | None:
-        """dy/dx, a row for each number of x; None where it is not worth it."""
-        size = sum(map(np.size, x))
-        self._uses += self._record is not None
-        if self._uses == self.often and size <= self.fewest and size * sum(map(np.size, y_adj)) <= 5000:
-            ends = np.cumsum([0, *map(np.size, x)])
-            changes = [[e[a:b].reshape(np.shape(p)) for p, a, b in zip(x, ends, ends[1:])] for e in np.eye(size)]
-            self._slopes = np.array([np.concatenate([*map(np.ravel, self.jvp(x, dx))]) for dx in changes])
-        return self._slopes
+    def _learn(self, x: Arrays, y_adj: Arrays) -> None:
+        """Find dy/dx, a row for each number of x, where it has become worth it."""
+        self._uses += 1
+        if self._uses != self.often:
+            return
+        size = sum(part.size for part in x)
+        if size <= self.fewest and size * sum(map(np.size, y_adj)) <= self.few:
+            ends = np.cumsum([0, *(part.size for part in x)])
+            changes = [[e[a:b].reshape(p.shape) for p, a, b in zip(x, ends, ends[1:])] for e in np.eye(size)]
+            self._slopes = np.array([_in_a_row(self.jvp(x, dx)) for dx in changes])
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
         leaves, values = self.recorded(x)
@@ -71,15 +76,21 @@ class Recording:
 
     def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
         leaves, values = self.recorded(x)
-        slopes = self._matrix(x, y_adj)
-        if slopes is not None:
-            flat, at, out = slopes @ np.concatenate([*map(np.ravel, y_adj)]), 0, []
+        if self._slopes is not None:
+            flat, at, out = self._slopes @ _in_a_row(y_adj), 0, []
             for part in x:
                 out.append(flat[at : at + part.size].reshape(part.shape))
                 at += part.size
             return out
+        if self._record is not None:
+            self._learn(x, y_adj)
         found = reverse_of_all(zip(values, y_adj), leaves)
         return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
+
+
+def _in_a_row(arrays: Arrays) -> np.ndarray:
+    """The numbers of all."""
+    return np.ravel(arrays[0]) if len(arrays) == 1 else np.concatenate([*map(np.ravel, arrays)])
 
 
 def is_fixed(x) -> bool:
@@ -110,6 +121,7 @@ class Chain:
         self._kept: dict[Link, tuple[Arrays, Arrays]] = {}  # (what it read, what it wrote)
         self._ways: dict[tuple[str, ...], tuple[list[Link], list[Link]]] = {}
         self._after: dict[tuple[str, ...], list[Link]] = {}
+        self._last: tuple | None = None  # wanted inputs, values of all, and what `vjp` read of these
 
     def value(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The values and what all links write; links that miss something are left out."""
@@ -168,8 +180,14 @@ class Chain:
         self, values: Mapping[str, np.ndarray], adjoints: Mapping[str, np.ndarray], wanted: Iterable[str]
     ) -> dict[str, np.ndarray]:
         """Adjoints of the wanted inputs for adjoints of what links write (None: zero)."""
-        pulled, before = self._way(tuple(wanted))
-        known, total = self._through(before, values), {n: y for n, y in adjoints.items() if y is not None}
+        wanted, given = tuple(wanted), (*values.values(),)
+        pulled, before = self._way(wanted)
+        if self._last is None or self._last[0] != wanted or not all(map(is_, self._last[1], given)):
+            known = self._through(before, values)
+            self._last = (wanted, given, known) if all(map(is_fixed, given)) else None
+        else:
+            known = self._last[2]
+        total = {n: y for n, y in adjoints.items() if y is not None}
         for link in reversed(pulled):
             if not any(name in total for name in link.writes):
                 continue

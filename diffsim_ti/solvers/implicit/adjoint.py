@@ -292,7 +292,9 @@ class ImplicitAdjoint(RecordedPasses):
     def collect(self) -> Derived:
         """Adjoints of what kernels read, in float64, at the start of the run."""
         a, features, out = self.ws.arrays, self.features, self.numbers.collect()
-        out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
+        out.displacement, out.velocity = self.p, self.q
+        if features.density:
+            out.mass = self.mass_adj
         out.element_masses = self.element_masses
         if features.gravity >= 0:
             out.parameters[features.gravity :][:3] = self.gravity_adj

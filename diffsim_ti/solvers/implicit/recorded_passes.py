@@ -39,7 +39,7 @@ class RecordedPasses:
         ws.rigid.begin(self.u, stage.c0)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
-        self.gamma = ws.instant(j, stage).gamma  # of velocities that host forces read
+        self.gamma = np.inf if stage.static else stage.gamma  # of velocities that host forces read
         self.operator = Operator(ws.potential, self.mass, ws.free, ws.newton.others, self.transposed)
         ws.take_multipliers(j, ws.potential.held_at)
         if ws.rigid:  # forces on them turn with them
