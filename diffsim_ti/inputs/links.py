@@ -20,6 +20,9 @@ class FreeVelocity(Recording, Link):
     def value(self, v):
         return (linear(v, self.free, self.free),)
 
+    def vjp(self, x, y_adj):
+        return (self.free(y_adj[0]),)
+
 
 class LumpedMass(VertexShares):
     """Of each vertex, sum rho V s_a over its elements, with the node's share s_a, 1/4 of four nodes; rho is one number or
