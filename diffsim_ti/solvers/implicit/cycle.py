@@ -123,12 +123,22 @@ def positive_inverse(A: np.ndarray) -> np.ndarray:
     return (vectors / np.maximum(np.abs(values), 1e-6 * np.abs(values).max())) @ vectors.T
 
 
+def _inverse_blocks(dense: np.ndarray, b: int) -> np.ndarray:
+    """Blocks of the inverse, row by row, of what has a diagonal."""
+    k, there, inverse = len(dense) // b, np.ix_(*2 * (np.abs(np.diagonal(dense)) > 0,)), np.zeros_like(dense)
+    inverse[there] = positive_inverse(dense[there])
+    return inverse.reshape(k, b, k, b).transpose(0, 2, 1, 3).reshape(-1, b, b)
+
+
 def inverse_matrix(M):
     """The inverse of a matrix of blocks, body by body, as one; motions that a block has not stay zero."""
     from scipy.sparse import bsr_matrix
     from scipy.sparse.csgraph import connected_components
 
     k, b = nodes_of(M), M.blocksize[0]
+    if len(M.indices) == k * k and M.has_sorted_indices:  # all are coupled
+        dense = M.data.reshape(k, k, b, b).swapaxes(1, 2).reshape(k * b, -1)
+        return bsr_matrix((_inverse_blocks(dense, b), M.indices, M.indptr), shape=M.shape)
     graph = bsr_matrix((np.ones((len(M.indices), 1, 1)), M.indices, M.indptr), shape=(k, k)).tocsr()
     count, label = connected_components(graph, directed=False)
     at, place, rows, columns, data = np.repeat(np.arange(k), np.diff(M.indptr)), np.zeros(k, int), [], [], []
@@ -138,12 +148,9 @@ def inverse_matrix(M):
         dense = np.zeros((len(own), len(own), b, b))
         dense[place[at[mine]], place[M.indices[mine]]] = M.data[mine]
         dense = dense.swapaxes(1, 2).reshape(b * len(own), -1)
-        there = np.ix_(*2 * (np.abs(np.diagonal(dense)) > 0,))
-        inverse = np.zeros_like(dense)
-        inverse[there] = positive_inverse(dense[there])
         rows.append(np.repeat(own, len(own)))
         columns.append(np.tile(own, len(own)))
-        data.append(inverse.reshape(len(own), b, len(own), b).transpose(0, 2, 1, 3).reshape(-1, b, b))
+        data.append(_inverse_blocks(dense, b))
     rows, columns, data = (np.concatenate(parts) for parts in (rows, columns, data))
     order = np.argsort(rows, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=k))])

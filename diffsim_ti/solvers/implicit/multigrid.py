@@ -76,7 +76,8 @@ class Multigrid(Preconditioner):
     price = 40, 50_000
     # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
     usual, strained = (1.5, 3.0), 0.1
-    # vertices from which on coarse levels take contact, and the change of its share of the stiffness there that they take
+    # vertices from which on coarse levels take contact, of equilibria of what is loose at rest always, and the change of its
+    # share of the stiffness there that they take
     large, changed = 1000, 0.25
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
@@ -94,6 +95,8 @@ class Multigrid(Preconditioner):
         with potential.at_rest():
             self.frames.update()
             matrices, ways = self._levels()
+        if a.contacts and a.num_scenes == 1 and ways and not mass.any() and is_loose(matrices[-1]):
+            self.large = 0
         self.place = None
         self._made, self._contact = (matrices[1:], ways), None
         self.cycle = Cycle(matrices, ways, self.frames, parallel)
@@ -321,6 +324,13 @@ def turned(M, rows: np.ndarray, columns: np.ndarray):
     at = np.repeat(np.arange(nodes_of(M)), np.diff(M.indptr))
     data = np.swapaxes(rows, 1, 2)[at] @ M.data @ columns[M.indices]
     return bsr_matrix((data, M.indices, M.indptr), shape=M.shape)
+
+
+def is_loose(M) -> bool:
+    """Whether a matrix lets something move freely: `positive_inverse` raises such eigenvalues."""
+    A = M.toarray()
+    values = np.linalg.eigvalsh(A[np.ix_(*2 * (np.diagonal(A) > 0,))])
+    return bool(values[0] < 1e-6 * values[-1])
 
 
 def is_definite(M) -> bool:
