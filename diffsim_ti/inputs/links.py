@@ -29,8 +29,7 @@ class LumpedMass(VertexShares):
     one per tetrahedron; times the vertex's factor where there are some."""
 
     def __init__(self, mesh, factors: np.ndarray | None = None):
-        every = np.arange(mesh.num_tetrahedra), np.arange(mesh.num_vertices)
-        super().__init__(mesh, *every, True, "mass", factors)
+        super().__init__(mesh, slice(None), np.arange(mesh.num_vertices), True, "mass", factors)
 
 
 class Same(Recording, Link):

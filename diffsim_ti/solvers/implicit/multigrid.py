@@ -177,8 +177,14 @@ class Multigrid(Preconditioner):
         turns = projectors_of(self.free)[at] @ self.frames.matrices()[at]
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        more, levels = roots @ np.swapaxes(roots, 1, 2), []
+        if len(matrices) == 1 and len(matrices[0].indices) == nodes_of(matrices[0]) ** 2:  # all are coupled
+            M, P = matrices[0], ways[0].toarray().reshape(len(size), 3, -1)[at]
+            b, added = M.blocksize[0], np.tensordot(P, more @ P, ((0, 1), (0, 1)))
+            data = M.data + added.reshape(nodes_of(M), b, -1, b).swapaxes(1, 2).reshape(-1, b, b)
+            return self.cycle.put_below([bsr_matrix((data, M.indices, M.indptr), shape=M.shape)])
         start = np.searchsorted(at, np.arange(len(size) + 1))
-        more, levels = bsr_matrix((roots @ np.swapaxes(roots, 1, 2), at, start), shape=2 * (3 * len(size),)), []
+        more = bsr_matrix((more, at, start), shape=2 * (3 * len(size),))
         for M, P in zip(matrices, ways):
             more = (P.T @ (more @ P)).tobsr(M.blocksize)
             levels.append(with_blocks(M, more))
