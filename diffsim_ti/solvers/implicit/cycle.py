@@ -115,8 +115,9 @@ def positive_inverse(A: np.ndarray) -> np.ndarray:
 
     factor, fails = dpotrf(A, lower=1)
     if not fails:
-        lower = np.tril(dpotri(factor, lower=1)[0])
-        inverse = lower + np.tril(lower, -1).T
+        lower = dpotri(factor, lower=1)[0]  # zero above
+        inverse = lower + lower.T
+        inverse[np.diag_indices(len(A))] *= 0.5
         if np.abs(A).sum(0).max() * np.abs(inverse).sum(0).max() < 1e10:  # which is at least its condition
             return inverse
     values, vectors = np.linalg.eigh(A)
@@ -136,9 +137,6 @@ def inverse_matrix(M):
     from scipy.sparse.csgraph import connected_components
 
     k, b = nodes_of(M), M.blocksize[0]
-    if len(M.indices) == k * k and M.has_sorted_indices:  # all are coupled
-        dense = M.data.reshape(k, k, b, b).swapaxes(1, 2).reshape(k * b, -1)
-        return bsr_matrix((_inverse_blocks(dense, b), M.indices, M.indptr), shape=M.shape)
     graph = bsr_matrix((np.ones((len(M.indices), 1, 1)), M.indices, M.indptr), shape=(k, k)).tocsr()
     count, label = connected_components(graph, directed=False)
     at, place, rows, columns, data = np.repeat(np.arange(k), np.diff(M.indptr)), np.zeros(k, int), [], [], []
@@ -175,6 +173,7 @@ class Cycle:
         self._down, self._up = [], []  # (kernel, records, numbers)
         downs = [P.T.tobsr(P.blocksize[::-1]) for P in ways]
         last, inverse = self.levels[-1], inverse_matrix(matrices[-1])
+        self.is_one_body = len(inverse.indices) == last.nodes**2
         within = [level.threads for level in self.levels[:-1]] + [threads_of(inverse)]
         for level, threads, above in zip(self.levels, within, [1, *map(threads_of, downs)]):
             if max(threads, above) > 1:
@@ -215,6 +214,10 @@ class Cycle:
             level.put_numbers(M)
         if matrices:
             runtime.fill(self._inverse.values, rows_of(inverse_matrix(matrices[-1]).data))
+
+    def put_inverse(self, coarsest: np.ndarray) -> None:
+        """Set that of a coarsest matrix, of one body."""
+        runtime.fill(self._inverse.values, rows_of(_inverse_blocks(coarsest, self.levels[-1].numbers)))
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""

@@ -98,7 +98,7 @@ class Multigrid(Preconditioner):
         if a.contacts and a.num_scenes == 1 and ways and not mass.any() and is_loose(matrices[-1]):
             self.large = 0
         self.place = None
-        self._made, self._contact = (matrices[1:], ways), None
+        self._made, self._contact, self._full = (matrices[1:], ways), None, None
         self.cycle = Cycle(matrices, ways, self.frames, parallel)
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
         if self._changes:
@@ -153,7 +153,7 @@ class Multigrid(Preconditioner):
         self.potential.place(u)
 
     def _put(self, matrices: list, ways: list) -> bool:
-        self._made, self._contact = (matrices[1:], ways), None
+        self._made, self._contact, self._full = (matrices[1:], ways), None, None
         return self.cycle.put(matrices, ways)
 
     def _bring_contact_down(self) -> None:
@@ -178,11 +178,11 @@ class Multigrid(Preconditioner):
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
         more, levels = roots @ np.swapaxes(roots, 1, 2), []
-        if len(matrices) == 1 and len(matrices[0].indices) == nodes_of(matrices[0]) ** 2:  # all are coupled
-            M, P = matrices[0], ways[0].toarray().reshape(len(size), 3, -1)[at]
-            b, added = M.blocksize[0], np.tensordot(P, more @ P, ((0, 1), (0, 1)))
-            data = M.data + added.reshape(nodes_of(M), b, -1, b).swapaxes(1, 2).reshape(-1, b, b)
-            return self.cycle.put_below([bsr_matrix((data, M.indices, M.indptr), shape=M.shape)])
+        if len(matrices) == 1 and self.cycle.is_one_body:
+            if self._full is None:
+                self._full = matrices[0].toarray(), ways[0].toarray().reshape(len(size), 3, -1)
+            A, P = self._full[0], self._full[1][at]
+            return self.cycle.put_inverse(A + np.tensordot(P, more @ P, ((0, 1), (0, 1))))
         start = np.searchsorted(at, np.arange(len(size) + 1))
         more = bsr_matrix((more, at, start), shape=2 * (3 * len(size),))
         for M, P in zip(matrices, ways):
