@@ -4,6 +4,7 @@ over all of them."""
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from operator import is_
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -42,55 +43,54 @@ class Recording:
     `fewest` the matrix of derivatives, too, which takes a sweep for each, once it was asked for `often`."""
 
     few, fewest, often = 20_000, 16, 10
-    _record, _slopes, _uses = (
-        None,
-        None,
-        0,
-    )  # (x, arrays that record in their place, y); dy/dx; adjoints asked for so far
+    _record = None  # what was recorded last, with what it read
 
-    def recorded(self, x: Arrays) -> tuple[list, Arrays]:
-        """(arrays that record in the place of x, what they lead to)"""
-        known = self._record
-        if known is not None and all(map(is_, known[0], x)):
-            return known[1:]
+    def recorded(self, x: Arrays) -> SimpleNamespace:
+        """leaves: arrays that record in the place of x; y: what they lead to; slopes: dy/dx, a row for each number of x,
+        where that is known."""
+        last = self._record
+        if last is not None and all(map(is_, last.x, x)):
+            return last
         leaves = [Recorded(part) for part in x]
-        found = leaves, self.value(*leaves)
+        found = SimpleNamespace(x=x, leaves=leaves, y=self.value(*leaves), slopes=None, uses=0)
         keeps = sum(map(np.size, x)) <= self.few and all(map(is_fixed, x))
-        self._record, self._slopes, self._uses = (x, *found) if keeps else None, None, 0
+        self._record = found if keeps else None
         return found
 
-    def _learn(self, x: Arrays, y_adj: Arrays) -> None:
-        """Find dy/dx, a row for each number of x, where it has become worth it."""
-        self._uses += 1
-        if self._uses != self.often:
-            return
-        size = sum(part.size for part in x)
-        if size <= self.fewest and size * sum(map(np.size, y_adj)) <= self.few:
-            ends = np.cumsum([0, *(part.size for part in x)])
-            changes = [[e[a:b].reshape(p.shape) for p, a, b in zip(x, ends, ends[1:])] for e in np.eye(size)]
-            self._slopes = np.array([_in_a_row(self.jvp(x, dx)) for dx in changes])
+    def _learn(self, at: SimpleNamespace) -> None:
+        """Find the slopes where these have become worth it."""
+        at.uses += 1
+        sizes = [np.size(part) for part in at.x] if at.uses == self.often else [self.fewest + 1]
+        if sum(sizes) <= self.fewest and sum(sizes) * sum(map(np.size, at.y)) <= self.few:
+            ends = np.cumsum([0, *sizes])
+            changes = [[e[a:b].reshape(p.shape) for p, a, b in zip(at.x, ends, ends[1:])] for e in np.eye(ends[-1])]
+            at.slopes = np.array([_in_a_row([forward(y, zip(at.leaves, dx)) for y in at.y]) for dx in changes])
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
-        leaves, values = self.recorded(x)
-        return [forward(y, zip(leaves, dx)) for y in values]
+        at = self.recorded(x)
+        return [forward(y, zip(at.leaves, dx)) for y in at.y]
 
     def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
-        leaves, values = self.recorded(x)
-        if self._slopes is not None:
-            flat, at, out = self._slopes @ _in_a_row(y_adj), 0, []
+        at = self.recorded(x)
+        if at.slopes is not None:
+            flat, end, out = at.slopes @ _in_a_row(y_adj), 0, []
             for part in x:
-                out.append(flat[at : at + part.size].reshape(part.shape))
-                at += part.size
+                out.append(flat[end : end + part.size].reshape(part.shape))
+                end += part.size
             return out
-        if self._record is not None:
-            self._learn(x, y_adj)
-        found = reverse_of_all(zip(values, y_adj), leaves)
+        self._learn(at)
+        found = reverse_of_all(zip(at.y, y_adj), at.leaves)
         return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
 
 
 def _in_a_row(arrays: Arrays) -> np.ndarray:
     """The numbers of all."""
     return np.ravel(arrays[0]) if len(arrays) == 1 else np.concatenate([*map(np.ravel, arrays)])
+
+
+def _are_same(x: Mapping, y: Mapping) -> bool:
+    """Whether two mappings hold the same objects."""
+    return x.keys() == y.keys() and all(map(is_, x.values(), map(y.__getitem__, x)))
 
 
 def is_fixed(x) -> bool:
@@ -180,13 +180,12 @@ class Chain:
         self, values: Mapping[str, np.ndarray], adjoints: Mapping[str, np.ndarray], wanted: Iterable[str]
     ) -> dict[str, np.ndarray]:
         """Adjoints of the wanted inputs for adjoints of what links write (None: zero)."""
-        wanted, given = tuple(wanted), (*values.values(),)
+        wanted, last = tuple(wanted), self._last
         pulled, before = self._way(wanted)
-        if self._last is None or self._last[0] != wanted or not all(map(is_, self._last[1], given)):
-            known = self._through(before, values)
-            self._last = (wanted, given, known) if all(map(is_fixed, given)) else None
-        else:
-            known = self._last[2]
+        if last is None or last[0] != wanted or not _are_same(last[1], values):
+            last = wanted, dict(values), self._through(before, values)
+            self._last = last if all(map(is_fixed, values.values())) else None
+        known = last[2]
         total = {n: y for n, y in adjoints.items() if y is not None}
         for link in reversed(pulled):
             if not any(name in total for name in link.writes):
