@@ -209,7 +209,7 @@ class JoinedAdjoint(ImplicitAdjoint):
         ws, features, count = self.ws, self.features, self.ws.num_scenes
         found, rows = self.numbers.collect(), features.sums()
         found.displacement, found.velocity = self.p, self.q
-        if features.density:
+        if features.density and self.element_masses is None:
             found.mass = self.mass_adj
         found.element_masses = self.element_masses
         found.rest = self.frames[0].sum(0) + self.rest_adj + (0.0 if found.rest is None else found.rest)

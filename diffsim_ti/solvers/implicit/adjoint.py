@@ -305,7 +305,7 @@ class ImplicitAdjoint(RecordedPasses):
         """Adjoints of what kernels read, in float64, at the start of the run."""
         a, features, out = self.ws.arrays, self.features, self.numbers.collect()
         out.displacement, out.velocity = self.p, self.q
-        if features.density:
+        if features.density and self.element_masses is None:
             out.mass = self.mass_adj
         out.element_masses = self.element_masses
         if features.gravity >= 0:
