@@ -77,7 +77,8 @@ class Multigrid(Preconditioner):
     # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
     usual, strained = (1.5, 3.0), 0.1
     # vertices of all scenes from which on coarse levels take contact; how many times as stiff as a vertex it is at least,
-    # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take
+    # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take.
+    # Of equilibria of what is loose at rest they take all.
     large, stiff, changed = 1000, 50, 0.5
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
@@ -95,6 +96,8 @@ class Multigrid(Preconditioner):
         with potential.at_rest():
             self.frames.update()
             matrices, ways = self._levels()
+        if a.contacts and a.num_scenes == 1 and ways and not mass.any() and is_loose(matrices[-1]):
+            self.large = self.stiff = 0
         self.place = None
         self._forget_contact(matrices, ways)
         self.cycle = Cycle(matrices, ways, self.frames, within)
@@ -336,6 +339,13 @@ def turned(M, rows: np.ndarray, columns: np.ndarray):
     at = np.repeat(np.arange(nodes_of(M)), np.diff(M.indptr))
     data = np.swapaxes(rows, 1, 2)[at] @ M.data @ columns[M.indices]
     return bsr_matrix((data, M.indices, M.indptr), shape=M.shape)
+
+
+def is_loose(M) -> bool:
+    """Whether a matrix lets something move freely: `positive_inverse` raises such eigenvalues."""
+    A = M.toarray()
+    values = np.linalg.eigvalsh(A[np.ix_(*2 * (np.diagonal(A) > 0,))])
+    return bool(values[0] < 1e-6 * values[-1])
 
 
 def is_definite(M) -> bool:
