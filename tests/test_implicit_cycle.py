@@ -491,7 +491,7 @@ def test_coarse_levels_take_stiff_contact_of_those_scenes_that_have_it():
         initial_velocities=np.where(thrown[:, None, None], [0.5, -1.0, 0], [0.5, 0.1, 0]) * np.ones((5, n, 3))
     )
     own = batch.sweep.workspace.newton.preconditioner
-    inverse, before, k = own.cycle._inverse, own._made[0][-1].toarray(), own.cycle.levels[-1].nodes // 5
+    inverse, before, k = own.cycle.inverse, own._made[0][-1].toarray(), own.cycle.levels[-1].nodes // 5
     start, column, rows = (runtime.fetch(x) for x in (inverse.start, inverse.column, inverse.values))
     found = np.zeros((5 * k, 6, 5 * k, 6))
     found[np.repeat(np.arange(5 * k), np.diff(start)), :, column] = rows.reshape(-1, 6, 8)[..., :6].swapaxes(1, 2)

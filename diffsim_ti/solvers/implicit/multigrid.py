@@ -161,6 +161,7 @@ class Multigrid(Preconditioner):
         """Levels below the finest one have none."""
         scenes, n = self.potential.arrays.num_scenes, self.potential.arrays.vertices_of_one
         self._made, self._below, self._contact = (matrices[1:], ways), matrices[1:], np.zeros((scenes, n))
+        self._full = None  # of one body with one level below the finest one, as dense arrays
 
     def _bring_contact_down(self, met: bool) -> None:
         """The levels below the finest one take contact with obstacles, where it has changed by much or a solve begins."""
@@ -187,8 +188,15 @@ class Multigrid(Preconditioner):
         turns = projectors_of(self.free)[at] @ self.frames.matrices()[at]
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        more, levels = roots @ np.swapaxes(roots, 1, 2), []
+        if len(matrices) == 1 and self.cycle.inverse.is_of_one_body:
+            if self._full is None:
+                self._full = matrices[0].toarray(), ways[0].toarray().reshape(size.size, 3, -1)
+            M, P = self._full[0], self._full[1][at]
+            self.cycle.inverse.put_dense(M + np.tensordot(P, more @ P, ((0, 1), (0, 1))))
+            return
         start = np.searchsorted(at, np.arange(size.size + 1))
-        more, levels = bsr_matrix((roots @ np.swapaxes(roots, 1, 2), at, start), shape=2 * (3 * size.size,)), []
+        more = bsr_matrix((more, at, start), shape=2 * (3 * size.size,))
         for M, P, before in zip(matrices, ways, self._below):
             more = (P.T @ (more @ P)).tobsr(M.blocksize)
             levels.append(with_blocks(M, more))
