@@ -160,8 +160,9 @@ class CriticalPoint(metaclass=Public):
             ds/dtheta = -(w . df/dtheta) / (w . df/ds)
 
         At a branch point of a symmetric stiffness K the eigenvalue g = mode . K mode stays zero along the path that is
-        followed, ds/dtheta = -(dg/dtheta) / (dg/ds), total derivatives. Of what breaks its symmetry there is none: the
-        factor falls with the power 2/3, or 1/2, of an imperfection.
+        followed, ds/dtheta = -(dg/dtheta) / (dg/ds), total derivatives; of several that are zero together, as of equal
+        columns, that of `mode`. Of what breaks its symmetry there is none: the factor falls with the power 2/3, or 1/2, of
+        an imperfection.
         Wu 1995, Sensitivity of critical loads; Koiter 1945, On the stability of elastic equilibrium.
         """
         e, w = self._equilibria, self._equilibria.field(self._null[1])
