@@ -524,6 +524,20 @@ def test_steps_of_implicit_scenes_go_on_from_their_ends():
     np.testing.assert_allclose(state["initial_positions"], frames.positions[:, -1], rtol=0, atol=1e-8)
 
 
+def test_blocks_of_a_scene_that_rests_take_what_hosts_add_once():
+    """While others are judged, twice."""
+    euler = implicit("Euler")[0].solver
+    scene = euler.scene.replace(terms=[*euler.scene.terms, ds.ElasticFoundation(1e6, surface="ymax")])
+    batch = ds.Batch(ds.ImplicitEulerSolver(scene, dt=0.005), 1, 3)
+    batch.forward()
+    potential = batch.sweep.workspace.potential
+    for _ in range(2):
+        potential.only(np.array([False, True, False]))
+        potential.put_contact_blocks()
+    blocks = np.swapaxes(runtime.fetch(potential.barriers.blocks), 0, 1)
+    np.testing.assert_allclose(blocks, potential.contact_blocks(), rtol=1e-12)
+
+
 def test_gradients_of_a_scene_that_is_given_up_are_of_its_run_alone(monkeypatch):
     solve_all = JoinedNewton.solve_all
 
