@@ -15,7 +15,9 @@ from diffsim_ti.batch.joined_newton import JoinedNewton
 from diffsim_ti.batch.joined_scene import JoinedArrays
 from diffsim_ti.batch.joined_workspace import JoinedSweep
 from diffsim_ti.diff_simulator import rollout_frames
+from diffsim_ti.runtime import Piecewise
 from diffsim_ti.solvers.implicit.preconditioners import Preconditioner
+from diffsim_ti.solvers.implicit.rounds import Rounds
 
 MESH = ds.TetrahedralMesh.create_box(3, 0.1)
 LOW = MESH.vertices[:, 1].min()
@@ -492,6 +494,22 @@ def test_implicit_scenes_are_solved_together(kind, monkeypatch):
         assert type(together.error(1)) is type(by_turns.error(1)) and "step 0" in str(together.error(1))
 
 
+def test_small_scenes_are_solved_in_few_launches(monkeypatch):
+    """Each pass asks where to start and solves; where a launch ends early the next one goes on as if it had not."""
+    launches, launch, found = [], Piecewise.__call__, []
+    monkeypatch.setattr(
+        Piecewise, "__call__", lambda self, *more, **own: (launches.append(self), launch(self, *more, **own))
+    )
+    for many in (200, 2):
+        monkeypatch.setattr(Rounds, "many", many)
+        batch, own = implicit("Euler")
+        launches.clear()
+        found.append((batch.forward(**own).displacements, len(launches)))
+    (whole, few), (in_parts, more) = found
+    np.testing.assert_array_equal(whole, in_parts)
+    assert few <= 6 * 4 < 2 * 6 * 4 < more, (few, more)  # of four passes
+
+
 @pytest.mark.backends
 def test_backend_of_implicit_scenes():
     """Where each has a thread of its own that sums over a dozen chunks of vertices, and ends after rounds of its own."""
@@ -522,6 +540,20 @@ def test_steps_of_implicit_scenes_go_on_from_their_ends():
         state = batch.forward(**own, **state).end
     frames = whole.forward(**own, initial_velocities=start)
     np.testing.assert_allclose(state["initial_positions"], frames.positions[:, -1], rtol=0, atol=1e-8)
+
+
+def test_blocks_of_a_scene_that_rests_take_what_hosts_add_once():
+    """While others are judged, twice."""
+    euler = implicit("Euler")[0].solver
+    scene = euler.scene.replace(terms=[*euler.scene.terms, ds.ElasticFoundation(1e6, surface="ymax")])
+    batch = ds.Batch(ds.ImplicitEulerSolver(scene, dt=0.005), 1, 3)
+    batch.forward()
+    potential = batch.sweep.workspace.potential
+    for _ in range(2):
+        potential.only(np.array([False, True, False]))
+        potential.put_contact_blocks()
+    blocks = np.swapaxes(runtime.fetch(potential.barriers.blocks), 0, 1)
+    np.testing.assert_allclose(blocks, potential.contact_blocks(), rtol=1e-12)
 
 
 def test_gradients_of_a_scene_that_is_given_up_are_of_its_run_alone(monkeypatch):

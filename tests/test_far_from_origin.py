@@ -12,6 +12,7 @@ import pytest
 import torch
 from contact_scenes import SHAPES, tetrahedron
 from far_places import FAR, found, moved, worst
+from scipy.spatial.transform import Rotation
 from test_own_obstacle import Ring
 
 import diffsim_ti as ds
@@ -106,16 +107,19 @@ def test_positions_keep_their_digits():
     np.testing.assert_allclose(theirs.positions.numpy(), exact[0] + 0.25, rtol=0, atol=1e-7)
 
 
-def test_a_file_for_blender_keeps_its_digits(tmp_path):
-    far = moved(scene(), FAR)
+@pytest.mark.parametrize("up", "xyz")
+def test_a_file_for_blender_keeps_its_digits_and_has_y_up(up, tmp_path):
+    far = moved(scene(), FAR).replace(terms=[ds.Gravity(up=up)])
     with open_writer(tmp_path / "run.glb", far) as writer:
         writer.write(Frame.of(ds.Simulator(ds.SemiImplicitSolver(far, dt=1e-3))))
     whole = (tmp_path / "run.glb").read_bytes()
     size = struct.unpack("<I", whole[12:16])[0]
     parts, numbers = json.loads(whole[20 : 20 + size]), whole[28 + size :]
-    surface = MESH.surface_vertices
-    places = np.frombuffer(numbers, "<f4", 3 * len(surface)).reshape(-1, 3)
-    np.testing.assert_allclose(places + parts["nodes"][0]["translation"], far.mesh.vertices[surface], atol=1e-6)
+    x, node = far.mesh.vertices[MESH.surface_vertices], parts["nodes"][0]
+    turn = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1]))
+    places = turn.apply(np.frombuffer(numbers, "<f4", x.size).reshape(-1, 3)) + node["translation"]
+    np.testing.assert_allclose(places, turn.apply(x), atol=1e-6)
+    np.testing.assert_allclose(places[:, 1], x[:, "xyz".index(up)], atol=1e-6)
 
 
 def test_the_nearest_point_of_a_plane():

@@ -10,7 +10,7 @@ import taichi as ti
 import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.stress.projection import Projection
-from diffsim_ti.solvers.implicit import cycle
+from diffsim_ti.solvers.implicit import cycle, multigrid
 from diffsim_ti.solvers.implicit.contact_kernels import ContactKernels
 from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
@@ -427,6 +427,24 @@ def stretched() -> ds.StaticSolver:
     return ds.StaticSolver(scene, dt=1.0, preconditioner="multigrid")
 
 
+def test_contact_holds_a_loose_body_on_coarse_levels(monkeypatch):
+    """An equilibrium on a floor, where nothing else stiffens rigid motions, takes a third of the products or less."""
+    mesh = ds.TetrahedralMesh.create_box(4, 0.2, origin=(0.0, 0.0005, 0.0))
+    terms = [ds.Gravity(), ds.Ground(friction=0.4)]
+    scene, found = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.4), terms=terms, precision="f64"), []
+    for loose in (multigrid.is_loose, lambda _: False):
+        monkeypatch.setattr(multigrid, "is_loose", loose)
+        rollout = ds.Rollout(ds.StaticSolver(scene), 1, gradients=["youngs_modulus"])
+        with pytest.warns(UserWarning, match="free to move rigidly"):
+            frames = rollout.forward()
+        gradient = rollout.vjp(frames, frames.displacements)["youngs_modulus"]
+        found.append((frames.displacements[-1], gradient, rollout.report.products))
+    (u, g, few), (v, h, many) = found
+    assert few <= many / 3
+    np.testing.assert_allclose(u, v, atol=1e-7 * np.abs(v).max())
+    np.testing.assert_allclose(g, h, rtol=1e-6)
+
+
 def test_matrices_of_the_strained_state(monkeypatch):
     """They save iterations, come back with a state to the bit, and leave results as they are."""
     found = {}
@@ -473,7 +491,7 @@ def test_coarse_levels_take_stiff_contact_of_those_scenes_that_have_it():
         initial_velocities=np.where(thrown[:, None, None], [0.5, -1.0, 0], [0.5, 0.1, 0]) * np.ones((5, n, 3))
     )
     own = batch.sweep.workspace.newton.preconditioner
-    inverse, before, k = own.cycle._inverse, own._made[0][-1].toarray(), own.cycle.levels[-1].nodes // 5
+    inverse, before, k = own.cycle.inverse, own._made[0][-1].toarray(), own.cycle.levels[-1].nodes // 5
     start, column, rows = (runtime.fetch(x) for x in (inverse.start, inverse.column, inverse.values))
     found = np.zeros((5 * k, 6, 5 * k, 6))
     found[np.repeat(np.arange(5 * k), np.diff(start)), :, column] = rows.reshape(-1, 6, 8)[..., :6].swapaxes(1, 2)

@@ -311,6 +311,31 @@ def test_a_link_is_computed_again_only_if_what_it_reads_changed():
     assert chain.value(dict(a=writable, d=d))["c"] == 16
 
 
+class Product(Recording, Link):
+    """c = a b^2, counting its calls."""
+
+    reads, writes, calls = ("a", "b"), ("c",), 0
+
+    def value(self, a, b):
+        self.calls += 1
+        return (a * b * b,)
+
+
+@pytest.mark.parametrize("size", [1, Recording.fewest], ids=["by the matrix of derivatives", "by sweeps"])
+def test_what_a_link_recorded_is_kept_while_it_holds(size):
+    link, a, b = Product(), fixed_array(*np.arange(1.0, size + 1)), fixed_array(3.0)
+    for k in range(Recording.often + 2):
+        by_a, by_b = link.vjp([a, b], [np.full(size, float(k))])
+        assert np.allclose(by_a, 9.0 * k, rtol=1e-15) and by_b == pytest.approx(6.0 * k * a.sum(), rel=1e-15)
+    assert link.calls == 1 and (link._record.slopes is not None) == (size == 1)
+    assert link.jvp([a, b], [np.ones(size), np.ones(1)])[0] == pytest.approx(9.0 + 6.0 * a) and link.calls == 1
+    assert link.vjp([a, fixed_array(5.0)], [np.ones(size)])[0] == pytest.approx(25.0) and link.calls == 2
+    changing = np.zeros(1)
+    for number in (2.0, 4.0):  # may change and stay the same array
+        changing[0] = number
+        assert link.vjp([a, changing], [np.ones(size)])[0] == pytest.approx(number**2)
+
+
 def test_only_links_on_the_way_are_pulled_back():
     first, second, third = Counted("a", "b"), Counted("b", "c"), Counted("d", "e")
     chain = Chain([first, second, third], ["a", "d"])

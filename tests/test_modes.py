@@ -84,6 +84,17 @@ def test_a_clamped_beam_by_both_eigensolvers():
     assert not found.shapes[:, scene.fixed].any()
 
 
+def test_of_a_state_that_is_unstable_the_lowest_modes_are_found():
+    """Of a column that is pressed by a hundredth of its length, with 960 unknowns: the eigenvalues of the dense pencil."""
+    mesh = ds.TetrahedralMesh.create_box((4, 21, 4), size=(0.1, 1.0, 0.1))
+    scene, u = scene_of(mesh, fixed="ymin"), mesh.vertices * [0, -0.01, 0]
+    free = np.setdiff1d(np.arange(3 * mesh.num_vertices), 3 * scene.fixed[:, None] + np.arange(3))
+    K, M = (x.toarray()[np.ix_(free, free)] for x in (scene.stiffness_matrix(u), scene.mass_matrix()))
+    values = eigh(K, M, eigvals_only=True, subset_by_index=[0, 4])
+    assert values[0] < 20 * values[2] < 0
+    assert ds.modes(scene, 5, u).eigenvalues == pytest.approx(values, rel=1e-8)
+
+
 def test_scikit_fem_has_the_same_elements():
     """Its stiffness by its own quadrature; its mass lumped by row sums."""
     skfem = pytest.importorskip("skfem")

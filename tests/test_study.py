@@ -263,7 +263,9 @@ def test_advice_names_patches_where_tetrahedra_lock(bulk_modulus, says):
 @pytest.mark.parametrize(
     "wrong, says",
     [
-        (dict(duration=-1.0), "or 0 for an equilibrium"),
+        (dict(duration=-1.0), "if not 0 for an equilibrium"),
+        (dict(frames=0), "frames must be a whole number >= 1"),
+        (dict(budget=-1.0), "budget must be > 0"),
         (dict(weights=1.0), "pass output="),
         (dict(output="end"), "output must be an output"),
         (dict(tolerance=2.0), "tolerance"),
@@ -274,6 +276,11 @@ def test_advice_refuses_what_is_no_question(wrong, says):
     scene, duration, tolerance = limited_displacement("drop")
     with pytest.raises(ValueError, match=says):
         recommend(scene, **dict(duration=duration, tolerance=tolerance) | wrong)
+
+
+def test_advice_for_a_body_that_stays_where_it_is():
+    scene = ds.Scene(ds.TetrahedralMesh.create_cube(2, 0.1), ds.StableNeoHookean(1e5, 0.3), fixed="ymin")
+    assert recommend(scene, 0.01, gradients=False, budget=1.0, elements=False).error == 0
 
 
 def test_own_scene_is_charted_against_its_own_converged_motion():

@@ -1,7 +1,10 @@
 """Conjugate gradients of all scenes of a batch at once: each has its own numbers alpha, beta and end."""
 
+import numpy as np
+
+from diffsim_ti import runtime
 from diffsim_ti.runtime.piecewise import Pieces
-from diffsim_ti.solvers.implicit.cg_kernels import STOPPED
+from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, LIMIT, ROOM, SQUARE, STOPPED
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 
 COUNTS = "nodes", "below", "shares", "shares_below", "chunks", "systems"  # of all scenes
@@ -32,6 +35,28 @@ class JoinedCG(DeviceCG):
     def __init__(self, potential, *more):
         self.systems, self.by_scene = potential.arrays.num_scenes, potential.arrays.by_scene
         super().__init__(potential, *more)
+        self._look = self.many if self.by_scene else 0
+
+    def solve(self, b: np.ndarray, tolerance, going, most: int, eps: float, more: bool) -> tuple:
+        """(x, rows of `state`) of all systems, whose mass and matrix are on the device; of one that is not `going` 0. A
+        system that meets a direction of negative curvature has the x before it or, if it is the first, the preconditioned b.
+        """
+        rows = b.reshape(self.systems, -1)
+        size, state = np.sqrt(np.einsum("ij,ij->i", rows, rows)), np.zeros((self.systems, ROOM))
+        wanted, done = going & (size > 0), 0
+        runtime.fill(self.r, (rows / np.where(wanted, size, np.inf)[:, None]).reshape(1, -1, 3))
+        state[:, LEAST], state[:, LIMIT], state[:, STOPPED] = tolerance**2, most, ~wanted
+        runtime.fill(self.state, state)
+        while done < most and (on := (state[:, STOPPED] == 0) & np.isfinite(state[:, SQUARE])).any():
+            self.iterate(state[on], most, eps, more)
+            state = runtime.fetch(self.state)
+            done = max(done + 1, int(state[:, COUNT].max()))
+        x = runtime.fetch_row(self.x, 0).reshape(rows.shape)
+        first = (state[:, STOPPED] == 2) & (state[:, COUNT] == 1)
+        if first.any():
+            x = np.where(first[:, None], runtime.fetch_row(self.p, 0).reshape(rows.shape), x)
+        known = wanted & (state[:, COUNT] > 0)
+        return np.where(known[:, None], x * size[:, None], 0.0).reshape(b.shape), state
 
     def __call__(self, mass, more, b, tolerances, going, max_iterations: int, eps: float):
         """(x, solved, negative) of each scene, as `solve`."""

@@ -166,6 +166,11 @@ class JoinedPotential(Potential):
         """Let what follows be of some scenes, a mask; of others what was found before stays."""
         runtime.fill(self.skip, ~scenes)
 
+    def put_contact_blocks(self):
+        if self.hosts:  # who add to those of all scenes
+            runtime.fill(self.skip, 0)
+        super().put_contact_blocks()
+
     def energies_beside(self):
         own = [part.energies(self.held_at) for part in self.hosts]
         return np.concatenate([np.zeros((self.arrays.num_scenes, 0)), *own], 1)

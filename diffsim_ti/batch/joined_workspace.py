@@ -200,7 +200,9 @@ class JoinedAdjoint(ImplicitAdjoint):
         """The scenes are the first axis."""
         ws, features, count = self.ws, self.features, self.ws.num_scenes
         found, rows = self.numbers.collect(), features.sums()
-        found.displacement, found.velocity, found.mass = self.p, self.q, self.mass_adj
+        found.displacement, found.velocity = self.p, self.q
+        if features.density and self.element_masses is None:
+            found.mass = self.mass_adj
         found.element_masses = self.element_masses
         found.rest = self.frames[0].sum(0) + self.rest_adj + (0.0 if found.rest is None else found.rest)
         if self.motion is not None:
@@ -213,7 +215,7 @@ class JoinedAdjoint(ImplicitAdjoint):
         of_vertices = runtime.fetch(self.numbers.sums).astype(np.float64)[rows.of("parameters")]
         out.parameters[:, : features.num_parameters] = of_scenes(of_vertices, count, axis=1).sum(2)
         if features.gravity >= 0:
-            out.parameters[:, features.gravity :][:, :3] = self.gravity
+            out.parameters[:, features.gravity :][:, :3] = self.gravity_adj
         if features.drag >= 0:
             out.parameters[:, features.drag] = self.rate
         for name in ("forces", "motion", "path"):

@@ -11,12 +11,12 @@ from threadpoolctl import ThreadpoolController
 
 
 @lru_cache(maxsize=1)
-def _controller() -> ThreadpoolController:
-    """Finding the libraries takes milliseconds; limiting them afterwards does not. Only those that are loaded are found,
-    and scipy brings a BLAS of its own."""
+def _libraries() -> list:
+    """Finding them takes milliseconds; limiting them afterwards does not. Only those that are loaded are found, and scipy
+    brings a BLAS of its own."""
     import scipy.linalg  # noqa: F401
 
-    return ThreadpoolController()
+    return ThreadpoolController().select(user_api="blas").lib_controllers
 
 
 def one_blas_thread(function: Callable) -> Callable:
@@ -24,7 +24,14 @@ def one_blas_thread(function: Callable) -> Callable:
 
     @wraps(function)
     def limited(*arguments, **named):
-        with _controller().limit(limits=1, user_api="blas"):
+        before = [(library, library.get_num_threads()) for library in _libraries()]
+        several = [(library, count) for library, count in before if count not in (None, 1)]
+        try:
+            for library, _ in several:
+                library.set_num_threads(1)
             return function(*arguments, **named)
+        finally:
+            for library, count in several:
+                library.set_num_threads(count)
 
     return limited

@@ -4,6 +4,7 @@ over all of them."""
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from operator import is_
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -38,16 +39,63 @@ class Link(ABC):
 
 class Recording:
     """The part of a link whose value takes arrays that record, from which its derivatives are found
-    (differentiation/arrays.py)."""
+    (differentiation/arrays.py). What was recorded is kept while x, of up to `few` numbers, stays the same arrays; of up to
+    `fewest` the matrix of derivatives, too, which takes a sweep for each, once it was asked for `often`."""
+
+    few, fewest, often = 20_000, 16, 10
+    _record = None  # what was recorded last, with what it read
+
+    def recorded(self, x: Arrays) -> SimpleNamespace:
+        """leaves: arrays that record in the place of x; y: what they lead to; slopes: dy/dx, a row for each number of x,
+        where that is known."""
+        last = self._record
+        if last is not None and all(map(is_, last.x, x)):
+            return last
+        leaves = [Recorded(part) for part in x]
+        found = SimpleNamespace(x=x, leaves=leaves, y=self.value(*leaves), slopes=None, uses=0)
+        keeps = sum(map(np.size, x)) <= self.few and all(map(is_fixed, x))
+        self._record = found if keeps else None
+        return found
+
+    def _learn(self, at: SimpleNamespace) -> None:
+        """Find the slopes where these have become worth it."""
+        at.uses += 1
+        sizes = [np.size(part) for part in at.x] if at.uses == self.often else [self.fewest + 1]
+        if sum(sizes) <= self.fewest and sum(sizes) * sum(map(np.size, at.y)) <= self.few:
+            ends = np.cumsum([0, *sizes])
+            changes = [[e[a:b].reshape(p.shape) for p, a, b in zip(at.x, ends, ends[1:])] for e in np.eye(ends[-1])]
+            at.slopes = np.array([_in_a_row([forward(y, zip(at.leaves, dx)) for y in at.y]) for dx in changes])
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
-        leaves = [Recorded(part) for part in x]
-        return [forward(y, zip(leaves, dx)) for y in self.value(*leaves)]
+        at = self.recorded(x)
+        return [forward(y, zip(at.leaves, dx)) for y in at.y]
 
     def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
-        leaves = [Recorded(part) for part in x]
-        found = reverse_of_all(zip(self.value(*leaves), y_adj), leaves)
+        at = self.recorded(x)
+        if at.slopes is not None:
+            flat, end, out = at.slopes @ _in_a_row(y_adj), 0, []
+            for part in x:
+                out.append(flat[end : end + part.size].reshape(part.shape))
+                end += part.size
+            return out
+        self._learn(at)
+        found = reverse_of_all(zip(at.y, y_adj), at.leaves)
         return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
+
+
+def _in_a_row(arrays: Arrays) -> np.ndarray:
+    """The numbers of all."""
+    return np.ravel(arrays[0]) if len(arrays) == 1 else np.concatenate([*map(np.ravel, arrays)])
+
+
+def _are_same(x: Mapping, y: Mapping) -> bool:
+    """Whether two mappings hold the same objects."""
+    return x.keys() == y.keys() and all(map(is_, x.values(), map(y.__getitem__, x)))
+
+
+def is_fixed(x) -> bool:
+    """Whether an array has its numbers for good: what may be written to may change and stay the same array."""
+    return isinstance(x, np.ndarray) and not x.flags.writeable
 
 
 class Chain:
@@ -73,6 +121,7 @@ class Chain:
         self._kept: dict[Link, tuple[Arrays, Arrays]] = {}  # (what it read, what it wrote)
         self._ways: dict[tuple[str, ...], tuple[list[Link], list[Link]]] = {}
         self._after: dict[tuple[str, ...], list[Link]] = {}
+        self._last: tuple | None = None  # wanted inputs, values of all, and what `vjp` read of these
 
     def value(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The values and what all links write; links that miss something are left out."""
@@ -93,7 +142,7 @@ class Chain:
         if before is not None and all(map(is_, before[0], x)):
             return before[1]
         y = [frozen(part) for part in link.value(*x)]
-        if not any(part.flags.writeable for part in x):  # what may be written to may change and stay the same array
+        if all(map(is_fixed, x)):
             self._kept[link] = x, y
         return y
 
@@ -131,8 +180,13 @@ class Chain:
         self, values: Mapping[str, np.ndarray], adjoints: Mapping[str, np.ndarray], wanted: Iterable[str]
     ) -> dict[str, np.ndarray]:
         """Adjoints of the wanted inputs for adjoints of what links write (None: zero)."""
-        pulled, before = self._way(tuple(wanted))
-        known, total = self._through(before, values), {n: y for n, y in adjoints.items() if y is not None}
+        wanted, last = tuple(wanted), self._last
+        pulled, before = self._way(wanted)
+        if last is None or last[0] != wanted or not _are_same(last[1], values):
+            last = wanted, dict(values), self._through(before, values)
+            self._last = last if all(map(is_fixed, values.values())) else None
+        known = last[2]
+        total = {n: y for n, y in adjoints.items() if y is not None}
         for link in reversed(pulled):
             if not any(name in total for name in link.writes):
                 continue

@@ -70,7 +70,8 @@ class Derived:
 
     def zeros(self, but=()) -> "Derived":
         """The same shapes, all zero; None for those in `but`."""
-        return self.replaced(**dict.fromkeys(but)).mapped(lambda part: np.zeros(part.shape))
+        parts = vars(self).items()
+        return Derived(**{n: None if part is None or n in but else np.zeros(part.shape) for n, part in parts})
 
 
 class DerivedNode(Node):

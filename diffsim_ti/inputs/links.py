@@ -20,14 +20,16 @@ class FreeVelocity(Recording, Link):
     def value(self, v):
         return (linear(v, self.free, self.free),)
 
+    def vjp(self, x, y_adj):
+        return (self.free(y_adj[0]),)
+
 
 class LumpedMass(VertexShares):
     """Of each vertex, sum rho V s_a over its elements, with the node's share s_a, 1/4 of four nodes; rho is one number or
     one per tetrahedron; times the vertex's factor where there are some."""
 
     def __init__(self, mesh, factors: np.ndarray | None = None):
-        every = np.arange(mesh.num_tetrahedra), np.arange(mesh.num_vertices)
-        super().__init__(mesh, *every, True, "mass", factors)
+        super().__init__(mesh, slice(None), np.arange(mesh.num_vertices), True, "mass", factors)
 
 
 class Same(Recording, Link):

@@ -48,7 +48,9 @@ class VertexShares(Recording, Link):
     """What each of some vertices has of the volume [m^3] or, with density, of the mass [kg] of the given tetrahedra around
     it: a fourth of each, or the shares of lumped masses of ten nodes; times factors of the vertices where there are some."""
 
-    def __init__(self, mesh, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str, factors=None):
+    def __init__(
+        self, mesh, chosen: np.ndarray | slice, vertices: np.ndarray, of_mass: bool, writes: str, factors=None
+    ):
         volumes = "volumes" if mesh.order == 1 else "element volumes"
         self.reads, self.writes = (volumes, "density") if of_mass else (volumes,), (writes,)
         self.chosen, self.count, self.shares = chosen, len(vertices), mesh.reference.lumped

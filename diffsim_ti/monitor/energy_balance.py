@@ -120,11 +120,11 @@ class EnergyBalance(Gains):
             self.ws.place_obstacles(first)
             self.window.poses = runtime.fetch(self.ws.arrays.offsets)
 
-    def after(self, now: int, num_passes: int, count: int) -> None:
-        """`count` passes are done, up to pass `now`, by the run alone."""
+    def after(self, now: int, num_passes: int, count: int, may_check: bool) -> None:
+        """`count` passes are done, up to pass `now`, by the run alone; may_check: here, if there were enough."""
         window = self.window
         window.passes, window.changes = window.passes + count, self.ws.changes
-        if window.passes >= min(self.every, self._soon):
+        if may_check and window.passes >= min(self.every, self._soon):
             self._check(now, num_passes)
             self._soon *= 2
             window.changes = self.ws.changes

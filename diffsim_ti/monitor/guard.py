@@ -206,6 +206,8 @@ class Guard:
                 step = int(schedule.row(first)) + 1
                 end = int(schedule.first(step)) if step <= schedule.row(num_passes - 1) else num_passes
                 stop = min(stop, end)
+            done = self._passes + stop - first
+            whole = done >= self.every or stop == num_passes or schedule.length(stop) != schedule.length(first)
             if balance:
                 balance.before(first, num_passes)
             self.mark(first)
@@ -213,21 +215,21 @@ class Guard:
                 self._pass(first, stop, num_passes, save_every, recording)
             except Tunnelling as error:
                 raise self._with_stable_step(error) from None
-            if self.ws.bending and self.ws.solver.explicit and stop == end:
+            if self.ws.bending and self.ws.solver.explicit and (stop == end if bends else whole):
                 self.ws.bending.check(stop, runtime.fetch_row(self.ws.state.u, 0))
             if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
                 self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
-            self._warn_of_stiff_contact(stop, num_passes)
             if balance:
-                balance.after(stop, num_passes, stop - first)
-            self._warn_of_gained_energy(stop, num_passes)
-            self._passes += stop - first
-            self._unseen += stop - first
-            if self.chatter and self._unseen >= self.usual:  # what shakes soon after an impact is none
-                self._unseen = 0
-                self.chatter.check(stop, num_passes)
+                balance.after(stop, num_passes, stop - first, whole)
+            self._passes, self._unseen = done, self._unseen + stop - first
+            if whole:  # so that what is said does not depend on where segments end
+                self._warn_of_stiff_contact(stop, num_passes)
+                self._warn_of_gained_energy(stop, num_passes)
+                if self.chatter and self._unseen >= self.usual:  # what shakes soon after an impact is none
+                    self._unseen = 0
+                    self.chatter.check(stop, num_passes)
             if self._passes >= self.every:
                 self._passes = 0
                 self._check_step(stop, num_passes)

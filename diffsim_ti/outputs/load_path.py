@@ -16,7 +16,7 @@ from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
 from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.outputs.forces_at_frames import AppliedLoads, BodyForces, at_end
-from diffsim_ti.outputs.modes import FOURTH_ORDER, free_directions
+from diffsim_ti.outputs.modes import FOURTH_ORDER, Tangent, free_directions
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import StaticSolver
 from diffsim_ti.terms import Robot, SelfContact
@@ -125,33 +125,6 @@ class Equilibria:
         return sum(float((self.own[name] * gradients[name]).sum()) for name in self.load)
 
 
-class Tangent:
-    """Factors of a matrix A without pivoting, so that `negative` pivots are as many as negative eigenvalues."""
-
-    def __init__(self, A):
-        from scipy.sparse.linalg import splu
-
-        self.A = A
-        try:
-            factors = splu(A, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True))
-        except RuntimeError:
-            raise NotConverged("load_path: the stiffness is singular to rounding", []) from None
-        self._solve, self.negative = factors.solve, int((factors.U.diagonal() < 0).sum())
-
-    def solve(self, b: np.ndarray, transposed: bool = False) -> np.ndarray:
-        trans, A = ("T", self.A.T) if transposed else ("N", self.A)
-        x = self._solve(b, trans)
-        return x + self._solve(b - A @ x, trans)
-
-    def null(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """(v, w, mu): A v = mu v, w A = mu w, mu nearest to zero, of length one."""
-        v = w = np.random.default_rng(0).standard_normal(self.A.shape[0])
-        for _ in range(4):
-            v, w = self.solve(v / np.linalg.norm(v)), self.solve(w / np.linalg.norm(w), True)
-        v, w = v / np.linalg.norm(v), w / np.linalg.norm(w)
-        return v, w, float(w @ (self.A @ v)) / float(w @ v)
-
-
 @dataclass(frozen=True)
 class _Point:
     u: np.ndarray
@@ -187,8 +160,9 @@ class CriticalPoint(metaclass=Public):
             ds/dtheta = -(w . df/dtheta) / (w . df/ds)
 
         At a branch point of a symmetric stiffness K the eigenvalue g = mode . K mode stays zero along the path that is
-        followed, ds/dtheta = -(dg/dtheta) / (dg/ds), total derivatives. Of what breaks its symmetry there is none: the
-        factor falls with the power 2/3, or 1/2, of an imperfection.
+        followed, ds/dtheta = -(dg/dtheta) / (dg/ds), total derivatives; of several that are zero together, as of equal
+        columns, that of `mode`. Of what breaks its symmetry there is none: the factor falls with the power 2/3, or 1/2, of
+        an imperfection.
         Wu 1995, Sensitivity of critical loads; Koiter 1945, On the stability of elastic equilibrium.
         """
         e, w = self._equilibria, self._equilibria.field(self._null[1])

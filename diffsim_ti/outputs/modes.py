@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.brief import brief_fields
 from diffsim_ti.common.checked import shown
+from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.common.public import Public, public
 from diffsim_ti.differentiation.arrays import Recorded, reverse
 from diffsim_ti.inputs import DerivedNode, StressPoints
@@ -140,6 +141,33 @@ def free_directions(scene: Scene):
     return out
 
 
+class Tangent:
+    """Factors of a matrix A without pivoting, so that `negative` pivots are as many as negative eigenvalues."""
+
+    def __init__(self, A):
+        from scipy.sparse.linalg import splu
+
+        self.A = A
+        try:
+            factors = splu(A, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True))
+        except RuntimeError:
+            raise NotConverged("the stiffness is singular to rounding", []) from None
+        self._solve, self.negative = factors.solve, int((factors.U.diagonal() < 0).sum())
+
+    def solve(self, b: np.ndarray, transposed: bool = False) -> np.ndarray:
+        trans, A = ("T", self.A.T) if transposed else ("N", self.A)
+        x = self._solve(b, trans)
+        return x + self._solve(b - A @ x, trans)
+
+    def null(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """(v, w, mu): A v = mu v, w A = mu w, mu nearest to zero, of length one."""
+        v = w = np.random.default_rng(0).standard_normal(self.A.shape[0])
+        for _ in range(4):
+            v, w = self.solve(v / np.linalg.norm(v)), self.solve(w / np.linalg.norm(w), True)
+        v, w = v / np.linalg.norm(v), w / np.linalg.norm(w)
+        return v, w, float(w @ (self.A @ v)) / float(w @ v)
+
+
 @public
 def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values: InputValue) -> Modes:
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
@@ -161,8 +189,8 @@ def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values
     True 2.282 Hz
     """
     from scipy.linalg import eigh
-    from scipy.sparse import diags
-    from scipy.sparse.linalg import eigsh
+    from scipy.sparse import diags, identity
+    from scipy.sparse.linalg import LinearOperator, eigsh
 
     if not hasattr(scene, "stiffness_matrix"):
         raise ValueError(f"modes: scene must be a Scene, got {shown(scene)}")
@@ -191,7 +219,11 @@ def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values
     if count <= DENSE or 3 * k >= count:
         values, vectors = eigh(A.toarray(), None if M is None else M.toarray(), subset_by_index=[0, k - 1])
     else:
-        values, vectors = eigsh(A.tocsc(), k, M, sigma=-1e-6 * size, which="LM", tol=1e-13)
+        sigma, start = -1e-6 * size, np.random.default_rng(0).standard_normal(count)
+        while (factors := Tangent((A - sigma * (identity(count) if M is None else M)).tocsc())).negative:
+            sigma *= 4  # not below all of them yet
+        solve = LinearOperator(A.shape, factors._solve)
+        values, vectors = eigsh(A.tocsc(), k, M, sigma=sigma, OPinv=solve, which="LM", tol=1e-13, v0=start)
         order = np.argsort(values)
         values, vectors = values[order], vectors[:, order]
     values = np.where(np.abs(values) < 1e-13 * size, 0.0, values)

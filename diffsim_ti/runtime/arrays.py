@@ -207,7 +207,8 @@ def _address(target) -> int:
 
 def fetch_row(source, k: int) -> np.ndarray:
     """Row k of a Taichi array of vectors in float64; of four components the first three."""
-    return fetch(source, k).astype(np.float64)
+    host = view(source)
+    return (fetch(source, k) if host is None else host[k, ..., :3]).astype(np.float64)
 
 
 def to_numpy_dtype(dtype):

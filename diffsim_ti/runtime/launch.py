@@ -86,7 +86,7 @@ class Launch:
         kinds = kernel.arguments[len(self._arrays) :]
         floats = [id(argument.annotation) in primitive_types.real_type_ids for argument in kinds]
         self._setters = [
-            ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,), is_float)
+            ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,))
             for k, is_float in enumerate(floats, start=len(self._arrays))
         ]
         self._set = [None] * len(floats)  # the numbers as the context has them
@@ -113,9 +113,9 @@ class Launch:
         if self._buffer:
             self._buffer.restore()
         known = self._set
-        for k, (setter, index, is_float) in enumerate(self._setters):
+        for k, (setter, index) in enumerate(self._setters):
             number = numbers[k]
-            if number is not known[k] and (is_float or number != known[k]):  # a third of a microsecond each
+            if number is not known[k] and (number != known[k] or number == 0):  # a third of a microsecond each; -0.0
                 known[k] = None  # also if this is interrupted
                 setter(index, number)
                 known[k] = number

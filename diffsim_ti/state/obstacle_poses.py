@@ -65,8 +65,9 @@ class ObstaclePoses:
 
     def value(self, path: np.ndarray | None, at: Moment | None) -> np.ndarray:
         """The rows, shape (size, 3); without a path all zero."""
-        out = [*np.zeros((self.size, 3))]
+        out = np.zeros((self.size, 3))
         if path is not None:
+            out = [*out]
             schedule, s = at.schedule, at.schedule.row_of(path, at.j)
             moments = (
                 schedule.place(path, at.j, at.at_stage),
@@ -81,7 +82,8 @@ class ObstaclePoses:
                     out[row + m] = _at_share(path[s, c + 1], phi, share)
                 out[row + RATE] = phi / schedule.step_length(at.j)
                 out[row + TAU] = np.array([at.tau, 0.0, 0.0])
-        return np.stack(out) if out else np.zeros((0, 3))
+            out = np.stack(out)
+        return out
 
     def row_of(self, k: int, rows: np.ndarray) -> np.ndarray:
         """Where obstacle k is where forces are taken: 3 numbers, or 7 of a pose."""

@@ -69,6 +69,8 @@ class Schedule(metaclass=Public):
     def shown(self, j, every: int):
         """The frame that the state before pass j is, or -1; every: 0 for no frames."""
         row = self.row(j)
+        if isinstance(j, int):  # as host passes ask
+            return row // every if every and j == self.first(row) and row % every == 0 else -1
         return np.where((every > 0) & (j == self.first(row)) & (row % max(every, 1) == 0), row // max(every, 1), -1)
 
     def counted(self, j, every: int):

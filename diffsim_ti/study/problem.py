@@ -151,4 +151,4 @@ def distance(problem: Problem, quantity: ArrayLike, exact: ArrayLike) -> float:
     if apart.ndim > 1 and apart.shape[-1] == 3:
         apart = np.linalg.norm(apart, axis=-1)
     largest = np.abs(exact) if exact.ndim < 2 else np.linalg.norm(exact, axis=-1)
-    return float(apart.max() / (problem.scale or largest.max()))
+    return float(apart.max() / (problem.scale or largest.max() or np.finfo(float).tiny))  # of what stays where it is, 0

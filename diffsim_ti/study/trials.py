@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
-from diffsim_ti.common.checked import instance
+from diffsim_ti.common.checked import between, instance, number, whole
 from diffsim_ti.common.public import public
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs import Output
@@ -463,17 +463,15 @@ def recommend(
     """
     if scene.terms_of(Robot):
         raise ValueError("recommend takes no robots: compare Rollouts of ImplicitEulerSolver and explicit solvers")
-    if not (duration >= 0 and np.isfinite(duration)):
-        raise ValueError(f"duration must be > 0 [s], or 0 for an equilibrium, got {duration:g}")
+    duration = number("duration, if not 0 for an equilibrium,", duration, unit="s") if np.any(duration) else 0.0
+    budget, frames = number("budget", budget, unit="s"), whole("frames", frames, 1)
     if output is None and weights is not None:
         raise ValueError("weights are of a number of an output: pass output=, such as MaterialPoints([[0, 0, 0]])")
     if output is not None:
         instance("recommend", "output", output, Output, "an output, such as MaterialPoints([[0, 0, 0]])")
     quantity = Quantity(output, weights)
-    if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance:g}")
-    if memory is not None and not memory > 0:
-        raise ValueError(f"memory must be > 0 [MB], got {memory:g}")
+    tolerance = between("tolerance", tolerance, 0, 1, ends=False)
+    memory = None if memory is None else number("memory", memory, unit="MB")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of trials with coarse steps, whose errors are measured
         if not duration:

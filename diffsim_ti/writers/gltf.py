@@ -10,6 +10,11 @@ from diffsim_ti.writers.writer import register
 
 FLOAT, UNSIGNED, ARRAY, ELEMENTS = 5126, 5125, 34962, 34963  # numbers of glTF
 TYPES = {1: "SCALAR", 3: "VEC3"}
+# what turns the axis that is up to y: a quaternion, and where it brings the axes
+TURNS = {
+    0: ([0, 0, 0.5**0.5, 0.5**0.5], [1, 0, 2], [-1, 1, 1]),
+    2: ([-(0.5**0.5), 0, 0, 0.5**0.5], [0, 2, 1], [1, 1, -1]),
+}
 
 
 @register
@@ -18,8 +23,8 @@ class GltfWriter(SurfacesWriter):
 
     Each frame is a morph target, whose weight the animation brings to 1 at the frame's time [s] and leads linearly to the
     next. Places are those of the first frame, of what is far from the origin less a translation (origin.py), and float32
-    differences to it [m]. In glTF y is up: where the scene's gravity acts along z, nodes are turned. A body has one colour:
-    colours of a field cannot move in glTF.
+    differences to it [m]. In glTF y is up: nodes are turned where the scene's gravity acts along x or z. A body has one
+    colour: colours of a field cannot move in glTF.
     Khronos Group 2021, glTF 2.0 Specification, sections 3.7.2 (morph targets) and 3.11 (animations).
     """
 
@@ -31,7 +36,7 @@ class GltfWriter(SurfacesWriter):
             self.path.write_bytes(self._file())
 
     def _file(self) -> bytes:
-        content, times = Content(self.setting.up == 2), np.array(self._times) - self._times[0]
+        content, times = Content(self.setting.up), np.array(self._times) - self._times[0]
         at = content.add(times, limits=True) if len(times) > 1 else None
         for name, triangles, places, _ in self.surfaces():
             content.add_surface(name, triangles, places, at, BODY if name == "body" else OBSTACLE)
@@ -39,10 +44,10 @@ class GltfWriter(SurfacesWriter):
 
 
 class Content:
-    """What a file holds: the parts of its JSON, and the numbers that they name; turned: from z upwards to y upwards."""
+    """What a file holds: the parts of its JSON, and the numbers that they name; up: the axis that is."""
 
-    def __init__(self, turned: bool):
-        self.turned = turned
+    def __init__(self, up: int):
+        self.turn, self.axes, self.signs = TURNS.get(up, ([], [0, 1, 2], [1, 1, 1]))
         self.parts = {name: [] for name in ("nodes", "meshes", "materials", "accessors", "bufferViews")}
         self.channels, self.samplers, self.bytes = [], [], bytearray()
 
@@ -73,9 +78,8 @@ class Content:
         node = len(self.parts["nodes"])
         weights = dict(weights=[0.0] * len(changes)) if changes else {}
         self.parts["meshes"].append(dict(name=name, primitives=[shape]) | weights)
-        away = away[[0, 2, 1]] * [1, 1, -1] if self.turned else away
-        turn = dict(rotation=[-(0.5**0.5), 0.0, 0.0, 0.5**0.5]) if self.turned else {}
-        moved = dict(translation=away.tolist()) if away.any() else {}
+        turn = dict(rotation=self.turn) if self.turn else {}
+        moved = dict(translation=(away[self.axes] * self.signs).tolist()) if away.any() else {}
         self.parts["nodes"].append(dict(name=name, mesh=node) | turn | moved)
         look = dict(baseColorFactor=[*colour, 1.0], metallicFactor=0.0, roughnessFactor=0.8)
         self.parts["materials"].append(dict(name=name, pbrMetallicRoughness=look, doubleSided=True))

@@ -20,6 +20,13 @@ from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.state.numbers import Adjoint
 
 
+def plus(x: np.ndarray, *more: np.ndarray | None) -> np.ndarray:
+    """x and what there is of others."""
+    for y in more:
+        x = x if y is None else x + y
+    return x
+
+
 class ImplicitAdjoint(RecordedPasses):
     """Adjoints of one run, in float64 on the host, except those of tetrahedra.
 
@@ -38,6 +45,8 @@ class ImplicitAdjoint(RecordedPasses):
         self.potential = p
         self.lag = runtime.array(a.vector, 2, n if p.has_friction else 1)
         self.poses = runtime.array(a.vector, a.poses.size, n if num_obstacles else 1)
+        used = (self.lag, p.has_friction), (self.poses, num_obstacles)
+        self._cleared = [array for array, some in used if some]  # in each pass
         self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, adjoint=(self, self.numbers))
         if self.z is not None:  # the state of the law
             corner, y = runtime.array(a.vector, *a.corner.shape), runtime.array(a.vector, 1, n)
@@ -55,8 +64,8 @@ class ImplicitAdjoint(RecordedPasses):
 
     def fits(self, workspace) -> bool:
         """Whether kernels and arrays are still those of the run."""
-        same = self.features == workspace.arrays.features(self.features.density, self.features.shape)
-        return same and workspace.potential is self.potential
+        features = workspace.arrays.features(self.features.density, self.features.shape)
+        return (self.features is features or self.features == features) and workspace.potential is self.potential
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest."""
@@ -68,12 +77,15 @@ class ImplicitAdjoint(RecordedPasses):
         a = self.ws.arrays
         self.frames = tuple(np.asarray(x, np.float64) for x in (positions_adj, velocities_adj))
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
-        self.pending = [np.zeros_like(self.p), np.zeros_like(self.p)]
-        self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
+        self.pending = [None, None]  # adjoints of the state before
+        self.by_weight, self.by_inertia = np.zeros(
+            (2, *self.p.shape)
+        )  # sums over passes, of what `collect` makes sums of
+        self.gravity, self.rate = np.zeros(3), 0.0
         masses = a.values.element_masses
         self.element_masses = None if masses is None else np.zeros_like(masses)
         self.growth = None if a.values.growths is None else np.zeros_like(a.values.growths)
-        self.by_hosts = a.values.zeros()  # of the numbers of host forces
+        self.by_hosts = a.values.zeros() if self.ws.hosts or self.joints else Derived()  # of the numbers of host forces
         self.rest_adj = np.zeros_like(self.p)
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
@@ -137,19 +149,17 @@ class ImplicitAdjoint(RecordedPasses):
     def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
         seen, from_pairs = self._pull_back_contacts(j, save_every)
-        by_contacts, by_x, by_lag = np.zeros((3, *p.shape)) if from_pairs is None else from_pairs
-        by_contacts = by_contacts if seen is None else by_contacts + seen[0]
+        by_contacts, by_x, by_lag = (None, None, None) if from_pairs is None else from_pairs
+        by_contacts = by_contacts if seen is None else plus(seen[0], by_contacts)
         if s.static:
             q = np.zeros_like(q)
-        p_free, q_free = p * ws.linear, q * ws.linear
         # the equation
-        seed = s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.linear
-        if np.abs(seed).max(initial=0.0) < 1e-18 * np.abs(p).max(
-            initial=0.0
-        ):  # rounding of what is held, no direction of ours
+        by_speed = None if s.static else s.e0 / s.gamma * q
+        by_ends = plus(p if s.c0 == 1 else s.c0 * p, by_speed, by_contacts)
+        seed, q_free = by_ends * ws.linear, q if s.static else q * ws.linear
+        if np.vdot(seed, seed) < 1e-36 * np.vdot(p, p):  # rounding of what is held, no direction of ours
             seed = np.zeros_like(seed)
         if self.joints:
-            by_ends = s.c0 * p + s.e0 / s.gamma * q + by_contacts
             seed = self.joints.begin(seed, 0.0 if seen is None else seen[2], by_ends)
             q_free = self.joints.with_held(q_free, q)
         by_star = self.solve(seed)
@@ -159,56 +169,60 @@ class ImplicitAdjoint(RecordedPasses):
         if self.joints:
             by_star = self.joints.follow(by_star)
         runtime.fill(ws.potential.w, by_star[None])
-        for target in (self.lag, self.poses):
-            runtime.fill(target, 0)
+        runtime.clear(self._cleared)
         if ws.pairs:
             ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
         self._vjp(**ws.potential.sizes())
-        reaction = runtime.fetch(ws.potential.y)[0].astype(np.float64)
-        reaction = reaction + by_contacts
+        reaction = plus(runtime.fetch_row(ws.potential.y, 0), by_contacts)
         if ws.hosts:
             by_place, by_speed = ws.hosts.vjp(ws.potential.held_at, by_star, self.by_hosts)
-            reaction, by_x = reaction + by_place + by_speed / self.gamma, by_x - by_speed / self.gamma
+            reaction, by_x = reaction + by_place + by_speed / self.gamma, plus(-by_speed / self.gamma, by_x)
         if ws.volumes:
             reaction = reaction + ws.volumes.add_targets(nu, ws.potential.held_at, self.by_hosts)
         if ws.potential.surface_friction:
             by_place, by_friction, by_begin = ws.potential.surface_friction.vjp(ws.potential.held_at, by_star)
-            reaction, by_x, by_lag = reaction + by_place, by_x + by_friction, by_lag + by_begin
-        by_joints = self.joints.pull_back(by_star) if self.joints else (0.0, 0.0, 0.0)
+            reaction, by_x, by_lag = reaction + by_place, plus(by_friction, by_x), plus(by_begin, by_lag)
+        by_joints = self.joints.pull_back(by_star) if self.joints else (None, None, None)
         if self.joints:
             reaction, self.rest_adj = reaction + by_joints[0], self.rest_adj + self.joints.by_rest
         share = ws.load_share(j, s)
-        self.gravity = self.gravity + share * self._sum(ws.mass * by_star)
-        if self.features.density:
-            self._add_mass(by_star, self.weight(share))
+        self.by_weight += share * by_star
+        if self.features.density and self.element_masses is not None:
+            at, weight = ws.arrays.mesh.elements, self.weight(share)
+            self.element_masses += by_star[at] @ np.swapaxes(weight[at], 1, 2)
+        elif self.features.density and not s.static:
+            self.by_inertia += by_star * self.acceleration
         if self.forces is not None:
             ws.add_loads(self.forces, j, s, share * by_star)
         # where inertia starts from
-        inertial = self.mass * by_star
-        reaction = reaction - inertial  # the inertia of neighbours acts on fixed vertices, too
-        x_adj = inertial - s.e0 / s.gamma * q_free + by_x
+        x_adj = inertial = q if s.static else self.mass * by_star
+        if not s.static:
+            reaction = reaction - inertial  # the inertia of neighbours acts on fixed vertices, too
+            x_adj = inertial - s.e0 / s.gamma * q_free
+        x_adj = plus(x_adj, by_x)
         if ws.potential.has_friction:
-            by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
-            by_lag, x_adj = by_lag + by_first, x_adj + by_first_x
+            by_first, by_first_x = plus(runtime.fetch(self.lag).astype(np.float64), None if seen is None else seen[1])
+            by_lag, x_adj = plus(by_first, by_lag), x_adj + by_first_x
         if self.joints:
-            by_lag, x_adj = by_lag + by_joints[1][0], x_adj + by_joints[1][1]
+            by_lag, x_adj = plus(by_joints[1][0], by_lag), x_adj + by_joints[1][1]
             by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64)) + by_joints[2]
             self.gravity = self.gravity + self.joints.end(by_poses, self.by_hosts)
-            self.rest_adj[ws.joints.at] -= self.joints.hand_on(by_ends + reaction - by_contacts)
+            by_places = by_ends + reaction if by_contacts is None else by_ends + reaction - by_contacts
+            self.rest_adj[ws.joints.at] -= self.joints.hand_on(by_places)
         if self.path is not None:
-            by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64)) + by_joints[2]
-            by_poses = by_poses + (0.0 if seen is None else seen[2])
+            by_poses = self._sum_of_poses(runtime.fetch(self.poses).astype(np.float64))
+            by_poses = plus(by_poses, by_joints[2], None if seen is None else seen[2])
             if ws.pairs and ws.pairs.obstacles:
                 by_poses = by_poses + ws.pairs.obstacles.take_rows()
             ws.collisions.vjp(by_poses, j, s, self.path)
-        y_adj = s.gamma * inertial + s.e1 * q_free
+        y_adj = s.gamma * inertial + s.e1 * q_free if s.e1 else s.gamma * inertial
         if self.features.drag >= 0:
             db0, db1, de0, de1 = s.by_rate
             by_rate = db0 * y_adj * self.v + de0 * q_free * self.v_star + de1 * q_free * self.y
             if self.before is not None:
                 by_rate += db1 * y_adj * self.before[1]
             self.rate = self.rate + self._sum(by_rate).sum(-1)
-        u_adj = s.a0 * x_adj + (1 - s.c0) * p_free + by_lag
+        u_adj = plus(s.a0 * x_adj, None if s.c0 == 1 else (1 - s.c0) * p * ws.linear, by_lag)
         v_adj = s.b0 * y_adj
         if ws.rigid:
             turned = ws.rigid.turned_vjp(by_star)
@@ -217,11 +231,11 @@ class ImplicitAdjoint(RecordedPasses):
         # prescribed places
         if len(held):
             self._pull_back_held(j, p, q, reaction, u_adj, v_adj)
-        self.p, self.q = u_adj + self.pending[0], v_adj + self.pending[1]
-        self.pending = [s.a1 * x_adj, s.b1 * y_adj] if self.before is not None else [0 * x_adj, 0 * y_adj]
+        self.p, self.q = plus(u_adj, self.pending[0]), plus(v_adj, self.pending[1])
+        self.pending = [None, None] if self.before is None else [s.a1 * x_adj, s.b1 * y_adj]
         if ws.strains:
             by_u, by_before = ws.strains.vjp(s, self.u, self.before, self)
-            self.p, self.pending[0] = self.p + by_u, self.pending[0] + by_before
+            self.p, self.pending[0] = self.p + by_u, plus(by_before, self.pending[0])
 
     @staticmethod
     def _sum(x: np.ndarray) -> np.ndarray:
@@ -233,13 +247,15 @@ class ImplicitAdjoint(RecordedPasses):
         """Of what each vertex has of the rows of obstacles."""
         return rows.sum(1)
 
-    def _add_mass(self, by_star: np.ndarray, weight: np.ndarray) -> None:
-        """Adds the adjoints of masses: weight, per mass, works on by_star."""
-        if self.element_masses is None:
-            self.mass_adj += (by_star * weight).sum(1)
-            return
-        at = self.ws.arrays.mesh.elements
-        self.element_masses += by_star[at] @ np.swapaxes(weight[at], 1, 2)
+    @property
+    def mass_adj(self) -> np.ndarray:
+        """By lumped masses."""
+        a = self.ws.arrays
+        return (self.by_weight * a.gravity_of(a.values) - self.by_inertia).sum(1)
+
+    @property
+    def gravity_adj(self) -> np.ndarray:
+        return self.gravity + self._sum(self.ws.mass * self.by_weight)
 
     def _pull_back_held(self, j, p, q, reaction, u_adj, v_adj) -> None:
         """Adds what comes by the held parts, of which nothing is in u_adj and v_adj of the equation."""
@@ -275,7 +291,11 @@ class ImplicitAdjoint(RecordedPasses):
 
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint."""
-        self.p, self.q, self.pending = factor * self.p, factor * self.q, [factor * x for x in self.pending]
+        self.p, self.q, self.pending = (
+            factor * self.p,
+            factor * self.q,
+            [x if x is None else factor * x for x in self.pending],
+        )
         if self.joints:
             self.joints.scale(factor)
         if self.z is not None:
@@ -284,10 +304,12 @@ class ImplicitAdjoint(RecordedPasses):
     def collect(self) -> Derived:
         """Adjoints of what kernels read, in float64, at the start of the run."""
         a, features, out = self.ws.arrays, self.features, self.numbers.collect()
-        out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
+        out.displacement, out.velocity = self.p, self.q
+        if features.density and self.element_masses is None:
+            out.mass = self.mass_adj
         out.element_masses = self.element_masses
         if features.gravity >= 0:
-            out.parameters[features.gravity :][:3] = self.gravity
+            out.parameters[features.gravity :][:3] = self.gravity_adj
         if features.drag >= 0:
             out.parameters[features.drag] = self.rate
         rest = self.frames[0].sum(0)

@@ -157,12 +157,23 @@ class Inverse:
                 continue
             dense = np.zeros((len(own), b, len(own), b))
             dense[row, :, column] = M.data[mine]
-            dense = dense.reshape(b * len(own), -1)
-            still = np.flatnonzero(np.diagonal(dense) == 0)
-            dense[still, still] = dense.max() or 1.0
-            inverse = positive_inverse(dense)
-            inverse[still, still] = 0.0
-            self._rows[there, :, :b] = inverse.reshape(len(own), b, len(own), b).transpose(2, 0, 1, 3)  # symmetric
+            self._put(dense.reshape(b * len(own), -1), there)
+        runtime.fill(self.values, self._rows.reshape(-1, self._rows.shape[2]))
+
+    def _put(self, dense: np.ndarray, there: np.ndarray) -> None:
+        still, k, b = np.flatnonzero(np.diagonal(dense) == 0), len(there), self.blocksize[0]
+        dense[still, still] = dense.max() or 1.0
+        inverse = positive_inverse(dense)
+        inverse[still, still] = 0.0
+        self._rows[there, :, :b] = inverse.reshape(k, b, k, b).transpose(2, 0, 1, 3)  # symmetric
+
+    @property
+    def is_of_one_body(self) -> bool:
+        return len(self._bodies) == 1
+
+    def put_dense(self, dense: np.ndarray) -> None:
+        """Of one body, whose matrix has no zeros to leave out."""
+        self._put(dense, self._bodies[0][-1])
         runtime.fill(self.values, self._rows.reshape(-1, self._rows.shape[2]))
 
 
@@ -183,8 +194,8 @@ class Cycle:
         self._entries = [len(M.data) for M in (*matrices, *ways)]
         self._down, self._up = [], []  # (kernel, records, numbers)
         downs = [P.T.tobsr(P.blocksize[::-1]) for P in ways]
-        last, self._inverse = self.levels[-1], Inverse(matrices[-1])
-        within = [level.threads for level in self.levels[:-1]] + [threads_of(self._inverse)]
+        last, self.inverse = self.levels[-1], Inverse(matrices[-1])
+        within = [level.threads for level in self.levels[:-1]] + [threads_of(self.inverse)]
         for level, threads, above in zip(self.levels, within, [1, *map(threads_of, downs)]):
             if max(threads, above) > 1:
                 level.part = runtime.array(ROWS[level.numbers], level.nodes * max(threads, above))
@@ -198,7 +209,7 @@ class Cycle:
             self._up.insert(0, (kernels.up, between, own))
         kernels = kernels_of(LevelKernels, last.numbers, "f32", last.parallel, within[-1])
         numbers = dict(nodes=last.nodes, shares=within[-1] * last.nodes)
-        self._solve = kernels.solve, dict(level=last, inverse=self._inverse), numbers
+        self._solve = kernels.solve, dict(level=last, inverse=self.inverse), numbers
         vectors = "f32" if runtime.arch_name() == "vulkan" else "f64"
         self._ends = kernels_of(LevelKernels, 3, vectors, self._wide(matrices[0], parallel))
         self._bound = {}
@@ -222,7 +233,7 @@ class Cycle:
         for level, M in zip(self.levels[1:-1], matrices):
             level.put_numbers(M)
         if matrices:
-            self._inverse.put(matrices[-1], anew)
+            self.inverse.put(matrices[-1], anew)
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""

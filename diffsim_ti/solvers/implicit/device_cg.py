@@ -1,7 +1,7 @@
 """Conjugate gradients on the device: of what crosses to the host, a few numbers every few iterations."""
 
+import math
 from collections.abc import Callable
-from math import isqrt
 
 import numpy as np
 import taichi as ti
@@ -33,7 +33,7 @@ class DeviceCG:
         self.precision = "f64" if arch_name() != "vulkan" else "f32"
         self._vector, fp = array_types(self.precision)["vectors"].dtype, PRECISIONS[self.precision]
         # on a card a thread waits for each entry of its chunk in turn, then one for chunks, eight at a time
-        on_card = max(8, isqrt(n // self.systems) // 6)
+        on_card = max(8, math.isqrt(n // self.systems) // 6)
         self.length = max(32, -(-n // max(256, self.systems))) if runs_on_cpu() else on_card
         self.chunks = self.systems * -(-n // (self.systems * self.length))
         self.x, self.r, self.z, self.p, self.q = (runtime.array(self._vector, 1, n) for _ in range(5))
@@ -49,7 +49,7 @@ class DeviceCG:
             self.inverse = runtime.array(self._vector, 3, n)
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n, systems=self.systems)
         self.is_one_kernel = self.by_scene or Repeated.is_possible(parallel)
-        whole = self.by_scene or runs_on_cpu() and not parallel
+        whole = runs_on_cpu() and not parallel
         # iterations between looks at the state; on a card as many as seem to be left
         self._look = self.many if whole else 1 if runs_on_cpu() else 0
         # (with a matrix, convex) -> iterate(times, rounding), what tells whether arrays are others
@@ -153,40 +153,31 @@ class DeviceCG:
             self._put(more)
         self.put_mass(mass)
 
-    def solve(self, b: np.ndarray, tolerance, going, most: int, eps: float, more=False, convex=False) -> tuple:
-        """(x, rows of `state`) of all systems, whose mass and matrix are on the device; of one that is not `going` 0. A
-        system that meets a direction of negative curvature has the x before it or, if it is the first, the preconditioned b.
-        """
-        rows = b.reshape(self.systems, -1)
-        size, state = np.sqrt(np.einsum("ij,ij->i", rows, rows)), np.zeros((self.systems, ROOM))
-        wanted, done = going & (size > 0), 0
-        runtime.fill(self.r, (rows / np.where(wanted, size, np.inf)[:, None]).reshape(1, -1, 3))
-        state[:, LEAST], state[:, LIMIT], state[:, STOPPED] = tolerance**2, most, ~wanted
-        runtime.fill(self.state, state)
-        while done < most and (on := (state[:, STOPPED] == 0) & np.isfinite(state[:, SQUARE])).any():
-            self.iterate(state[on], most, eps, more, convex)
-            state = runtime.fetch(self.state)
-            done = max(done + 1, int(state[:, COUNT].max()))
-        x = runtime.fetch_row(self.x, 0).reshape(rows.shape)
-        first = (state[:, STOPPED] == 2) & (state[:, COUNT] == 1)
-        if first.any():
-            x = np.where(first[:, None], runtime.fetch_row(self.p, 0).reshape(rows.shape), x)
-        known = wanted & (state[:, COUNT] > 0)
-        return np.where(known[:, None], x * size[:, None], 0.0).reshape(b.shape), state
-
     def __call__(
         self, mass: Mass, more, convex: bool, b: np.ndarray, tolerance: float, max_iterations: int, eps: float
     ):
-        """(x, relative residual, iterations, p or None), as `linear.conjugate_gradients`.
+        """(x, relative residual, iterations, p or None), as `linear.conjugate_gradients`. A system that meets a direction of
+        negative curvature has the x before it or, if it is the first, the preconditioned b.
 
         mass: c m, shape (num_vertices, 1); more: a SciPy matrix that joins A, or None; convex: of contact between surfaces
         only its convex part.
         """
         self.put_system(mass, more)
-        x, (state,) = self.solve(b, tolerance, True, max_iterations, eps, more is not None, convex)
-        count = int(state[COUNT])
-        if state[STOPPED] == 3:  # the preconditioner is not positive definite
+        size, state, done = float(np.sqrt(np.einsum("ij,ij", b, b))), np.zeros((1, ROOM)), 0
+        if not size > 0:
+            return np.zeros_like(b), 0.0, 0, None
+        runtime.fill(self.r, (b / size)[None])
+        state[0, LEAST], state[0, LIMIT] = tolerance**2, max_iterations
+        runtime.fill(self.state, state)
+        while done < max_iterations and state[0, STOPPED] == 0 and math.isfinite(state[0, SQUARE]):
+            self.iterate(state, max_iterations, eps, more is not None, convex)
+            state = runtime.look(self.state)
+            done = max(done + 1, int(state[0, COUNT]))
+        count, stopped, square = int(state[0, COUNT]), state[0, STOPPED], float(state[0, SQUARE])
+        if stopped == 3:  # the preconditioner is not positive definite
             return np.zeros_like(b), np.inf, count, None
-        if not np.isfinite(state[SQUARE]):
+        if not math.isfinite(square):
             raise FloatingPointError("the stiffness of this state is not finite")
-        return x, float(np.sqrt(state[SQUARE])), count, runtime.fetch_row(self.p, 0) if state[STOPPED] == 2 else None
+        p = runtime.fetch_row(self.p, 0) if stopped == 2 else None
+        x = p if p is not None and count == 1 else runtime.fetch_row(self.x, 0)
+        return size * x if count else np.zeros_like(b), math.sqrt(square), count, p

@@ -30,9 +30,10 @@ class Effort:
     @classmethod
     def of(cls, mesh) -> "Effort":
         """Of the vertices that the elements of a mesh couple; found once."""
-        if mesh not in KNOWN:
-            KNOWN[mesh] = cls._found(mesh.elements, mesh.num_vertices)
-        return KNOWN[mesh]
+        known = KNOWN.get(mesh)
+        if known is None:
+            known = KNOWN[mesh] = cls._found(mesh.elements, mesh.num_vertices)
+        return known
 
     @classmethod
     def _found(cls, elements: np.ndarray, n: int) -> "Effort":

@@ -91,11 +91,12 @@ def _in_turn(operator, preconditioner, most: int):
     if not isinstance(preconditioner, Preconditioner):
         yield preconditioner, most
         return
-    effort = preconditioner.effort
-    static = not np.any(diagonal_of(operator.mass))  # steps with inertia take few rounds, which are to stay as they are
-    if not (preconditioner.given_up or static and preconditioner.spent > 2 * preconditioner.patience):
-        yield preconditioner, min(most, preconditioner.patience)
+    patience, spent = preconditioner.patience, preconditioner.spent
+    # steps with inertia take few rounds, which are to stay as they are
+    if not preconditioner.given_up and (spent <= 2 * patience or np.any(diagonal_of(operator.mass))):
+        yield preconditioner, min(most, patience)
         preconditioner.given_up = True
+    effort = preconditioner.effort
     other, name = operator.factorised() if effort.fits else None, type(preconditioner).__name__
     instead = "its sparse factorisation takes their place, which may take minutes"
     if other is None:

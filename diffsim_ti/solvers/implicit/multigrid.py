@@ -77,7 +77,8 @@ class Multigrid(Preconditioner):
     # what iterations per decade at rest may be taken for; change of C = F^T F from which on numbers may be poor
     usual, strained = (1.5, 3.0), 0.1
     # vertices of all scenes from which on coarse levels take contact; how many times as stiff as a vertex it is at least,
-    # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take
+    # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take.
+    # Of equilibria of what is loose at rest they take all.
     large, stiff, changed = 1000, 50, 0.5
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
@@ -95,6 +96,8 @@ class Multigrid(Preconditioner):
         with potential.at_rest():
             self.frames.update()
             matrices, ways = self._levels()
+        if a.contacts and a.num_scenes == 1 and ways and not mass.any() and is_loose(matrices[-1]):
+            self.large = self.stiff = 0
         self.place = None
         self._forget_contact(matrices, ways)
         self.cycle = Cycle(matrices, ways, self.frames, within)
@@ -158,6 +161,7 @@ class Multigrid(Preconditioner):
         """Levels below the finest one have none."""
         scenes, n = self.potential.arrays.num_scenes, self.potential.arrays.vertices_of_one
         self._made, self._below, self._contact = (matrices[1:], ways), matrices[1:], np.zeros((scenes, n))
+        self._full = None  # of one body with one level below the finest one, as dense arrays
 
     def _bring_contact_down(self, met: bool) -> None:
         """The levels below the finest one take contact with obstacles, where it has changed by much or a solve begins."""
@@ -184,8 +188,15 @@ class Multigrid(Preconditioner):
         turns = projectors_of(self.free)[at] @ self.frames.matrices()[at]
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        more, levels = roots @ np.swapaxes(roots, 1, 2), []
+        if len(matrices) == 1 and self.cycle.inverse.is_of_one_body:
+            if self._full is None:
+                self._full = matrices[0].toarray(), ways[0].toarray().reshape(size.size, 3, -1)
+            M, P = self._full[0], self._full[1][at]
+            self.cycle.inverse.put_dense(M + np.tensordot(P, more @ P, ((0, 1), (0, 1))))
+            return
         start = np.searchsorted(at, np.arange(size.size + 1))
-        more, levels = bsr_matrix((roots @ np.swapaxes(roots, 1, 2), at, start), shape=2 * (3 * size.size,)), []
+        more = bsr_matrix((more, at, start), shape=2 * (3 * size.size,))
         for M, P, before in zip(matrices, ways, self._below):
             more = (P.T @ (more @ P)).tobsr(M.blocksize)
             levels.append(with_blocks(M, more))
@@ -336,6 +347,13 @@ def turned(M, rows: np.ndarray, columns: np.ndarray):
     at = np.repeat(np.arange(nodes_of(M)), np.diff(M.indptr))
     data = np.swapaxes(rows, 1, 2)[at] @ M.data @ columns[M.indices]
     return bsr_matrix((data, M.indices, M.indptr), shape=M.shape)
+
+
+def is_loose(M) -> bool:
+    """Whether a matrix lets something move freely: `positive_inverse` raises such eigenvalues."""
+    A = M.toarray()
+    values = np.linalg.eigvalsh(A[np.ix_(*2 * (np.diagonal(A) > 0,))])
+    return bool(values[0] < 1e-6 * values[-1])
 
 
 def is_definite(M) -> bool:

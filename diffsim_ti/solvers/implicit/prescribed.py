@@ -142,7 +142,7 @@ class PrescribedInPasses(Workspace):
 
     def pass_of_all(self, j: int) -> int:
         """Number of pass j, also of the steps of a run that come one by one."""
-        return self.first_step * int(np.max(self.solver.schedule.substeps)) + j
+        return self.first_step * int(np.max(self.solver.schedule.substeps)) + j if self.first_step else j
 
     def loads(self, j: int, stage: Stage) -> np.ndarray:
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""

@@ -23,10 +23,10 @@ class RecordedPasses:
         """Take pass j from the record, its first slot being the state before pass `base`."""
         ws = self.ws
         self.u, self.v, self.before = ws.read(ws.record, j - base)
-        self.u_next = ws.read(ws.record, j - base + 1)[0]
+        self.u_next = runtime.fetch_row(ws.record.u, j - base + 1)
         self.stage = stage = ws.solver.stage(ws.rate, self.before is None, j)
         self.x, self.y = ws.inertial(stage, self.u, self.v, self.before)
-        self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
+        self.u_star = self.u_next if stage.c0 == 1 else (self.u_next - (1 - stage.c0) * self.u) / stage.c0
         self.mass = stage.inertia * ws.mass
         if self.joints:
             self.joints.open(j - base)
@@ -39,7 +39,7 @@ class RecordedPasses:
         ws.rigid.begin(self.u, stage.c0)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
-        self.gamma = ws.instant(j, stage).gamma  # of velocities that host forces read
+        self.gamma = np.inf if stage.static else stage.gamma  # of velocities that host forces read
         self.operator = Operator(ws.potential, self.mass, ws.free, ws.newton.others, self.transposed)
         ws.take_multipliers(j, ws.potential.held_at)
         if ws.rigid:  # forces on them turn with them
@@ -63,7 +63,11 @@ class RecordedPasses:
     def weight(self, share: float) -> np.ndarray:
         """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""
         a = self.ws.arrays
-        return share * a.gravity_of(a.values) - self.stage.inertia * (self.u_star - self.x - self.stage.gamma * self.y)
+        return share * a.gravity_of(a.values) - self.acceleration
+
+    @property
+    def acceleration(self) -> np.ndarray:
+        return self.stage.inertia * (self.u_star - self.x - self.stage.gamma * self.y)
 
     @property
     def v_star(self) -> np.ndarray:

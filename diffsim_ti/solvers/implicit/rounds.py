@@ -50,7 +50,7 @@ class Rounds:
         self.solves_on_host = newton.system() is None
         self.contact = bool(a.contacts or self.pairs or potential.hosts)
         slides = isinstance(free, FreeDirections) and not potential.joints  # whose directions are the host's
-        self.whole = runs_on_cpu() and cg.is_one_kernel and (cg.by_scene or not cg.parallel)
+        self.whole = runs_on_cpu() and cg.is_one_kernel and (cg.by_scene or not (cg.parallel or cg.several))
         self.whole &= a.vertices_of_one <= self.small and not (self.beside or (self.pairs and self.pairs.asks))
         self.whole &= potential.kernels.blocks.variables <= self.short
         how = cg.parallel and not self.whole, slides, self.contact, self.beside, self.several and not self.whole
