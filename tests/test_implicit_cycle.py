@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.sparse
 import taichi as ti
 
 import diffsim_ti as ds
@@ -443,6 +444,11 @@ def test_contact_holds_a_loose_body_on_coarse_levels(monkeypatch):
     assert few <= many / 3
     np.testing.assert_allclose(u, v, atol=1e-7 * np.abs(v).max())
     np.testing.assert_allclose(g, h, rtol=1e-6)
+
+
+def test_what_is_held_altogether_is_not_loose():
+    """Its coarse levels have no numbers."""
+    assert not multigrid.is_loose(scipy.sparse.bsr_matrix((6, 6)))
 
 
 def test_matrices_of_the_strained_state(monkeypatch):

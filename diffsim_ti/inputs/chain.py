@@ -39,21 +39,32 @@ class Link(ABC):
 
 class Recording:
     """The part of a link whose value takes arrays that record, from which its derivatives are found
-    (differentiation/arrays.py). What was recorded is kept while x, of up to `few` numbers, stays the same arrays."""
+    (differentiation/arrays.py). What was recorded is kept while x, of up to `few` numbers, stays the same arrays. Adjoints
+    of up to `fewest` are products with the matrix of derivatives: from the first on, for bits are not to depend on how
+    often they were asked for."""
 
-    few = 20_000
+    few, fewest = 20_000, 16
     _record = None  # what was recorded last, with what it read
 
     def recorded(self, x: Arrays) -> SimpleNamespace:
-        """leaves: arrays that record in the place of x; y: what they lead to."""
+        """leaves: arrays that record in the place of x; y: what they lead to; slopes: dy/dx, a row for each number of x,
+        None until it is asked for."""
         last = self._record
         if last is not None and all(map(is_, last.x, x)):
             return last
         leaves = [Recorded(part) for part in x]
-        found = SimpleNamespace(x=x, leaves=leaves, y=self.value(*leaves))
+        found = SimpleNamespace(x=(*x,), leaves=leaves, y=(*self.value(*leaves),), slopes=None)
         keeps = sum(map(np.size, x)) <= self.few and all(map(is_fixed, x))
         self._record = found if keeps else None
         return found
+
+    def _slopes(self, at: SimpleNamespace) -> np.ndarray:
+        """Those of up to `fewest` numbers, else none."""
+        ends = np.cumsum([0, *map(np.size, at.x)])
+        if ends[-1] > self.fewest or ends[-1] * sum(map(np.size, at.y)) > self.few:
+            return np.zeros(0)
+        changes = [[e[a:b].reshape(np.shape(p)) for p, a, b in zip(at.x, ends, ends[1:])] for e in np.eye(ends[-1])]
+        return np.array([_in_a_row([forward(y, zip(at.leaves, dx)) for y in at.y]) for dx in changes])
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
         at = self.recorded(x)
@@ -61,8 +72,21 @@ class Recording:
 
     def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
         at = self.recorded(x)
+        if at.slopes is None:
+            at.slopes = self._slopes(at)
+        if at.slopes.size:
+            flat, end, out = at.slopes @ _in_a_row(y_adj), 0, []
+            for part in x:
+                out.append(flat[end : end + np.size(part)].reshape(np.shape(part)))
+                end += np.size(part)
+            return out
         found = reverse_of_all(zip(at.y, y_adj), at.leaves)
         return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
+
+
+def _in_a_row(arrays: Arrays) -> np.ndarray:
+    """The numbers of all."""
+    return np.ravel(arrays[0]) if len(arrays) == 1 else np.concatenate([*map(np.ravel, arrays)])
 
 
 def _are_same(x: Mapping, y: Mapping) -> bool:

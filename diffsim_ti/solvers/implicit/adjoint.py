@@ -78,9 +78,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.frames = tuple(np.asarray(x, np.float64) for x in (positions_adj, velocities_adj))
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
         self.pending = [None, None]  # adjoints of the state before
-        self.by_weight, self.by_inertia = np.zeros(
-            (2, *self.p.shape)
-        )  # sums over passes, of what `collect` makes sums of
+        self.by_weight, self.by_inertia = np.zeros((2, *self.p.shape))  # sums over passes (mass_adj, gravity_adj)
         self.gravity, self.rate = np.zeros(3), 0.0
         masses = a.values.element_masses
         self.element_masses = None if masses is None else np.zeros_like(masses)
@@ -291,11 +289,8 @@ class ImplicitAdjoint(RecordedPasses):
 
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint."""
-        self.p, self.q, self.pending = (
-            factor * self.p,
-            factor * self.q,
-            [x if x is None else factor * x for x in self.pending],
-        )
+        self.p, self.q = factor * self.p, factor * self.q
+        self.pending = [x if x is None else factor * x for x in self.pending]
         if self.joints:
             self.joints.scale(factor)
         if self.z is not None:

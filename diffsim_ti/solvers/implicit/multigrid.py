@@ -353,7 +353,7 @@ def is_loose(M) -> bool:
     """Whether a matrix lets something move freely: `positive_inverse` raises such eigenvalues."""
     A = M.toarray()
     values = np.linalg.eigvalsh(A[np.ix_(*2 * (np.diagonal(A) > 0,))])
-    return bool(values[0] < 1e-6 * values[-1])
+    return len(values) > 0 and bool(values[0] < 1e-6 * values[-1])
 
 
 def is_definite(M) -> bool:
