@@ -457,7 +457,7 @@ def test_a_load_that_was_interrupted_leaves_nothing_behind(where, monkeypatch):
         raise KeyboardInterrupt
 
     rollout, fresh = (ds.Rollout(ds.ImplicitEulerSolver(oscillator(), dt=0.02), 1) for _ in range(2))
-    rollout.forward(youngs_modulus=2 * E, density=2 * RHO)
+    rollout.forward(youngs_modulus=2 * E, density=3 * RHO)
     with monkeypatch.context() as patch:
         patch.setattr(*where, interrupted)
         with pytest.raises(KeyboardInterrupt):
