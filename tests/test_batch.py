@@ -554,6 +554,10 @@ def test_blocks_of_a_scene_that_rests_take_what_hosts_add_once():
         potential.put_contact_blocks()
     blocks = np.swapaxes(runtime.fetch(potential.barriers.blocks), 0, 1)
     np.testing.assert_allclose(blocks, potential.contact_blocks(), rtol=1e-12)
+    potential.put_contact_blocks()
+    potential.only(np.array([False, True, False]))
+    alone, hosts = potential.obstacle_blocks(met=True), potential.hosts.blocks(potential.held_at)
+    np.testing.assert_allclose(alone + hosts, blocks, rtol=1e-12, atol=1e-12 * np.abs(blocks).max())
 
 
 def test_gradients_of_a_scene_that_is_given_up_are_of_its_run_alone(monkeypatch):

@@ -55,12 +55,14 @@ def test_a_gain_below_the_stable_step_is_said_and_the_advice_helps(kind):
     assert watch.gained < 0.01 * watch.moving and watch.moving > 0.5 * start
 
 
-def test_rollouts_say_it_once_a_run_and_name_the_step():
-    """The same wherever states are kept."""
+@pytest.mark.parametrize("rounded", [False, True])
+def test_rollouts_say_it_once_a_run_and_name_the_step(rounded):
+    """The same wherever states are kept, also where the lengths of steps differ by rounding."""
     h, found = 0.9 * ds.stable_dt(body()).dt, []
+    steps = ds.UnequalSteps(np.diff(np.linspace(0, 700 * h, 701))) if rounded else 700
     for every in (None, 30):
         solver = ds.VelocityVerletSolver(body(initial_velocities=0.3 * NOISE), dt=h)
-        rollout = ds.Rollout(solver, 700, checkpoint_every=every)
+        rollout = ds.Rollout(solver, steps, checkpoint_every=every)
         rollout.forward(initial_velocities=0 * NOISE)
         rollout.sweep.workspace.energy_watch.every = 240
         with pytest.warns(EnergyGained) as said:

@@ -107,9 +107,9 @@ def test_positions_keep_their_digits():
     np.testing.assert_allclose(theirs.positions.numpy(), exact[0] + 0.25, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("up", "xyz")
-def test_a_file_for_blender_keeps_its_digits_and_has_y_up(up, tmp_path):
-    far = moved(scene(), FAR).replace(terms=[ds.Gravity(up=up)])
+@pytest.mark.parametrize("up, gravity", [("x", -9.8), ("y", -9.8), ("z", -9.8), ("y", 0.0)])
+def test_a_file_for_blender_keeps_its_digits_and_has_y_up(up, gravity, tmp_path):
+    far = moved(scene(), FAR).replace(terms=[ds.Gravity(gravity, up=up)])
     with open_writer(tmp_path / "run.glb", far) as writer:
         writer.write(Frame.of(ds.Simulator(ds.SemiImplicitSolver(far, dt=1e-3))))
     whole = (tmp_path / "run.glb").read_bytes()

@@ -12,6 +12,8 @@ import diffsim_ti as ds
 from diffsim_ti.mechanics.stress.projection import has_eigenvalue_below
 from diffsim_ti.solvers.implicit.rotations import rotations_of
 from diffsim_ti.solvers.implicit.rounds import Rounds
+from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
+from diffsim_ti.state.arrays import SceneArrays
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 by_name = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
@@ -445,6 +447,22 @@ def test_runs_from_other_starts_keep_the_bodies_that_are_loaded():
         known.append(loop.sweep.workspace.preconditioner)
     assert all(x is known[0] for x in known)
     assert loop.forward(**start, youngs_modulus=2 * E) and loop.sweep.workspace.preconditioner is not known[0]
+
+
+@pytest.mark.parametrize("where", [(SceneArrays, "inverse_of"), (ImplicitWorkspace, "mass_of")])
+def test_a_load_that_was_interrupted_leaves_nothing_behind(where, monkeypatch):
+    """Neither numbers on the device nor masses of the run before."""
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    rollout, fresh = (ds.Rollout(ds.ImplicitEulerSolver(oscillator(), dt=0.02), 1) for _ in range(2))
+    rollout.forward(youngs_modulus=2 * E, density=3 * RHO)
+    with monkeypatch.context() as patch:
+        patch.setattr(*where, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            rollout.forward()
+    np.testing.assert_array_equal(rollout.forward().positions, fresh.forward().positions)
 
 
 def test_steps_by_a_simulator_are_those_of_a_rollout():

@@ -486,6 +486,18 @@ def test_matrices_of_the_strained_state(monkeypatch):
         other.resume(state | dict(preconditioner=np.zeros(3)))
 
 
+def test_the_inverse_of_a_single_level_follows_the_strained_state(monkeypatch):
+    monkeypatch.setattr(Multigrid, "direct", 1000)
+    found = []
+    for price in ((10, 0), (1e9, 0)):
+        monkeypatch.setattr(Multigrid, "price", price)
+        rollout = ds.Rollout(stretched(), 6)
+        found.append((rollout.forward().displacements[-1], rollout.report.products))
+    (u, few), (v, many) = found
+    assert few < 0.6 * many
+    np.testing.assert_allclose(u, v, atol=1e-7 * np.abs(v).max())
+
+
 def test_coarse_levels_take_stiff_contact_of_those_scenes_that_have_it():
     """Of five cubes two are thrown at a rough floor: its stiffness is in their inverse, the others keep what they have."""
     mesh = ds.TetrahedralMesh.create_cube(6, 0.1)

@@ -264,6 +264,7 @@ def test_advice_names_patches_where_tetrahedra_lock(bulk_modulus, says):
     "wrong, says",
     [
         (dict(duration=-1.0), "if not 0 for an equilibrium"),
+        (dict(duration=None), "duration"),
         (dict(frames=0), "frames must be a whole number >= 1"),
         (dict(budget=-1.0), "budget must be > 0"),
         (dict(weights=1.0), "pass output="),

@@ -139,6 +139,8 @@ class JoinedPotential(Potential):
         self.skip = runtime.array(ti.i32, arrays.num_scenes)
 
     def launch(self, name, lanes=True, **records):
+        if name == "contact_blocks" and self.hosts:  # who add to those of all scenes
+            runtime.fill(self.skip, 0)
         if name not in BY_SCENE or not self.arrays.by_scene:
             return super().launch(name, lanes, **records)
         if name not in self._launches:
@@ -165,11 +167,6 @@ class JoinedPotential(Potential):
     def only(self, scenes: np.ndarray) -> None:
         """Let what follows be of some scenes, a mask; of others what was found before stays."""
         runtime.fill(self.skip, ~scenes)
-
-    def put_contact_blocks(self):
-        if self.hosts:  # who add to those of all scenes
-            runtime.fill(self.skip, 0)
-        super().put_contact_blocks()
 
     def energies_beside(self):
         own = [part.energies(self.held_at) for part in self.hosts]

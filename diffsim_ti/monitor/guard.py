@@ -183,7 +183,9 @@ class Guard:
         """Parts of passes first .. last - 1 of one length; each is gone through before the next is asked for."""
         schedule = self.ws.solver.schedule
         for begin, end in schedule.stretches(first, last):
-            self.ws.substep = float(schedule.length(begin))
+            h = float(schedule.length(begin))
+            if abs(h - self.ws.substep) > 1e-12 * h:  # lengths that differ by rounding alone are one
+                self.ws.substep = h
             yield begin, end
             if schedule.varies:
                 self.ws.watch.close(self.ws.substep)
@@ -207,7 +209,7 @@ class Guard:
                 end = int(schedule.first(step)) if step <= schedule.row(num_passes - 1) else num_passes
                 stop = min(stop, end)
             done = self._passes + stop - first
-            whole = done >= self.every or stop == num_passes or schedule.length(stop) != schedule.length(first)
+            whole = done >= self.every or stop == num_passes or len(schedule.stretches(stop - 1, stop + 1)) > 1
             if balance:
                 balance.before(first, num_passes)
             self.mark(first)

@@ -222,7 +222,7 @@ def modes(scene: Scene, k: int, displacements: ArrayLike | None = None, **values
         sigma, start = -1e-6 * size, np.random.default_rng(0).standard_normal(count)
         while (factors := Tangent((A - sigma * (identity(count) if M is None else M)).tocsc())).negative:
             sigma *= 4  # not below all of them yet
-        solve = LinearOperator(A.shape, factors._solve)
+        solve = LinearOperator(A.shape, factors._solve, dtype=float)
         values, vectors = eigsh(A.tocsc(), k, M, sigma=sigma, OPinv=solve, which="LM", tol=1e-13, v0=start)
         order = np.argsort(values)
         values, vectors = values[order], vectors[:, order]

@@ -67,6 +67,7 @@ class SceneArrays:
         self.poses = ObstaclePoses(self.obstacles, np.reshape(away, (-1, 3)))
         self.offsets = runtime.array(self.vector, self.poses.size)
         self.values: Derived | None = None
+        self._whole: Derived | None = None  # the same, unless a load of them was interrupted
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
         self.rows: dict[str, np.ndarray | None] = {}  # numbers as the device has them, of steps too
 
@@ -188,7 +189,8 @@ class SceneArrays:
 
     def load(self, values: Derived) -> bool:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound again."""
-        old, before = self.values, None if self.values is None else self.features()
+        old, self._whole = self._whole, None
+        before = old and self.features()
         self.values, self._known_features = values, {}
         self.rows = values.parts()
         moved = before != self.features()
@@ -211,6 +213,7 @@ class SceneArrays:
                 runtime.fill(current, data)
         if self.bodies:
             self.bodies.load(values, sources["inverse_mass"][0])
+        self._whole = values
         return moved
 
     def clear_corners_of_loads(self) -> None:

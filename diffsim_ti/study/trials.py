@@ -463,7 +463,8 @@ def recommend(
     """
     if scene.terms_of(Robot):
         raise ValueError("recommend takes no robots: compare Rollouts of ImplicitEulerSolver and explicit solvers")
-    duration = number("duration, if not 0 for an equilibrium,", duration, unit="s") if np.any(duration) else 0.0
+    at_rest = np.array_equal(duration, 0)
+    duration = 0.0 if at_rest else number("duration, if not 0 for an equilibrium,", duration, unit="s")
     budget, frames = number("budget", budget, unit="s"), whole("frames", frames, 1)
     if output is None and weights is not None:
         raise ValueError("weights are of a number of an output: pass output=, such as MaterialPoints([[0, 0, 0]])")

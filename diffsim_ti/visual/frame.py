@@ -46,7 +46,8 @@ class Setting(metaclass=Public):
         """A scene's."""
         held = scene.supports.held if len(scene.supports.partly_fixed) else None
         gravity = scene.term(Gravity)
-        up = 1 if gravity is None else int(np.argmax(np.abs(gravity.values["gravity"])))
+        acts = gravity is not None and gravity.values["gravity"].any()
+        up = int(np.argmax(np.abs(gravity.values["gravity"]))) if acts else 1
         return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene), held, up)
 
 

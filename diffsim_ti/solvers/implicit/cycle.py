@@ -150,7 +150,7 @@ class Inverse:
         self.put(M)
 
     def put(self, M, anew=(True,)) -> None:
-        """anew: of which of so many scenes numbers are others."""
+        """anew: a mask of the scenes whose numbers have changed."""
         b = M.blocksize[0]
         for own, mine, row, column, there in self._bodies:
             if not anew[own[0] * len(anew) // nodes_of(M)]:
@@ -225,11 +225,12 @@ class Cycle:
         for (_, between, _), P in zip(self._down, ways):
             runtime.fill(between["down"].values, rows_of(P.T.tobsr(P.blocksize[::-1]).data))
             runtime.fill(between["up"].values, rows_of(P.data))
-        self.put_below(matrices[1:])
+        self.put_below(matrices[1:] or matrices)
         return True
 
     def put_below(self, matrices: list, anew=(True,)) -> None:
-        """Set the numbers of the levels below the finest one, if there are any, and of the inverse; anew: as of that."""
+        """Set the numbers of the levels below the finest one, if there are any, and of the inverse of scenes that are
+        `anew`."""
         for level, M in zip(self.levels[1:-1], matrices):
             level.put_numbers(M)
         if matrices:

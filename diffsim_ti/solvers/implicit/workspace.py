@@ -61,14 +61,7 @@ class TwoStepHistory(History):
             copy_slot(source.v, s, target.before.v, to)
 
 
-GIVEN = (
-    "displacement",
-    "velocity",
-    "forces",
-    "motion",
-    "path",
-    "growths",
-)  # other numbers of these leave a body what it is
+GIVEN = {"displacement", "velocity", "forces", "motion", "path", "growths"}  # other numbers leave a body what it is
 
 
 class ImplicitWorkspace(PrescribedInPasses):
@@ -79,7 +72,7 @@ class ImplicitWorkspace(PrescribedInPasses):
     enough = 20  # rounds with which a solution that was not found is found by load stepping
 
     def __init__(self, solver, derived, bend=0.0):
-        self.potential, self._length, self.hosts = None, solver.substep, host_forces(solver.scene)
+        self.newton, self._length, self.hosts = None, solver.substep, host_forces(solver.scene)
         watched = solver.may_gain_energy and not (solver.scene.term(Growth) or solver.scene.interaction(Robots))
         self.energy_watch = EnergyWatch(self) if watched else None
         super().__init__(solver, derived, bend)
@@ -90,7 +83,9 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     def load(self, derived) -> None:
         self.overlaps = {}  # where equilibria are looked for from, as bytes: what was found there
-        if self._has_bodies_of(derived) and not self.arrays.load(derived):  # a control loop
+        newton, self.newton = self.newton, None  # until all is there: of a load that is interrupted nothing is kept
+        if newton and self._has_bodies_of(derived) and not self.arrays.load(derived):  # a control loop
+            self.newton = newton
             self.restart()
         else:
             self.load_bodies(derived)
@@ -99,7 +94,7 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     def _has_bodies_of(self, values) -> bool:
         """Whether only states and what is given by steps are other than those that are loaded."""
-        if not self.potential or self.pairs or self.joints or self.volumes or self.scene.reduced:
+        if self.pairs or self.joints or self.volumes or self.scene.reduced:
             return False
         known = self.arrays.values.parts()
         return all(name in GIVEN or np.array_equal(x, known[name]) for name, x in values.parts().items())
@@ -108,13 +103,11 @@ class ImplicitWorkspace(PrescribedInPasses):
         """All of `load`."""
         self._launches.clear()
         super().load(derived)
-        if not self._launches.get("potential"):
-            self.potential = self.potential_kind(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
-            self._launches["potential"] = True
-            self.joints = self.potential.joints = Joints(self) if self.scene.interaction(Robots) else None
-            self.start_joints()
-            self.place_obstacles(0)
-            self.strains = FrozenStrains(self) if self.potential.held is not None else None
+        self.potential = self.potential_kind(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
+        self.joints = self.potential.joints = Joints(self) if self.scene.interaction(Robots) else None
+        self.start_joints()
+        self.place_obstacles(0)
+        self.strains = FrozenStrains(self) if self.potential.held is not None else None
         a = self.arrays
         self._mass = self.mass_of(derived)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
@@ -139,8 +132,8 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.preconditioner, self.noted = self.preconditioners_kind(self), Noted(self)
         self.collisions = self.collisions_kind(self)
         finders, more = (self.collisions.past, self.preconditioner), (others, self.volumes)
-        self.newton = self.newton_kind(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
-        self.newton.detection = self.collisions.detection
+        newton = self.newton_kind(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
+        newton.detection, self.newton = self.collisions.detection, newton
 
     @property
     def mass(self) -> Mass:
