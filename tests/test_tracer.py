@@ -266,3 +266,27 @@ def test_a_kernel_that_fails_leaves_taichis_tracer_behind():
     with pytest.raises(ti.TaichiCompilationError, match="nowhere"):
         wrong(1.0)
     assert [vars(owner).get(name) for owner, name in sources._CHANGES] == before
+
+
+def test_functions_of_taichi_copy_their_arguments_in_kernels_of_others():
+    """Those that kernels of the package hand arguments to as they are, while these are traced alone."""
+
+    @runtime.kernel
+    def ours() -> ti.f64:
+        return ti.Vector([3.0, 4.0], ti.f64).normalized()[0]
+
+    @ti.func
+    def spoil(x: ti.template()):
+        x[0] = 100.0
+        return 1.0
+
+    @ti.func
+    def first(x, _):
+        return x[0]
+
+    @ti.kernel
+    def theirs() -> ti.f64:
+        x = ti.Vector([3.0, 4.0], ti.f64)
+        return first(x.normalized(), spoil(x))
+
+    assert ours() == pytest.approx(0.6) and theirs() == pytest.approx(0.6)

@@ -6,15 +6,13 @@ which nothing else acts in any of the eight (free_vertices.py); at the others th
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.batch.block_views import OF_STEPS, BlockViews, in_blocks, in_lanes
-from diffsim_ti.runtime import LANES, Bundle, Kernel, at, let, traced
+from diffsim_ti.runtime import LANES, A, Bundle, Kernel, as_kernel, at, let, traced
 from diffsim_ti.state.pass_table import reversed_pass
 
-A = ti.template()
 STATE = dict.fromkeys(("u", "v", "f", "frames_u", "frames_v", "seen"), "blocks2")
 STATE |= dict(stage="vectors2", work="scalars", calm="ints")
 CHANGE = dict.fromkeys(("u", "v", "frames_u", "frames_v"), "blocks2")
@@ -41,8 +39,9 @@ class BatchKernels(BlockViews):
 
     # ---- forward -----------------------------------------------------------------------------------------------------
 
-    @ti.func
-    def passes(self, scene: A, state: A, table: A, plan: A):
+    @as_kernel("step", {}, stride="int")
+    def step(self, scene: A, state: A, table: A, plan: A):
+        """`count` passes from pass `first` on."""
         for t in range(plan.spread * plan.num_blocks):
             if t % plan.spread == 0:
                 for j in range(plan.first, plan.first + plan.count):
@@ -74,15 +73,14 @@ class BatchKernels(BlockViews):
                         self.vertex.step(i, j, self.one(now, lane), own, at_, plan)
             self.free.clear(b, i, scene.corner, plan)
 
-    @cached_property
-    def step(self) -> Kernel:
-        """`count` passes from pass `first` on."""
-        return self._kernel("step", self.passes, dict(state=self.with_record(STATE)), stride="int")
-
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
-    @ti.func
-    def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
+    def changed(self) -> dict:
+        return dict(tangent=self.with_record(CHANGE) | CHANGED | OF_STEPS | self.alone | self.growing)
+
+    @as_kernel("step_jvp", changed)
+    def step_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
+        """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
         for t in range(plan.spread * plan.num_blocks):
             if t % plan.spread == 0:
                 for j in range(plan.first, plan.first + plan.count):
@@ -125,16 +123,15 @@ class BatchKernels(BlockViews):
             calm = state.calm[(s * plan.num_blocks + b) * plan.num_vertices + i]
         return calm
 
-    @cached_property
-    def step_jvp(self) -> Kernel:
-        """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_record(CHANGE) | CHANGED | OF_STEPS | self.alone | self.growing
-        return self._kernel("step_jvp", self.passes_jvp, dict(state=self.with_record(STATE), tangent=tangent))
-
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
-    @ti.func
-    def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
+    def adjoints(self) -> dict:
+        own = self.with_record(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.items.adjoint) | self.growing
+        return dict(adjoint=own)
+
+    @as_kernel("step_vjp", adjoints, **dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int"))
+    def step_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
+        """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
         for t in range(plan.spread * plan.num_blocks):
             if t % plan.spread == 0:
                 for back in range(plan.count):
@@ -183,16 +180,8 @@ class BatchKernels(BlockViews):
                 by = self.adjoint_of(b, lane, adjoint, plan)
                 self.vertex.obstacles.fold_part(p, plan.num_vertices, j, j, by, table, plan)
 
-    @cached_property
-    def step_vjp(self) -> Kernel:
-        """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
-        numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
-        adjoint = self.with_record(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.items.adjoint) | self.growing
-        arrays = dict(state=self.with_record(STATE), adjoint=adjoint)
-        return self._kernel("step_vjp", self.passes_vjp, arrays, **numbers)
-
     def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:
-        arrays = dict(scene=self.scene()) | arrays | dict(table=self.table())
+        arrays = dict(scene=self.scene(), state=self.with_record(STATE)) | arrays | dict(table=self.table())
         few = self.law.short and self.features.order == 1 and not (self.features.groups or self.items.any)
         numbers = NUMBERS | numbers | self.items.counts | self.lengths
         return Kernel(f"batch_{name}", body, self.law.precision, arrays, numbers, polished=few)

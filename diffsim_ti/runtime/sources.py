@@ -8,6 +8,7 @@ pair out again by a walk through the whole kernel: its time grows with the squar
 """
 
 import ast
+import inspect
 import textwrap
 from contextlib import contextmanager, nullcontext
 
@@ -131,6 +132,8 @@ def _faster():
                 setattr(owner, name, own)
             yield
         finally:
+            while tracer.shared:
+                tracer.shared.pop().annotation = inspect.Parameter.empty
             for (owner, name), own in before.items():
                 delattr(owner, name) if own is _INHERITED else setattr(owner, name, own)
 

@@ -58,6 +58,7 @@ _DECORATORS = {
 }
 _record_of = lru_cache(maxsize=None)(core.DebugInfo)  # of a place in a file
 _AS_IT_IS = template()  # Taichi copies no argument of a parameter with this annotation
+shared: list = []  # parameters that have it while a kernel of ours is traced, some of functions of Taichi's
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -260,6 +261,7 @@ def arguments(function, values: tuple, changed: set[str]) -> tuple:
     for parameter, value in zip(function.arguments, values):
         if parameter.annotation is inspect.Parameter.empty and parameter.name not in changed:
             parameter.annotation = _AS_IT_IS
+            shared.append(parameter)
         if parameter.annotation is _AS_IT_IS:
             value = let(value) if type(value) is Expr else impl.expr_init_func(value)
         elif (

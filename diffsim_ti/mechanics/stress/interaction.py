@@ -6,7 +6,7 @@ from diffsim_ti.terms import Growth
 
 
 class Growths(Interaction):
-    """They change what tetrahedra take for their rest shape, and act by their stress alone (growing.py)."""
+    """They change what tetrahedra take for their rest shape, and act by their stress alone (tetrahedron.py)."""
 
     name, kinds, works, is_load, makes_rows = "growth", (Growth,), "growth", False, True
     in_kernels = on_host = False

@@ -45,7 +45,7 @@ class PatchCoupling:
     """sum_p c_p g_p (x) g_p, what patches add to d2E/du2 beyond their tetrahedra at fixed pressure.
 
     g_p: the change of W_p theta_p for displacements of the patch's vertices [m^2], c_p = lam_p / W_p [Pa/m^3]
-    (patched_tetrahedron.py). A row for each pair of a patch and one of its vertices.
+    (above). A row for each pair of a patch and one of its vertices.
     """
 
     def __init__(self, arrays):

@@ -63,8 +63,6 @@ class FrictionKernels(ListedPair):
                 total += scene.corner[scene.corner_of[k]]
         return total
 
-    # ---- what presses ------------------------------------------------------------------------------------------------
-
     # ---- where pair p presses, at corners y1, y2, y3 relative to corner 0 (proximity.py) ----------------------------------
 
     @ti.func

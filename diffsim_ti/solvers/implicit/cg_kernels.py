@@ -1,16 +1,15 @@
 """Kernels of conjugate gradients. Sums go over fixed chunks, then over these: the same bits with any number of threads."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, Kernel, runs_on_cpu
+from diffsim_ti.runtime import PRECISIONS, A, Kernel, as_kernel, runs_on_cpu
 
-A = ti.template()
 # places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature, 3 r . z <= 0
 RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST, LIMIT = range(8)
 NUMBERS, ROOM = 8, 56  # of these; of those behind them, which are Newton's method's (newton_kernels.py), too
+SUMS, SIZES = dict(part="scalars2", state="scalars2"), dict.fromkeys(("chunks", "length", "nodes", "systems"), "int")
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,12 @@ class CGKernels:
         """A vector in another precision, number by number: Taichi has no vector code for this."""
         return ti.Vector([ti.cast(v[0], fp), ti.cast(v[1], fp), ti.cast(v[2], fp), ti.cast(0, fp)])
 
-    @ti.func
-    def is_wanted(self, cg: A, plan: A):
+    def _kernel(self, name: str, body, numbers: dict, /, **arrays) -> Kernel:
+        return Kernel(name, body, self.vectors, arrays, numbers)
+
+    @as_kernel("wanted", {}, cg=dict(state="scalars2"))
+    def wanted(self, cg: A, plan: A):
+        """Whether a solve goes on, for `Repeated`."""
         wanted = cg.state[0, STOPPED] == 0
         if ti.static(self.several):
             for b in range(1, cg.state.shape[0]):
@@ -99,25 +102,22 @@ class CGKernels:
                     wanted = True
         return wanted
 
-    @cached_property
-    def wanted(self) -> Kernel:
-        """Whether a solve goes on, for `Repeated`."""
-        return Kernel("wanted", self.is_wanted, self.vectors, dict(cg=dict(state="scalars2")), {})
-
-    @ti.func
-    def divide(self, cg: A, plan: A):
+    @as_kernel("scale", dict(nodes="int"), cg=dict.fromkeys(("r", "z", "inverse"), "vectors2"))
+    def scale(self, cg: A, plan: A):
+        """z = D^-1 r; inverse: the columns of each block of D^-1."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             cg.z[0, i] = self.block(cg.inverse, i, cg.r[0, i])
 
-    @cached_property
-    def scale(self) -> Kernel:
-        """z = D^-1 r; inverse: the columns of each block of D^-1."""
-        arrays = dict(cg=dict.fromkeys(("r", "z", "inverse"), "vectors2"))
-        return Kernel("scale", self.divide, self.vectors, arrays, dict(nodes="int"))
-
-    @ti.func
-    def inverses(self, cg: A, body: A, out: A, plan: A):
+    @as_kernel(
+        "invert",
+        dict(nodes="int"),
+        cg=dict(free="scalars", inverse="vectors2"),
+        body=dict(hard="ints", mass="scalars", least="scalars"),
+        out=lambda self: dict(blocks=f"vectors2_{self.scene}"),
+    )
+    def invert(self, cg: A, body: A, out: A, plan: A):
+        """D^-1 of each block of a stiffness with inertia; hard: whether it is less than `least`."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             if cg.free[i] > 0:
@@ -133,17 +133,14 @@ class CGKernels:
                 for j in ti.static(range(3)):
                     cg.inverse[j, i] = ti.Vector([inverse[0, j], inverse[1, j], inverse[2, j], 0], self.fp)
 
-    @cached_property
-    def invert(self) -> Kernel:
-        """D^-1 of each block of a stiffness with inertia; hard: whether it is less than `least`."""
-        arrays = dict(
-            cg=dict(free="scalars", inverse="vectors2"), body=dict(hard="ints", mass="scalars", least="scalars")
-        )
-        arrays |= dict(out=dict(blocks=f"vectors2_{self.scene}"))
-        return Kernel("invert", self.inverses, self.vectors, arrays, dict(nodes="int"))
-
-    @ti.func
-    def first(self, cg: A, at: A, plan: A):
+    @as_kernel(
+        "turn",
+        SIZES,
+        cg=SUMS | dict.fromkeys(("r", "z", "p"), "vectors2"),
+        at=lambda self: dict(w=f"vectors2_{self.scene}") | (dict(skip="ints") if self.several else {}),
+    )
+    def turn(self, cg: A, at: A, plan: A):
+        """The next direction p = z + beta p."""
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
             rz = ti.cast(0, self.fp)
@@ -172,17 +169,6 @@ class CGKernels:
                     p += cg.p[0, i] * cg.state[b, BETA]
                 cg.p[0, i] = p
                 at.w[0, i] = self.to(PRECISIONS[self.scene], p)
-
-    def _kernel(self, name: str, function, cg: dict, at: dict, **numbers) -> Kernel:
-        arrays = dict(cg=dict(part="scalars2", state="scalars2") | cg, at=at)
-        sizes = dict.fromkeys(("chunks", "length", "nodes", "systems"), "int")
-        return Kernel(name, function, self.vectors, arrays, sizes | numbers)
-
-    @cached_property
-    def turn(self) -> Kernel:
-        """The next direction p = z + beta p."""
-        at = dict(w=f"vectors2_{self.scene}") | (dict(skip="ints") if self.several else {})
-        return self._kernel("turn", self.first, dict.fromkeys(("r", "z", "p"), "vectors2"), at)
 
     @ti.func
     def block(self, columns: A, k, v):
@@ -241,8 +227,15 @@ class CGKernels:
             square += self.dot(cg.r[0, i], cg.r[0, i])
         cg.part[0, c] = square
 
-    @ti.func
-    def advance(self, cg: A, at: A, plan: A):
+    def stepped(self) -> dict:
+        """What a step reads and changes."""
+        own = SUMS | dict(mass="scalars", free="scalars") | dict.fromkeys(("x", "r", "p", "q"), "vectors2")
+        own |= dict(guide="ints", held="vectors2") if self.guided else {}
+        return own | (dict(start="ints", column="ints", blocks="vectors2") if self.more else {})
+
+    @as_kernel("step", SIZES | dict(rounding="float"), cg=stepped, at=lambda self: dict(y=f"vectors2_{self.scene}"))
+    def step(self, cg: A, at: A, plan: A):
+        """x and r after a step along p, y being what the potential's product makes of it."""
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
             if cg.state[self.system(c, plan.chunks, plan), STOPPED] == 0:
@@ -263,11 +256,3 @@ class CGKernels:
                 cg.state[b, SQUARE] = cg.part[0, self.add_up(cg.part, 1, b, plan)]
                 if cg.state[b, SQUARE] <= cg.state[b, LEAST]:
                     cg.state[b, STOPPED] = ti.cast(1, self.fp)
-
-    @cached_property
-    def step(self) -> Kernel:
-        """x and r after a step along p, y being what the potential's product makes of it."""
-        own = dict(mass="scalars", free="scalars") | dict.fromkeys(("x", "r", "p", "q"), "vectors2")
-        own |= dict(guide="ints", held="vectors2") if self.guided else {}
-        own |= dict(start="ints", column="ints", blocks="vectors2") if self.more else {}
-        return self._kernel("step", self.advance, own, dict(y=f"vectors2_{self.scene}"), rounding="float")

@@ -5,10 +5,8 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, Kernel, traced
+from diffsim_ti.runtime import PRECISIONS, A, Kernel, as_kernel, traced
 from diffsim_ti.runtime import at as entry
-
-A = ti.template()
 
 
 def matrix_arrays(rows: int) -> dict:
@@ -128,8 +126,17 @@ class CycleKernels:
         for i in range(plan.nodes):
             self.change(i, 1, level, level.y, level.x)
 
-    @ti.func
-    def restrict(self, level: A, down: A, below: A, plan: A):
+    def _kernel(self, name: str, body, arrays: dict, *numbers: str) -> Kernel:
+        arrays = dict(level=level_arrays(self.fine, self.threads)) | arrays
+        return Kernel(name, body, "f32", arrays, dict.fromkeys(numbers, "int"))
+
+    @as_kernel(
+        "down",
+        lambda self: dict(down=matrix_arrays(self.coarse), below=level_arrays(self.coarse, self.threads_down)),
+        *("nodes", "below", "shares", "shares_below"),
+    )
+    def down(self, level: A, down: A, below: A, plan: A):
+        """From the first x of a level to b and the first x of the next."""
         self.changes(level, plan)
         self.share_level(level, level.x, plan)
         ti.loop_config(serialize=not self.parallel)
@@ -142,17 +149,9 @@ class CycleKernels:
             below.b[i] = b
             self.begin(i, below, b, self.zero(self.coarse), below.x, self.coarse)
 
-    @cached_property
-    def down(self) -> Kernel:
-        """From the first x of a level to b and the first x of the next."""
-        level, below = level_arrays(self.fine, self.threads), level_arrays(self.coarse, self.threads_down)
-        arrays = dict(level=level, down=matrix_arrays(self.coarse), below=below)
-        return Kernel(
-            "down", self.restrict, "f32", arrays, dict.fromkeys(("nodes", "below", "shares", "shares_below"), "int")
-        )
-
-    @ti.func
-    def correct(self, level: A, up: A, below: A, plan: A):
+    @as_kernel("up", lambda self: dict(up=matrix_arrays(self.fine), below=level_arrays(self.coarse)), "nodes", "shares")
+    def up(self, level: A, up: A, below: A, plan: A):
+        """From the last x of the next level to the last of this."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             level.y[i] = self.row(i, up, below.x, level, level.x[i], self.coarse, 1)
@@ -161,13 +160,6 @@ class CycleKernels:
         for i in range(plan.nodes):
             self.begin(i, level, self.left(i, level, level.y), level.y[i], level.x, self.fine)
         self.changes(level, plan)
-
-    @cached_property
-    def up(self) -> Kernel:
-        """From the last x of the next level to the last of this."""
-        level = level_arrays(self.fine, self.threads)
-        arrays = dict(level=level, up=matrix_arrays(self.fine), below=level_arrays(self.coarse))
-        return Kernel("up", self.correct, "f32", arrays, dict(nodes="int", shares="int"))
 
 
 @dataclass(frozen=True)
@@ -184,22 +176,26 @@ class LevelKernels:
     def between(self) -> CycleKernels:
         return CycleKernels(self.numbers, self.numbers, self.parallel)
 
-    @ti.func
-    def multiply(self, level: A, inverse: A, plan: A):
+    def _kernel(self, name: str, body, numbers: dict, **arrays) -> Kernel:
+        return Kernel(name, body, self.precision, arrays, dict(nodes="int") | numbers)
+
+    @as_kernel(
+        "solve",
+        dict(shares="int"),
+        level=lambda self: level_arrays(self.numbers, self.threads),
+        inverse=lambda self: matrix_arrays(self.numbers),
+    )
+    def solve(self, level: A, inverse: A, plan: A):
+        """x = A^-1 b by the inverse, a matrix of blocks."""
         self.between.share(plan.shares, inverse, level.b, level, self.numbers, self.numbers, self.threads)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             zero = self.between.zero(self.numbers)
             level.x[i] = self.between.row(i, inverse, level.b, level, zero, self.numbers, self.threads)
 
-    @cached_property
-    def solve(self) -> Kernel:
-        """x = A^-1 b by the inverse, a matrix of blocks."""
-        arrays = dict(level=level_arrays(self.numbers, self.threads), inverse=matrix_arrays(self.numbers))
-        return Kernel("solve", self.multiply, "f32", arrays, dict(nodes="int", shares="int"))
-
-    @ti.func
-    def turn_back(self, at: A, level: A, frames: A, plan: A):
+    @as_kernel("enter", dict(scale="float"), at=dict(r="vectors2"), level=level_arrays(3), frames=dict(turned="rows3"))
+    def enter(self, at: A, level: A, frames: A, plan: A):
+        """b = scale Q^T r, Q: `turned`, and the first x of the finest level."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             r = self.between.zero(3)
@@ -211,14 +207,15 @@ class LevelKernels:
             level.b[i] = b
             self.between.begin(i, level, b, self.between.zero(3), level.x, 3)
 
-    @cached_property
-    def enter(self) -> Kernel:
-        """b = scale Q^T r, Q: `turned`, and the first x of the finest level."""
-        arrays = dict(at=dict(r="vectors2"), level=level_arrays(3), frames=dict(turned="rows3"))
-        return Kernel("enter", self.turn_back, self.precision, arrays, dict(nodes="int", scale="float"))
-
-    @ti.func
-    def turn_forth(self, at: A, level: A, frames: A, plan: A):
+    @as_kernel(
+        "leave",
+        dict(scale="float"),
+        at=dict(z="vectors2"),
+        level=level_arrays(3),
+        frames=dict(turned="rows3", allowed="rows3"),
+    )
+    def leave(self, at: A, level: A, frames: A, plan: A):
+        """z = scale P Q y, P: what vertices may do."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             own = level.x[i]
@@ -226,9 +223,3 @@ class LevelKernels:
             y = self.between.block(frames.allowed, i, turned, 3)
             for j in ti.static(range(3)):
                 at.z[0, i][j] = ti.cast(y[j], PRECISIONS[self.precision]) * plan.scale
-
-    @cached_property
-    def leave(self) -> Kernel:
-        """z = scale P Q y, P: what vertices may do."""
-        arrays = dict(at=dict(z="vectors2"), level=level_arrays(3), frames=dict(turned="rows3", allowed="rows3"))
-        return Kernel("leave", self.turn_forth, self.precision, arrays, dict(nodes="int", scale="float"))
