@@ -50,7 +50,7 @@ CONTACT_REVERSE = NO_TRAFFIC | dict(launches=19, copies_to_device=4, bytes_to_de
 NEW_LIST = NO_TRAFFIC | dict(launches=55, copies_to_device=16, copies_to_host=11, fills=2)
 # ... for each implicit step of this scene, whose rounds of Newton's method read a few numbers, and for a product of the host
 IMPLICIT_FORWARD = NO_TRAFFIC | dict(launches=310, copies_to_device=68, copies_to_host=31, fills=4)
-IMPLICIT_REVERSE = NO_TRAFFIC | dict(launches=63, copies_to_device=14, copies_to_host=11, fills=2)
+IMPLICIT_REVERSE = NO_TRAFFIC | dict(launches=63, copies_to_device=14, copies_to_host=10, fills=1)
 PRODUCT = NO_TRAFFIC | dict(launches=3, copies_to_device=2, copies_to_host=1)
 # ... for a whole explicit run, besides its substeps: arrays go each way once, zeroing is a memset
 ONCE_FORWARD = dict(synchronisations=0, copies_to_device=17, copies_to_host=8, fills=4)

@@ -138,7 +138,7 @@ class Stress(_Tensors):
     it, about twice as accurate with ten nodes, at surfaces too (Zienkiewicz, Zhu 1992, doi:10.1002/nme.1620330702).
     principal: Cauchy's eigenvalues instead, ascending, shape (frames, ..., 3); where two coincide only their sum has a
     gradient. von_mises: sqrt(3/2 s : s) of Cauchy's deviator s instead, shape (frames, ...), at vertices that of the mean
-    stress; where it is 0 it has a kink, and its gradient is given as 0, but that of rounding has a slope.
+    stress; where it is 0 it has a kink, and its gradient is given as 0 (a stress of mere rounding has a slope).
     The gradient is exact by all inputs; in single precision the stress has an error of some 1e-6 of the modulus. Of a law
     with a state, such as `Prony`, it is that of the strain and of what the law remembers in the frame; the viscous stress
     of `KelvinVoigt` is not in it.

@@ -158,6 +158,14 @@ class Inverse:
             dense = np.zeros((len(own), b, len(own), b))
             dense[row, :, column] = M.data[mine]
             self._put(dense.reshape(b * len(own), -1), there)
+        self._upload()
+
+    def put_dense(self, dense: np.ndarray) -> None:
+        """The same for a matrix of one body, as a dense array."""
+        self._put(dense, self._bodies[0][-1])
+        self._upload()
+
+    def _upload(self) -> None:
         runtime.fill(self.values, self._rows.reshape(-1, self._rows.shape[2]))
 
     def _put(self, dense: np.ndarray, there: np.ndarray) -> None:
@@ -170,11 +178,6 @@ class Inverse:
     @property
     def is_of_one_body(self) -> bool:
         return len(self._bodies) == 1
-
-    def put_dense(self, dense: np.ndarray) -> None:
-        """Of one body, whose matrix has no zeros to leave out."""
-        self._put(dense, self._bodies[0][-1])
-        runtime.fill(self.values, self._rows.reshape(-1, self._rows.shape[2]))
 
 
 class Cycle:

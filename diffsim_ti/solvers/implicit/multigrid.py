@@ -111,9 +111,9 @@ class Multigrid(Preconditioner):
         self._joined = SimpleNamespace(own=own, touched=runtime.array(ti.i32, n), hard=runtime.array(ti.i32, n))
         records = dict(at=self.potential.barriers, frames=self.frames, turning=self.frames.body, body=self._joined)
         records["level"] = self.cycle.levels[0]
-        kernel = lambda parallel: kernels_of(ContactKernels, a.precision, precision, parallel).join  # noqa: E731
-        self._join = kernel(parallel and not a.by_scene), records, dict(vertices=n)
-        self._launch = kernel(parallel).bind(**records)
+        within, alone = parallel and not a.by_scene, parallel  # in one kernel with others, and in its own
+        within, alone = (kernels_of(ContactKernels, a.precision, precision, p).join for p in (within, alone))
+        self._join, self._launch = (within, records, dict(vertices=n)), alone.bind(**records)
         self._begin_join()
 
     def _begin_join(self) -> None:

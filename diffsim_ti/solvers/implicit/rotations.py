@@ -106,9 +106,10 @@ class Frames:
             hard=runtime.array(ti.i32, n),
         )
         a, records = potential.arrays, dict(at=potential, body=self.body, frames=self)
-        kernel = lambda parallel: kernels_of(FrameKernels, a.precision, parallel).frames  # noqa: E731
-        self.part = kernel(parallel and not a.by_scene), records, dict(zip(("points", "each", "vertices"), self.count))
-        self._launch = kernel(parallel).bind(**records)
+        within, alone = parallel and not a.by_scene, parallel  # in one kernel with others, and in its own
+        within, alone = (kernels_of(FrameKernels, a.precision, p).frames for p in (within, alone))
+        self.part = within, records, dict(zip(("points", "each", "vertices"), self.count))
+        self._launch = alone.bind(**records)
 
     def update(self) -> None:
         """To the displacement at which the potential is placed."""
