@@ -418,6 +418,18 @@ class CurvedPairs:
         add = self.kernels.add_blocks, dict(rows=self.up, at=at), dict(count=self.a.num_vertices)
         return [*self.inner.adding_blocks(self.fine(u, 0), self._blocks), add]
 
+    @property
+    def overlap(self) -> int:
+        return self.inner.overlap * int(np.diff(self.matrix.indptr).max(initial=1))
+
+    def stiffness(self, u) -> tuple:
+        from scipy.sparse import eye, kron
+
+        matrix, diagonal = self.inner.stiffness(self.fine(u, 0))
+        up = kron(self.matrix.T, eye(3), "csr")
+        squares = self.matrix.T.multiply(self.matrix.T) @ diagonal.reshape(-1, 9)
+        return (up @ matrix @ up.T).tobsr((3, 3)), squares.reshape(-1, 3, 3)
+
     def _step(self, step: np.ndarray, to) -> np.ndarray:
         return self.spread(
             step, 0.0 if to is None else self.obstacles.displacements_at(to) - self.obstacles.displacements

@@ -132,6 +132,17 @@ class HessianKernels(ListedPair):
             for a in ti.static(range(4)):
                 scene.corner[4 * p + a] = self.four(w[a] * ti.sqrt(k) * n)
 
+    @ti.func
+    def root_or_none(self, kind: A, p, scene: A, at: A, plan: A):
+        for a in ti.static(range(4)):
+            scene.corner[4 * p + a] = self.vec4(0)
+        self.root(kind, p, scene, at, plan)
+
+    @as_kernel("pair_roots", dict(u="vectors2"), ACTING)
+    def roots(self, scene: A, at: A, plan: A):
+        """Of each corner its vector c: the convex part between corners a and b is c_a c_b^T; zero where none acts."""
+        self.each_pair(self.root_or_none, scene, at, plan)
+
     @as_kernel("pair_blocks", dict(u="vectors2", out="vectors2"), ACTING, anew="int")
     def blocks(self, scene: A, at: A, plan: A):
         """Adds the 3x3 diagonal blocks of the convex part to rows 0..2 of `out`, one column of each vertex; or puts them

@@ -4,7 +4,8 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.surfaces.buffers import Parts
+from diffsim_ti.mechanics.stress.projection import summed
+from diffsim_ti.mechanics.surfaces.buffers import Parts, whole
 from diffsim_ti.mechanics.surfaces.hessian_kernels import HessianKernels
 from diffsim_ti.mechanics.surfaces.lagged_friction import LaggedFriction
 from diffsim_ti.mechanics.surfaces.listed_pair import SAFE
@@ -26,6 +27,8 @@ class ImplicitPairs(SurfacePairs):
     blocked: np.ndarray | None = None  # corners of the pair that stopped the last march
     _ahead: np.ndarray | float = 0.0  # how far vertices are expected to go in a pass [m]
     asks = False  # whether the host has to look at the way of a step
+    # how many times its diagonal blocks a matrix is at most: the square of a sum over so many corners of a pair
+    overlap = 4
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)
@@ -112,6 +115,28 @@ class ImplicitPairs(SurfacePairs):
         (mechanics/energy/kernels.py); where sizes say `anew`, puts them there."""
         friction = self.friction.adding_blocks(out) if self.friction else []
         return [self.prepared(self.hessian.blocks, dict(u=u, out=out)), *friction]
+
+    def stiffness(self, u) -> tuple:
+        """(Hessian of the convex part and of friction at u[0], where `place` has been, as a SciPy matrix of blocks [N/m];
+        its diagonal blocks, as `adding_blocks` adds them)."""
+        from scipy.sparse import bsr_matrix
+
+        self.run(self.hessian.roots, dict(u=u))
+        count, n = self.list.count, self.a.num_vertices
+        c = whole(self.corner)[: 4 * count].reshape(count, 4, -1)[..., :3].astype(np.float64)
+        acts = np.flatnonzero(c.any((1, 2)))
+        corners = [whole(self.list.pairs)[: 4 * count].reshape(-1, 4)[acts].astype(np.int64)]
+        blocks = [c[acts][:, :, None, :, None] * c[acts][:, None, :, None, :]]
+        if self.friction:
+            corners.append(self.friction.corners.astype(np.int64))
+            blocks.append(self.friction.stiffness())
+        corners = np.concatenate(corners)
+        places = (corners[:, :, None] * n + corners[:, None, :]).ravel()
+        places, blocks = summed(places, np.concatenate(blocks).reshape(-1, 9))
+        rows, columns, diagonal = places // n, places % n, np.zeros((n, 3, 3))
+        diagonal[rows[rows == columns]] = blocks[rows == columns]
+        start = np.searchsorted(rows, np.arange(n + 1))
+        return bsr_matrix((blocks, columns, start), shape=(3 * n, 3 * n)), diagonal
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0, placed: bool = False) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet during the motion; close to the

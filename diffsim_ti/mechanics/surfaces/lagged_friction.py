@@ -146,6 +146,11 @@ class LaggedFriction:
     def multiplying(self, w) -> Parts:
         return self._product.part(self._product.kernels.products, w=w, out=self.a.corner)
 
+    def stiffness(self) -> np.ndarray:
+        """Of each pair between its corners, where `measuring` has been, shape (count, 4, 4, 3, 3) [N/m]."""
+        S = whole(self._product.of.stiffness)[: 3 * self.count].reshape(-1, 3, 4)[..., :3]
+        return np.einsum("pa,pb,pij->pabij", self.w, self.w, S)
+
     def adding_blocks(self, out) -> Parts:
         return self._product.part(self._product.kernels.blocks, out=out)
 

@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.buffers import put
 from diffsim_ti.runtime import ROWS, kernels_of
 from diffsim_ti.solvers.implicit.cycle_kernels import THETA, CycleKernels, LevelKernels
 
@@ -55,7 +56,7 @@ def diagonal_blocks(M) -> np.ndarray:
 class Level:
     """A level: a matrix of square blocks whose largest eigenvalue against its diagonal blocks is found here."""
 
-    def __init__(self, M, parallel: bool):
+    def __init__(self, M, parallel: bool, coupled: bool = False):
         self.numbers, self.nodes = M.blocksize[0], nodes_of(M)
         rows = np.repeat(np.arange(self.nodes), np.diff(M.indptr))
         self._off = rows != M.indices
@@ -66,13 +67,35 @@ class Level:
         self.diagonal, self.inverse = (runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2))
         self.threads, self.parallel = threads_of(M), parallel
         self._measure(M)
+        if coupled:
+            self.contact_start = runtime.upload(np.zeros(self.nodes + 1), ti.i32)
+            self.contact_column, self.contact_values = runtime.array(ti.i32, 1), runtime.array(ROWS[self.numbers], 1)
 
     def _measure(self, M) -> None:
         blocks = diagonal_blocks(M)
-        largest = getattr(M, "largest", None)  # known since it was made
-        self.theta = THETA * MARGIN * (largest or largest_eigenvalue(M, blocks))
-        for target, own in ((self.diagonal, blocks), (self.inverse, inverses(blocks) / self.theta)):
-            runtime.fill(target, rows_of(own))
+        self.largest = getattr(M, "largest", None) or largest_eigenvalue(M, blocks)  # or known since it was made
+        runtime.fill(self.diagonal, rows_of(blocks))
+        self._inverses = inverses(blocks)
+        self.widen(self.largest)
+
+    def widen(self, largest: float) -> None:
+        """Take another largest eigenvalue, with the diagonal blocks as they are but for what contact has changed of them."""
+        self.theta = THETA * MARGIN * largest
+        runtime.fill(self.inverse, rows_of(self._inverses / self.theta))
+
+    def couple(self, M, take) -> None:
+        """Let another matrix join this one; take: `Buffers.take`."""
+        room, b = len(M.data), self.numbers
+        self.contact_column = take(f"columns of contact of {self.nodes} nodes", ti.i32, room)
+        self.contact_values = take(f"contact of {self.nodes} nodes", ROWS[b], b * room)
+        runtime.fill(self.contact_start, M.indptr)
+        put(self.contact_column, M.indices)
+        put(self.contact_values, rows_of(M.data))
+
+    def put_contact(self, M, more, take) -> None:
+        """Let a matrix of contact join M, whose numbers are there."""
+        self._measure((M + more).tobsr(M.blocksize))
+        self.couple(without(more, diagonal_blocks(more)), take)
 
     def put_numbers(self, M) -> None:
         """Set those of another matrix with the same places."""
@@ -84,6 +107,18 @@ class Level:
         blocks, inverse = (runtime.fetch(x).reshape(-1, 3, 3) for x in (self.diagonal, self.inverse))
         inverse[nodes] = inverses(np.swapaxes(blocks[nodes].astype(np.float64), 1, 2)) / self.theta  # symmetric
         runtime.fill(self.inverse, inverse.reshape(-1, 3))
+
+
+def without(M, diagonal: np.ndarray):
+    """M less diagonal blocks, without blocks of zeros."""
+    from scipy.sparse import bsr_matrix
+
+    k = len(diagonal)
+    out = (M - bsr_matrix((diagonal, np.arange(k), np.arange(k + 1)), shape=M.shape)).tobsr(M.blocksize)
+    out.sort_indices()
+    some = out.data.any((1, 2))
+    start = np.concatenate([[0], np.cumsum(some)])[out.indptr]
+    return bsr_matrix((out.data[some], out.indices[some], start), shape=M.shape)
 
 
 def largest_eigenvalue(M, diagonal: np.ndarray) -> float:
@@ -125,15 +160,17 @@ def positive_inverse(A: np.ndarray) -> np.ndarray:
 
 
 class Inverse:
-    """The inverse of a matrix of blocks, body by body, as one on the device; motions that a block has not stay zero."""
+    """The inverse of a matrix of blocks, body by body, as one on the device; motions that a block has not stay zero.
+    whole: as if it were one body."""
 
-    def __init__(self, M):
+    def __init__(self, M, whole: bool = False):
         from scipy.sparse import csr_matrix
         from scipy.sparse.csgraph import connected_components
 
         k, rows = nodes_of(M), np.repeat(np.arange(nodes_of(M)), np.diff(M.indptr))
         graph = csr_matrix((np.ones(len(rows)), M.indices, M.indptr), shape=(k, k))
         label, place, self._bodies = connected_components(graph, directed=False)[1], np.zeros(k, int), []
+        label = 0 * label if whole else label
         start = np.concatenate([[0], np.cumsum(np.bincount(label)[label])])
         nodes, entries = (
             np.split(np.argsort(x, kind="stable"), np.cumsum(np.bincount(x))[:-1]) for x in (label, label[rows])
@@ -185,26 +222,26 @@ class Cycle:
     diagonal blocks: symmetric and positive definite on what P leaves.
 
     matrices: of each level, the coarsest last; ways: from each to the one before. frames: `turned` Q and `allowed` P, a
-    block for each node of the finest level, by columns.
+    block for each node of the finest level, by columns. coupled: whether contact of surfaces joins the levels.
     Adams, Brezina, Hu, Tuminaro 2003, doi:10.1016/S0021-9991(03)00194-3.
     """
 
     wide = 1000  # nodes of a level from which on all threads work on it
 
-    def __init__(self, matrices: list, ways: list, frames, parallel: bool):
+    def __init__(self, matrices: list, ways: list, frames, parallel: bool, coupled: bool = False):
         self.frames = frames
-        self.levels = [Level(M, self._wide(M, parallel)) for M in matrices]
+        self.levels = [Level(M, self._wide(M, parallel), coupled) for M in matrices]
         self._entries = [len(M.data) for M in (*matrices, *ways)]
         self._down, self._up = [], []  # (kernel, records, numbers)
         downs = [P.T.tobsr(P.blocksize[::-1]) for P in ways]
-        last, self.inverse = self.levels[-1], Inverse(matrices[-1])
+        last, self.inverse = self.levels[-1], Inverse(matrices[-1], coupled)
         within = [level.threads for level in self.levels[:-1]] + [threads_of(self.inverse)]
         for level, threads, above in zip(self.levels, within, [1, *map(threads_of, downs)]):
             if max(threads, above) > 1:
                 level.part = runtime.array(ROWS[level.numbers], level.nodes * max(threads, above))
         for level, below, P, down in zip(self.levels, self.levels[1:], ways, downs):
             threads = level.threads, threads_of(down)
-            kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel), *threads)
+            kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel), *threads, coupled)
             between = dict(level=level, down=block_matrix(down), up=block_matrix(P), below=below)
             own = dict(nodes=level.nodes, shares=threads[0] * level.nodes)
             more = dict(below=below.nodes, shares_below=threads[1] * below.nodes)
@@ -238,6 +275,18 @@ class Cycle:
             level.put_numbers(M)
         if matrices:
             self.inverse.put(matrices[-1], anew)
+
+    def couple(self, M, largest: float, take) -> None:
+        """Let a matrix of contact join the finest level, whose largest eigenvalue is at most so large then."""
+        self.levels[0].couple(M, take)
+        self.levels[0].widen(largest)
+        self._bound = {}
+
+    def put_contact_below(self, matrices: list, more: list, take) -> None:
+        """Let matrices of contact join those of the levels below the finest one."""
+        for level, M, own in zip(self.levels[1:-1], matrices, more):
+            level.put_contact(M, own, take)
+        self.inverse.put_dense((matrices[-1] + more[-1]).toarray())
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""

@@ -14,11 +14,13 @@ def matrix_arrays(rows: int) -> dict:
     return dict(start="ints", column="ints", values=f"rows{rows}")
 
 
-def level_arrays(numbers: int, threads: int = 1) -> dict:
+def level_arrays(numbers: int, threads: int = 1, coupled: bool = False) -> dict:
     """Of a level with 3 or 6 numbers at a node: its matrix without the diagonal blocks, these, their damped inverses, and
-    vectors: right-hand side, approximation, its last change, another one; parts of rows where several threads share one."""
+    vectors: right-hand side, approximation, its last change, another one; parts of rows where several threads share one;
+    another matrix, of surfaces in contact, that joins that of a `coupled` level."""
     kind, more = f"rows{numbers}", ("part",) if threads > 1 else ()
-    return matrix_arrays(numbers) | dict.fromkeys(("diagonal", "inverse", "b", "x", "d", "y", *more), kind)
+    contact = {f"contact_{name}": of for name, of in matrix_arrays(numbers).items()} if coupled else {}
+    return matrix_arrays(numbers) | contact | dict.fromkeys(("diagonal", "inverse", "b", "x", "d", "y", *more), kind)
 
 
 def chebyshev(terms: int, share: float) -> tuple[float, list[tuple[float, float]]]:
@@ -39,13 +41,14 @@ THETA, FACTORS = chebyshev(3, 0.1)  # measured: with one or two terms as fast in
 @dataclass(frozen=True)
 class CycleKernels:
     """Between a level with `fine` numbers at a node and the next with `coarse` ones. So many threads share a row of the
-    level's matrix, and of the one down to the next (`threads_of`)."""
+    level's matrix, and of the one down to the next (`threads_of`). coupled: whether contact of surfaces joins the level."""
 
     fine: int
     coarse: int
     parallel: bool
     threads: int = 1
     threads_down: int = 1
+    coupled: bool = False
 
     @ti.func
     def zero(self, numbers: A):
@@ -96,6 +99,10 @@ class CycleKernels:
         """(b - A x) of row i, after `share_level`."""
         own = x[i]
         y = self.row(i, level, x, level, self.block(level.diagonal, i, own, self.fine), self.fine, self.threads)
+        if ti.static(self.coupled):
+            for k in range(level.contact_start[i], level.contact_start[i + 1]):
+                other = x[level.contact_column[k]]
+                y += self.block(level.contact_values, k, other, self.fine)
         return level.b[i] + y * ti.cast(-1, ti.f32)
 
     @ti.func
@@ -127,7 +134,7 @@ class CycleKernels:
             self.change(i, 1, level, level.y, level.x)
 
     def _kernel(self, name: str, body, arrays: dict, *numbers: str) -> Kernel:
-        arrays = dict(level=level_arrays(self.fine, self.threads)) | arrays
+        arrays = dict(level=level_arrays(self.fine, self.threads, self.coupled)) | arrays
         return Kernel(name, body, "f32", arrays, dict.fromkeys(numbers, "int"))
 
     @as_kernel(

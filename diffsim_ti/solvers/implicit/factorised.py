@@ -67,8 +67,8 @@ KNOWN: WeakKeyDictionary = WeakKeyDictionary()  # of meshes
 
 class Factorised:
     """r -> M^-1 r for the Hessian that an Operator multiplies by, with stress, patches, mass, matrices of host forces and
-    what a Projection adds. Of contact, and of host forces without a matrix, it has the diagonal blocks, of chambers nothing
-    that couples all of their surface: products and conjugate gradients make up for these.
+    what a Projection adds. Of contact between surfaces it has the convex part, of host forces without a matrix the diagonal
+    blocks, of chambers nothing that couples all of their surface: products and conjugate gradients make up for these.
 
     A symmetric matrix is L D L^T, without pivoting, and M = L |D| L^T: positive definite, and the matrix itself where that
     is. Then M^-1 = A^-1 + 2 sum of w w^T / |d| over the negative pivots d, with L^T w = e, so that w . A w = d. `negative`
@@ -134,6 +134,10 @@ def hessian(operator):
     potential = operator.potential
     n, u, contact, more = potential.arrays.num_vertices, potential.held_at, potential.contact_blocks(), []
     for matrix, blocks in potential.hosts.matrices(u):
+        contact = contact - blocks
+        more.append(matrix)
+    if potential.pairs:
+        matrix, blocks = potential.pairs.stiffness(potential.u)
         contact = contact - blocks
         more.append(matrix)
     if contact is not None:

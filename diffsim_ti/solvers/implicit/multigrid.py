@@ -19,6 +19,7 @@ from diffsim_ti.solvers.implicit.cycle import (
     largest_eigenvalue,
     nodes_of,
     upload_rows,
+    without,
 )
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 from diffsim_ti.solvers.implicit.factorised import eliminated
@@ -60,7 +61,7 @@ class Multigrid(Preconditioner):
 
     Isotropic laws: turning a body turns its stiffness, K(R u) = R K(u) R^T. So residuals are turned back by each vertex's
     mean rotation, and corrections forth. Contact stiffness, and that of host forces as it changes, join the finest level;
-    of large bodies that of obstacles joins the others, too.
+    of large bodies that of obstacles joins the others, too. Of contact between surfaces all that is convex joins all levels.
     Where strains have grown so much that iterations in excess cost more than numbers of the matrices do, these are made anew
     at the present state, its tetrahedra made positive semidefinite, on the same aggregates.
     The V-cycle over it is cycle.py's.
@@ -80,6 +81,7 @@ class Multigrid(Preconditioner):
     # over the vertices along a cube's edge, for smoothing sees to less; the change of its share there that they take.
     # Of equilibria of what is loose at rest they take all.
     large, stiff, changed = 1000, 50, 0.5
+    few = 100  # vertices up to which contact between surfaces is taken for its diagonal blocks, in one kernel of all
 
     def __init__(self, potential, mass: np.ndarray, free: Free, run=None, parallel: bool = False):
         """run: what has the `following` of a run; on one thread a cycle is where threads take scenes."""
@@ -99,8 +101,11 @@ class Multigrid(Preconditioner):
         if a.contacts and a.num_scenes == 1 and ways and not mass.any() and is_loose(matrices[-1]):
             self.large = self.stiff = 0
         self.place = None
+        self.couples = bool(potential.pairs and ways) and self._ties is None and len(mass) > self.few
+        if self.couples:
+            self.large = self.stiff = 0
         self._forget_contact(matrices, ways)
-        self.cycle = Cycle(matrices, ways, self.frames, within)
+        self.cycle = Cycle(matrices, ways, self.frames, within, self.couples)
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
         if self._changes:
             self._make_join(parallel)
@@ -164,12 +169,18 @@ class Multigrid(Preconditioner):
         self._full = None  # of one body with one level below the finest one, as dense arrays
 
     def _bring_contact_down(self, met: bool) -> None:
-        """The levels below the finest one take contact with obstacles, where it has changed by much or a solve begins."""
-        a = self.potential.arrays
-        if not a.contacts or a.num_vertices <= self.large or self._ties is not None:
+        """The levels below the finest one take contact, where it has changed by much or a solve begins; contact between
+        surfaces joins the finest one always."""
+        potential, a = self.potential, self.potential.arrays
+        if not (self.couples or a.contacts) or a.num_vertices <= self.large or self._ties is not None:
             return
-        blocks, known = self.potential.obstacle_blocks(met), self._contact.any(1)
-        size, stiffness = (np.abs(np.einsum("kii->k", D)).reshape(a.num_scenes, -1) for D in (blocks, self._diagonal))
+        all_blocks = blocks = potential.obstacle_blocks(met)
+        if self.couples:
+            of_pairs, diagonal = potential.pairs.stiffness(potential.u)
+            all_blocks = blocks + diagonal
+            of_pairs = self._couple(of_pairs, diagonal)
+        known, traces = self._contact.any(1), (np.abs(np.einsum("kii->k", D)) for D in (all_blocks, self._diagonal))
+        size, stiffness = (trace.reshape(a.num_scenes, -1) for trace in traces)
         soft = ~(size * a.vertices_of_one ** (1 / 3) > self.stiff * stiffness).any(1)
         size[soft & (self._is_new | ~known)] = 0
         share = size / (size + stiffness + 1e-300)
@@ -184,12 +195,13 @@ class Multigrid(Preconditioner):
 
         self._is_new, self._contact[anew] = self._is_new & ~anew, share[anew]
         self.frames.update()
-        at, (matrices, ways), scenes = np.flatnonzero(size * anew[:, None]), self._made, a.num_scenes
+        (matrices, ways), scenes = self._made, a.num_scenes
+        at = np.flatnonzero(size * anew[:, None] * blocks.any((1, 2)).reshape(scenes, -1))
         turns = projectors_of(self.free)[at] @ self.frames.matrices()[at]
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
         more, levels = roots @ np.swapaxes(roots, 1, 2), []
-        if len(matrices) == 1 and self.cycle.inverse.is_of_one_body:
+        if len(matrices) == 1 and self.cycle.inverse.is_of_one_body and not self.couples:
             if self._full is None:
                 self._full = matrices[0].toarray(), ways[0].toarray().reshape(size.size, 3, -1)
             M, P = self._full[0], self._full[1][at]
@@ -197,6 +209,13 @@ class Multigrid(Preconditioner):
             return
         start = np.searchsorted(at, np.arange(size.size + 1))
         more = bsr_matrix((more, at, start), shape=2 * (3 * size.size,))
+        if self.couples:
+            more = more + of_pairs
+            for P in ways:
+                more = (P.T @ (more @ P)).tobsr((6, 6))
+                levels.append(more)
+            self.cycle.put_contact_below(matrices, levels, potential.pairs.inner.list.buffers.take)
+            return
         for M, P, before in zip(matrices, ways, self._below):
             more = (P.T @ (more @ P)).tobsr(M.blocksize)
             levels.append(with_blocks(M, more))
@@ -204,6 +223,17 @@ class Multigrid(Preconditioner):
             levels[-1].data[stay] = before.data[stay]
         self._below = levels
         self.cycle.put_below(levels, anew)
+
+    def _couple(self, M, diagonal: np.ndarray):
+        """Let contact between surfaces join the finest level, which has diagonal blocks of it by itself: M turned back."""
+        self.frames.update()
+        pairs, finest = self.potential.pairs, self.cycle.levels[0]
+        turns = projectors_of(self.free) @ self.frames.matrices()
+        M, diagonal = turned(M, turns, turns), np.swapaxes(turns, 1, 2) @ diagonal @ turns
+        largest = max(finest.largest, pairs.overlap if M.data.size else 0.0)
+        self.cycle.couple(without(M, diagonal), largest, pairs.inner.list.buffers.take)
+        self._join[2]["theta"] = finest.theta
+        return M
 
     def _levels(self, more=()) -> tuple[list, list]:
         """(matrices of all levels, ways from each to the one before) where the potential stands, turned back by frames."""

@@ -28,6 +28,7 @@ class Preconditioner:
     spent, given_up, unfit, has_warned = 0, False, False, False
     quick = 1  # products with multigrid take so many times as long
     rounds = None  # of Newton's method with it (rounds.py)
+    couples = False  # whether `follow` brings contact of surfaces in each round
 
     def begin(self) -> None:
         self.spent, self.given_up, self.unfit = 0, False, False

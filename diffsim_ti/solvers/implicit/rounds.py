@@ -52,7 +52,7 @@ class Rounds:
         slides = isinstance(free, FreeDirections) and not potential.joints  # whose directions are the host's
         self.whole = runs_on_cpu() and cg.is_one_kernel and (cg.by_scene or not (cg.parallel or cg.several))
         self.whole &= a.vertices_of_one <= self.small and not (self.beside or (self.pairs and self.pairs.asks))
-        self.whole &= potential.kernels.blocks.variables <= self.short
+        self.whole &= potential.kernels.blocks.variables <= self.short and not preconditioner.couples
         how = cg.parallel and not self.whole, slides, self.contact, self.beside, self.several and not self.whole
         how += bool(self.pairs), not self.several
         self._kernels = kernels_of(NewtonKernels, a.precision, cg.precision, *how)
