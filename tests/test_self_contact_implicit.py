@@ -4,10 +4,12 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+import scipy.linalg
 from test_self_contact import MATERIAL, crossed_edges, momenta, two_blocks
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
+from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.rounds import Rounds
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
@@ -119,6 +121,76 @@ def test_products_and_diagonal_of_the_hessian():
         pairs.launch(pairs.multiplying(potential.u, potential.w, True))
         column = -runtime.fetch(a.corner)[tail][np.searchsorted(a.mesh.surface_vertices, i)]
         np.testing.assert_allclose(blocks[i][:, d], column, atol=1e-12 * np.abs(blocks[i]).max())
+
+
+def stacked(cells: int = 4, order: int = 1, **more) -> ds.Scene:
+    """A cube thrown down and sideways on one that is held, rough, within the reach of contact."""
+    cube = ds.TetrahedralMesh.create_box(cells + 1, 0.1)
+    mesh = ds.TetrahedralMesh.joined([cube, cube.translated([0.01, 0.1006, 0.013])])
+    mesh = mesh.quadratic() if order == 2 else mesh
+    held, upper = mesh.vertices[:, 1] < 1e-9, mesh.vertices[:, 1:2] > 0.1003
+    v = upper * np.array([0.1, -1.0, 0.0])
+    terms = [ds.Gravity(), ds.SelfContact(1e4, 1e-3, friction=0.5)]
+    own = dict(fixed=held, initial_velocities=v, precision="f64")
+    return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.4), 1000.0, terms, **own | more)
+
+
+def bent() -> ds.Scene:
+    """Of ten nodes whose faces are curved, so that pairs are those of a finer surface."""
+    scene = stacked(2, order=2)
+    X = scene.mesh.vertices.copy()
+    X[:, 1] += 0.01 * np.sin(10 * X[:, 0])
+    return scene.replace(mesh=ds.TetrahedralMesh(X, scene.mesh.elements))
+
+
+@pytest.mark.parametrize("scene", [stacked, bent], ids=["flat", "curved"])
+def test_the_matrix_of_contact_is_that_of_products(scene):
+    """Of the convex part and of friction; it is at most `overlap` times its diagonal blocks, which bounds the smoother."""
+    simulator = ds.Simulator(ds.ImplicitEulerSolver(scene(), dt=1e-3))
+    simulator.step()
+    workspace = simulator.workspace
+    potential, pairs, a = workspace.potential, workspace.pairs, workspace.arrays
+    u = potential.place(workspace.read(workspace.state, 0)[0])
+    matrix, diagonal = pairs.stiffness(potential.u)
+    assert pairs.inner.friction.count > 0 and matrix.data.any()
+    w = np.random.default_rng(0).standard_normal(u.shape)
+    runtime.fill(potential.w, w[None])
+    pairs.launch(pairs.multiplying(potential.u, potential.w, True))
+    product, surface = np.zeros_like(u), a.mesh.surface_vertices
+    product[surface] = -runtime.fetch(a.corner)[a.first_contact_corner :][: len(surface)]
+    np.testing.assert_allclose((matrix @ w.ravel()).reshape(-1, 3), product, atol=1e-12 * np.abs(product).max())
+    np.testing.assert_allclose(diagonal, potential.contact_blocks(), atol=1e-12 * np.abs(diagonal).max())
+    more = pairs.overlap * scipy.linalg.block_diag(*diagonal) - matrix.toarray()
+    assert np.linalg.eigvalsh(more)[0] > -1e-9 * np.abs(more).max()
+
+
+def test_contact_costs_few_products_and_leaves_results_as_they_are(monkeypatch):
+    """With all that couples surfaces in the preconditioner, in that of diagonal blocks, and by a factorisation."""
+    found, scene = [], stacked()
+    for few, patience in ((100, None), (1000, None), (1000, 2)):
+        monkeypatch.setattr(Multigrid, "few", few)
+        if patience is not None:
+            monkeypatch.setattr(Multigrid, "patience", patience)
+        rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=1e-2), 4, gradients=["youngs_modulus"])
+        frames = rollout.forward()
+        products = rollout.report.products
+        gradient = rollout.vjp(frames, frames.displacements)["youngs_modulus"]
+        found.append((products, frames.displacements[-1], gradient))
+    (few, u, g), (many, *_), (direct, *_) = found
+    assert few < many / 3 and direct < many / 3
+    for _, v, h in found[1:]:
+        np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
+        np.testing.assert_allclose(g, h, rtol=1e-5)
+
+
+def test_states_that_are_kept_do_not_change_a_bit_of_coupled_surfaces():
+    found = []
+    for every in (1, 4):
+        rollout = ds.Rollout(ds.ImplicitEulerSolver(stacked(), dt=1e-2), 4, checkpoint_every=every)
+        frames = rollout.forward()
+        found.append((frames.displacements[-1], rollout.vjp(frames, frames.displacements)["youngs_modulus"]))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
 
 
 def pressed(push, load_steps=1):

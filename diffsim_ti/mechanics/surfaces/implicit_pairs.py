@@ -123,7 +123,7 @@ class ImplicitPairs(SurfacePairs):
 
         self.run(self.hessian.roots, dict(u=u))
         count, n = self.list.count, self.a.num_vertices
-        c = whole(self.corner)[: 4 * count].reshape(count, 4, -1)[..., :3].astype(np.float64)
+        c = whole(self.corner)[: 4 * count].reshape(-1, 4, 4)[..., :3].astype(np.float64)
         acts = np.flatnonzero(c.any((1, 2)))
         corners = [whole(self.list.pairs)[: 4 * count].reshape(-1, 4)[acts].astype(np.int64)]
         blocks = [c[acts][:, :, None, :, None] * c[acts][:, None, :, None, :]]

@@ -211,8 +211,8 @@ class Multigrid(Preconditioner):
         more = bsr_matrix((more, at, start), shape=2 * (3 * size.size,))
         if self.couples:
             more = more + of_pairs
-            for P in ways:
-                more = (P.T @ (more @ P)).tobsr((6, 6))
+            for M, P in zip(matrices, ways):
+                more = (P.T @ (more @ P)).tobsr(M.blocksize)
                 levels.append(more)
             self.cycle.put_contact_below(matrices, levels, potential.pairs.inner.list.buffers.take)
             return
