@@ -65,7 +65,7 @@ class Level:
         self.values = upload_rows(M.data[self._off])
         self.b, self.x, self.d, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(4))
         self.diagonal, self.inverse = (runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2))
-        self.threads, self.parallel = threads_of(M), parallel
+        self.threads, self.parallel, self.coupled = threads_of(M), parallel, coupled
         self._measure(M)
         if coupled:
             self.contact_start = runtime.upload(np.zeros(self.nodes + 1), ti.i32)
@@ -98,8 +98,10 @@ class Level:
         self.couple(without(more, diagonal_blocks(more)), take)
 
     def put_numbers(self, M) -> None:
-        """Set those of another matrix with the same places."""
+        """Set those of another matrix with the same places, without contact of surfaces."""
         runtime.fill(self.values, rows_of(M.data[self._off]))
+        if self.coupled:
+            runtime.fill(self.contact_start, 0)
         self._measure(M)
 
     def invert(self, nodes: np.ndarray) -> None:

@@ -174,34 +174,26 @@ class Multigrid(Preconditioner):
         potential, a = self.potential, self.potential.arrays
         if not (self.couples or a.contacts) or a.num_vertices <= self.large or self._ties is not None:
             return
-        all_blocks = blocks = potential.obstacle_blocks(met)
+        of_pairs, blocks = None, potential.obstacle_blocks(met) if a.contacts else np.zeros_like(self._diagonal)
+        size = np.abs(np.einsum("kii->k", blocks))
+        if a.contacts and potential.pairs:
+            potential.put_contact_blocks()
         if self.couples:
-            of_pairs, diagonal = potential.pairs.stiffness(potential.u)
-            all_blocks = blocks + diagonal
-            of_pairs = self._couple(of_pairs, diagonal)
-        known, traces = self._contact.any(1), (np.abs(np.einsum("kii->k", D)) for D in (all_blocks, self._diagonal))
-        size, stiffness = (trace.reshape(a.num_scenes, -1) for trace in traces)
-        soft = ~(size * a.vertices_of_one ** (1 / 3) > self.stiff * stiffness).any(1)
-        size[soft & (self._is_new | ~known)] = 0
-        share = size / (size + stiffness + 1e-300)
-        change, most = np.abs(share - self._contact), np.maximum(share, self._contact)
-        anew = change.sum(1) > self.changed * most.sum(1)
-        anew |= self._is_new & (size.any(1) | known)
-        if self.potential.pairs:
-            self.potential.put_contact_blocks()
+            of_pairs, diagonal = self._couple()
+            size += np.abs(np.einsum("kii->k", diagonal))
+        anew, scenes = self._changed(size.reshape(a.num_scenes, -1)), a.num_scenes
         if not anew.any():
             return
         from scipy.sparse import bsr_matrix
 
-        self._is_new, self._contact[anew] = self._is_new & ~anew, share[anew]
         self.frames.update()
-        (matrices, ways), scenes = self._made, a.num_scenes
-        at = np.flatnonzero(size * anew[:, None] * blocks.any((1, 2)).reshape(scenes, -1))
+        matrices, ways = self._made
+        at = np.flatnonzero(size * blocks.any((1, 2)) * np.repeat(anew, a.vertices_of_one))
         turns = projectors_of(self.free)[at] @ self.frames.matrices()[at]
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
         more, levels = roots @ np.swapaxes(roots, 1, 2), []
-        if len(matrices) == 1 and self.cycle.inverse.is_of_one_body and not self.couples:
+        if len(matrices) == 1 and self.cycle.inverse.is_of_one_body and of_pairs is None:
             if self._full is None:
                 self._full = matrices[0].toarray(), ways[0].toarray().reshape(size.size, 3, -1)
             M, P = self._full[0], self._full[1][at]
@@ -209,7 +201,7 @@ class Multigrid(Preconditioner):
             return
         start = np.searchsorted(at, np.arange(size.size + 1))
         more = bsr_matrix((more, at, start), shape=2 * (3 * size.size,))
-        if self.couples:
+        if of_pairs is not None:
             more = more + of_pairs
             for M, P in zip(matrices, ways):
                 more = (P.T @ (more @ P)).tobsr(M.blocksize)
@@ -224,16 +216,30 @@ class Multigrid(Preconditioner):
         self._below = levels
         self.cycle.put_below(levels, anew)
 
-    def _couple(self, M, diagonal: np.ndarray):
-        """Let contact between surfaces join the finest level, which has diagonal blocks of it by itself: M turned back."""
+    def _changed(self, size: np.ndarray) -> np.ndarray:
+        """Of which scenes coarse levels take contact of such a size at vertices, a mask; they are taken to have it. What is
+        too soft for them becomes zero."""
+        known, stiffness = self._contact.any(1), np.abs(np.einsum("kii->k", self._diagonal)).reshape(size.shape)
+        soft = ~(size * size.shape[1] ** (1 / 3) > self.stiff * stiffness).any(1)
+        size[soft & (self._is_new | ~known)] = 0
+        share = size / (size + stiffness + 1e-300)
+        change, most = np.abs(share - self._contact), np.maximum(share, self._contact)
+        anew = change.sum(1) > self.changed * most.sum(1)
+        anew |= self._is_new & (size.any(1) | known)
+        self._is_new, self._contact[anew] = self._is_new & ~anew, share[anew]
+        return anew
+
+    def _couple(self) -> tuple:
+        """Let contact between surfaces join the finest level, which has diagonal blocks of it by itself: its matrix and
+        these, turned back."""
         self.frames.update()
         pairs, finest = self.potential.pairs, self.cycle.levels[0]
-        turns = projectors_of(self.free) @ self.frames.matrices()
+        turns, (M, diagonal) = projectors_of(self.free) @ self.frames.matrices(), pairs.stiffness(self.potential.u)
         M, diagonal = turned(M, turns, turns), np.swapaxes(turns, 1, 2) @ diagonal @ turns
         largest = max(finest.largest, pairs.overlap if M.data.size else 0.0)
         self.cycle.couple(without(M, diagonal), largest, pairs.inner.list.buffers.take)
         self._join[2]["theta"] = finest.theta
-        return M
+        return M, diagonal
 
     def _levels(self, more=()) -> tuple[list, list]:
         """(matrices of all levels, ways from each to the one before) where the potential stands, turned back by frames."""
