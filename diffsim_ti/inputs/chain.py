@@ -48,14 +48,15 @@ class Recording:
     _record = None  # what was recorded last, with what it read
 
     def recorded(self, x: Arrays) -> SimpleNamespace:
-        """leaves: arrays that record in the place of x, whose numbers, one after the other, end at `ends`; y: what they lead
-        to; slopes: dy/dx, a row for each number of x, None until it is asked for."""
+        """leaves: arrays that record in the place of x, of these shapes, whose numbers, one after the other, end at `ends`;
+        y: what they lead to; slopes: dy/dx, a row for each number of x, None until it is asked for."""
         last = self._record
         if last is not None and all(map(is_, last.x, x)):
             return last
         leaves = [Recorded(part) for part in x]
         ends = [*accumulate(map(np.size, x), initial=0)]
-        found = SimpleNamespace(x=(*x,), leaves=leaves, ends=ends, y=(*self.value(*leaves),), slopes=None)
+        of_x = dict(x=(*x,), leaves=leaves, shapes=[*map(np.shape, x)], ends=ends)
+        found = SimpleNamespace(**of_x, y=(*self.value(*leaves),), slopes=None)
         keeps = ends[-1] <= self.few and all(map(is_fixed, x))
         self._record = found if keeps else None
         return found
@@ -65,7 +66,7 @@ class Recording:
         ends = at.ends
         if ends[-1] > self.fewest or ends[-1] * sum(map(np.size, at.y)) > self.few:
             return np.zeros(0)
-        changes = [[e[a:b].reshape(np.shape(p)) for p, a, b in zip(at.x, ends, ends[1:])] for e in np.eye(ends[-1])]
+        changes = [[e[a:b].reshape(s) for s, a, b in zip(at.shapes, ends, ends[1:])] for e in np.eye(ends[-1])]
         return np.array([_in_a_row([forward(y, zip(at.leaves, dx)) for y in at.y]) for dx in changes])
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
@@ -78,9 +79,9 @@ class Recording:
             at.slopes = self._slopes(at)
         if at.slopes.size:
             flat = at.slopes @ _in_a_row(y_adj)
-            return [flat[a:b].reshape(np.shape(part)) for part, a, b in zip(x, at.ends, at.ends[1:])]
+            return [flat[a:b].reshape(shape) for shape, a, b in zip(at.shapes, at.ends, at.ends[1:])]
         found = reverse_of_all(zip(at.y, y_adj), at.leaves)
-        return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
+        return [np.zeros(shape) if adjoint is None else adjoint for shape, adjoint in zip(at.shapes, found)]
 
 
 def _in_a_row(arrays: Arrays) -> np.ndarray:

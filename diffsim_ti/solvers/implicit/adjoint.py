@@ -135,7 +135,7 @@ class ImplicitAdjoint(RecordedPasses):
     def _pull_back_contacts(self, j: int, save_every: int) -> tuple[tuple | None, tuple | None]:
         """Adjoints of what the forces of obstacles in pass j depend on (SharesAdjoint), and of what pairs do
         (PairShares.vjp), where a loss names them."""
-        seed = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else None
+        seed = self.contacts.seed(j, save_every, self.stage.static)
         seen = by_pairs = None
         if seed is not None and self._shares:
             seen = self._shares.pull_back(seed[: self._shares.num_obstacles], self._sum_of_poses)
@@ -146,7 +146,7 @@ class ImplicitAdjoint(RecordedPasses):
 
     def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
-        seen, from_pairs = self._pull_back_contacts(j, save_every)
+        seen, from_pairs = self._pull_back_contacts(j, save_every) if self.contacts else (None, None)
         by_contacts, by_x, by_lag = (None, None, None) if from_pairs is None else from_pairs
         by_contacts = by_contacts if seen is None else plus(seen[0], by_contacts)
         if s.static:
