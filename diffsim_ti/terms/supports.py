@@ -1,7 +1,6 @@
 """Supports: which vertices do not move freely, and in which directions."""
 
 from collections.abc import Mapping
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -64,17 +63,17 @@ class Supports:
         self.held = 0.5 * (held + np.swapaxes(held, 1, 2))
         self.held[np.abs(self.held) < 1e-15] = 0
 
-    @cached_property
+    @property
     def fixed(self) -> np.ndarray:
         """Sorted indices of the vertices that are fixed in all directions."""
         return self.vertices[self.wholly]
 
-    @cached_property
+    @property
     def partly_fixed(self) -> np.ndarray:
         """Sorted indices of the vertices that are fixed in some directions only."""
         return self.vertices[~self.wholly]
 
-    @cached_property
+    @property
     def sliding_supports(self) -> np.ndarray:
         """Projectors onto the directions in which these are fixed, shape (k, 3, 3)."""
         return self.held[~self.wholly]
