@@ -48,7 +48,7 @@ class JoinedCG(DeviceCG):
         state[:, LEAST], state[:, LIMIT], state[:, STOPPED] = tolerance**2, most, ~wanted
         runtime.fill(self.state, state)
         while done < most and (on := (state[:, STOPPED] == 0) & np.isfinite(state[:, SQUARE])).any():
-            self.iterate(state[on], most, eps, more)
+            self.iterate(state[on], most - done, eps, more)
             state = runtime.fetch(self.state)
             done = max(done + 1, int(state[:, COUNT].max()))
         x = runtime.fetch_row(self.x, 0).reshape(rows.shape)

@@ -24,8 +24,7 @@ def one_blas_thread(function: Callable) -> Callable:
 
     @wraps(function)
     def limited(*arguments, **named):
-        before = [(library, library.get_num_threads()) for library in _libraries()]
-        several = [(library, count) for library, count in before if count not in (None, 1)]
+        several = [(library, n) for library in _libraries() if (n := library.get_num_threads()) not in (None, 1)]
         try:
             for library, _ in several:
                 library.set_num_threads(1)

@@ -221,7 +221,7 @@ def reverse_of_all(adjoints: Iterable[tuple], leaves: Iterable[Node]) -> list:
     def take(node, more):
         fresh = id(node) not in known
         _add(known, own, node, more)
-        if fresh and id(node) in known:
+        if fresh and node.parents and id(node) in known:
             heappush(waiting, (-node.number, node))
 
     for y, seed in adjoints:

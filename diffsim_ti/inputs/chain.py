@@ -3,6 +3,7 @@ over all of them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import accumulate
 from operator import is_
 from types import SimpleNamespace
 
@@ -47,23 +48,25 @@ class Recording:
     _record = None  # what was recorded last, with what it read
 
     def recorded(self, x: Arrays) -> SimpleNamespace:
-        """leaves: arrays that record in the place of x; y: what they lead to; slopes: dy/dx, a row for each number of x,
-        None until it is asked for."""
+        """leaves: arrays that record in the place of x, of these shapes, whose numbers, one after the other, end at `ends`;
+        y: what they lead to; slopes: dy/dx, a row for each number of x, None until it is asked for."""
         last = self._record
         if last is not None and all(map(is_, last.x, x)):
             return last
         leaves = [Recorded(part) for part in x]
-        found = SimpleNamespace(x=(*x,), leaves=leaves, y=(*self.value(*leaves),), slopes=None)
-        keeps = sum(map(np.size, x)) <= self.few and all(map(is_fixed, x))
+        ends = [*accumulate(map(np.size, x), initial=0)]
+        of_x = dict(x=(*x,), leaves=leaves, shapes=[*map(np.shape, x)], ends=ends)
+        found = SimpleNamespace(**of_x, y=(*self.value(*leaves),), slopes=None)
+        keeps = ends[-1] <= self.few and all(map(is_fixed, x))
         self._record = found if keeps else None
         return found
 
     def _slopes(self, at: SimpleNamespace) -> np.ndarray:
         """Those of up to `fewest` numbers, else none."""
-        ends = np.cumsum([0, *map(np.size, at.x)])
+        ends = at.ends
         if ends[-1] > self.fewest or ends[-1] * sum(map(np.size, at.y)) > self.few:
             return np.zeros(0)
-        changes = [[e[a:b].reshape(np.shape(p)) for p, a, b in zip(at.x, ends, ends[1:])] for e in np.eye(ends[-1])]
+        changes = [[e[a:b].reshape(s) for s, a, b in zip(at.shapes, ends, ends[1:])] for e in np.eye(ends[-1])]
         return np.array([_in_a_row([forward(y, zip(at.leaves, dx)) for y in at.y]) for dx in changes])
 
     def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
@@ -75,13 +78,10 @@ class Recording:
         if at.slopes is None:
             at.slopes = self._slopes(at)
         if at.slopes.size:
-            flat, end, out = at.slopes @ _in_a_row(y_adj), 0, []
-            for part in x:
-                out.append(flat[end : end + np.size(part)].reshape(np.shape(part)))
-                end += np.size(part)
-            return out
+            flat = at.slopes @ _in_a_row(y_adj)
+            return [flat[a:b].reshape(shape) for shape, a, b in zip(at.shapes, at.ends, at.ends[1:])]
         found = reverse_of_all(zip(at.y, y_adj), at.leaves)
-        return [np.zeros(np.shape(part)) if adjoint is None else adjoint for part, adjoint in zip(x, found)]
+        return [np.zeros(shape) if adjoint is None else adjoint for shape, adjoint in zip(at.shapes, found)]
 
 
 def _in_a_row(arrays: Arrays) -> np.ndarray:
@@ -122,7 +122,7 @@ class Chain:
         self._kept: dict[Link, tuple[Arrays, Arrays]] = {}  # (what it read, what it wrote)
         self._ways: dict[tuple[str, ...], tuple[list[Link], list[Link]]] = {}
         self._after: dict[tuple[str, ...], list[Link]] = {}
-        self._last: tuple | None = None  # wanted inputs, values of all, and what `vjp` read of these
+        self._last: tuple | None = None  # wanted inputs, values of all, and what the links of `vjp` read of these
 
     def value(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The values and what all links write; links that miss something are left out."""
@@ -184,14 +184,13 @@ class Chain:
         wanted, last = tuple(wanted), self._last
         pulled, before = self._way(wanted)
         if last is None or last[0] != wanted or not _are_same(last[1], values):
-            last = wanted, dict(values), self._through(before, values)
+            known = self._through(before, values)
+            last = wanted, dict(values), [(link, [*map(known.get, link.reads)]) for link in reversed(pulled)]
             self._last = last if all(map(is_fixed, values.values())) else None
-        known = last[2]
         total = {n: y for n, y in adjoints.items() if y is not None}
-        for link in reversed(pulled):
-            if not any(name in total for name in link.writes):
+        for link, x in last[2]:
+            if total.keys().isdisjoint(link.writes):
                 continue
-            x = [known[name] for name in link.reads]
             try:
                 y_adj = [total[name] for name in link.writes]
             except KeyError:  # nothing depends on some of it

@@ -58,7 +58,7 @@ class VertexShares(Recording, Link):
 
     def value(self, volumes, *density):
         of_each = (density[0] * volumes if density else volumes)[self.chosen]
-        out = summed_at(self.nodes, of_each[:, None] * self.shares, self.count)
+        out = summed_at(self.nodes, of_each[:, None] @ self.shares[None], self.count)
         return (out if self.factors is None else self.factors * out,)
 
 

@@ -55,6 +55,12 @@ class Displacement(Recording, Link):
             out = replaced(out, at, moved)
         return (out,)
 
+    def vjp(self, x, y_adj):
+        if self.bodies:
+            return super().vjp(x, y_adj)
+        by_place = np.array(self.of(y_adj[0]))
+        return by_place, -by_place
+
 
 class RigidVelocity(Recording, Link):
     """v = free(v), free being a projection, and of sets that do not deform that of the nearest rigid motion."""

@@ -242,7 +242,7 @@ class Coefficients(Recording, Link):
         return (self.material.coefficients(dict(zip(self.reads, x))),)
 
     def vjp(self, x, y_adj):
-        (p,), adjoint = self.recorded(x).y, np.asarray(y_adj[0], np.float64)
+        p, adjoint = value_of(self.recorded(x).y[0]), np.asarray(y_adj[0], np.float64)
         if p.ndim < adjoint.ndim:
             adjoint = adjoint.sum(1) if p.ndim == 2 else adjoint.reshape(-1, adjoint.shape[-1]).sum(0)
         return super().vjp(x, (adjoint if adjoint.shape == p.shape else np.broadcast_to(adjoint, p.shape),))

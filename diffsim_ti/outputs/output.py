@@ -121,8 +121,10 @@ class Change:
     def add(self, other: "Change") -> None:
         """Add another one."""
         for name in STATES:
-            mine, theirs = getattr(self, name), getattr(other, name)
-            setattr(self, name, mine if theirs is None else theirs if mine is None else mine + theirs)
+            theirs = getattr(other, name)
+            if theirs is not None:
+                mine = getattr(self, name)
+                setattr(self, name, theirs if mine is None else mine + theirs)
         for name, value in other.inputs.items():
             self.inputs[name] = self.inputs[name] + value if name in self.inputs else value
 

@@ -79,7 +79,7 @@ def warn_of_large_stretch(frames: Frames) -> bool:
 
 def check_finite(name: str, adjoint: np.ndarray, save_every: int) -> None:
     """Raise FloatingPointError, naming the step, where a loss's gradient by some frames is not finite."""
-    if not np.all(np.isfinite(adjoint)):
+    if not np.isfinite(adjoint).all():
         frame = int(np.argwhere(~np.isfinite(adjoint))[0][0]) if adjoint.ndim else 0
         raise FloatingPointError(
             f"the loss's gradient by {name} is not finite at step {frame * save_every} "
@@ -91,7 +91,7 @@ def norm(x: np.ndarray) -> float:
     """Euclidean norm in float64, without overflow."""
     x = np.asarray(x, np.float64).ravel()
     square = float(x.dot(x) if x.size < 5000 else np.einsum("i,i", x, x))  # alone: threads of BLAS wait for Taichi's
-    if 1e-280 < square < 1e280 or not x.any():
+    if 1e-280 < square < 1e280 or not np.count_nonzero(x):
         return square**0.5
     largest = float(np.abs(x).max(initial=0.0))  # squares vanish, overflow, or are not finite
     return largest * float(np.linalg.norm(x / largest)) if 0 < largest < np.inf else largest

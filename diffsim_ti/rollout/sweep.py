@@ -1,6 +1,8 @@
 """n steps of a solver on the device: forward, in reverse from kept states, and in tangents."""
 
+import math
 from collections.abc import Callable, Iterable
+from functools import cached_property
 
 import numpy as np
 
@@ -125,7 +127,7 @@ class Sweep:
         times = [self.solver.schedule.frame_time(max(k, 1), self.save_every) for k in range(self.num_frames)]
         return np.reshape(times if self.steps else [1.0], (-1, 1, 1, 1, 1))
 
-    @property
+    @cached_property
     def noted(self) -> tuple[str, ...]:
         """What frames hold besides states, by name."""
         return tuple(
@@ -340,11 +342,11 @@ class Sweep:
             _warn_of_coarse_steps(self.solver, run.contact_resolution)
         of_frames = self._reverse(seed, self.careful)
         derived, of_start = seed.collect(self._adjoint, self.truncates)
-        if not np.isfinite(sum(of_start) + derived.coefficients.sum()):
+        if not math.isfinite(sum(of_start) + derived.coefficients.sum()):
             if not self.careful:
                 self._reverse(seed, True)  # raises where it happens
             raise FloatingPointError("the adjoint is not finite at the start of the run")
-        if not any(seed.noted[name] is not None for name in self.noted):  # whose seeds are no adjoints of places
+        if all(seed.noted[name] is None for name in self.noted):  # whose seeds are no adjoints of places
             _warn_of_explosion(of_frames, of_start, float(self.solver.schedule.time(self.steps)) or self.solver.dt)
         return derived
 

@@ -176,11 +176,8 @@ class Repeated:
         made, numbers = _repeated_kernel(name, kernels, names, shared, tuple(map(len, groups)), one_thread, pieces)
         title = f"the kernel {name}" + next((k.of_law for k in kernels if k.of_law), "")
         options = dict(title=title, loops=0 if one_thread else -1)
-        launch = Launch(made, *arrays, vectorized=vectorized, **options)
-        own = [(n, None if k is None else own_numbers[k]) for k, n in numbers]
-        self._launch = lambda times, given: launch(
-            *((given if x is None else x)[n] for n, x in own), *self._more, times
-        )
+        self._launch = Launch(made, *arrays, vectorized=vectorized, **options)
+        self._numbers = [(n, None if k is None else own_numbers[k]) for k, n in numbers]
         self._sizes = None if one_thread else (16, 4, 1)  # of launches: the driver compiles each number of times anew
 
     _more = ()  # numbers before the last one
@@ -191,9 +188,13 @@ class Repeated:
         return runs_on_cpu() and not parallel or can_repeat()
 
     def __call__(self, times: int, **numbers) -> None:
+        self._go(times, numbers)
+
+    def _go(self, times: int, numbers) -> None:
+        given = [(numbers if own is None else own)[n] for n, own in self._numbers]
         while times:
-            size = next(n for n in self._sizes or (times,) if n <= times)
-            self._launch(size, numbers)
+            size = next(n for n in self._sizes if n <= times) if self._sizes else times
+            self._launch(*given, *self._more, size)
             times -= size
 
 

@@ -89,7 +89,7 @@ class Launch:
             ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,))
             for k, is_float in enumerate(floats, start=len(self._arrays))
         ]
-        self._set = [None] * len(floats)  # the numbers as the context has them
+        self._set, self._last = [None] * len(floats), None  # the numbers as the context has them
 
     def _compile(self, prog, config, traced):
         with say_if_long(f"compiling {self._title}") if self.variables > SHORT else contextlib.nullcontext():
@@ -112,16 +112,22 @@ class Launch:
             self._prepare(numbers)
         if self._buffer:
             self._buffer.restore()
-        known = self._set
-        for k, (setter, index) in enumerate(self._setters):
-            number = numbers[k]
-            if number is not known[k] and (number != known[k] or number == 0):  # a third of a microsecond each; -0.0
-                known[k] = None  # also if this is interrupted
-                setter(index, number)
-                known[k] = number
+        if numbers != self._last or 0 in numbers:  # which may be -0.0
+            known, self._last = self._set, None  # also if this is interrupted
+            for k, (setter, index) in enumerate(self._setters):
+                number = numbers[k]
+                if number is not known[k] and (number != known[k] or number == 0):  # a third of a microsecond each
+                    known[k] = None
+                    setter(index, number)
+                    known[k] = number
+            self._last = numbers
         times = numbers[-1] if self._loops else 1
-        if times in self._tasks:  # without a line of Python between them, where an interrupt would end half a launch
-            deque(map(_TASK.__call__, self._tasks[times], repeat(self._read)), maxlen=0)
+        tasks = self._tasks.get(times)
+        if tasks:
+            if len(tasks) == 1:
+                tasks[0](self._read)
+            else:  # without a line of Python between them, where an interrupt would end half a launch
+                deque(map(_TASK.__call__, tasks, repeat(self._read)), maxlen=0)
             return
         with self._repeated.times(times) if self._repeated else contextlib.nullcontext():
             self._owner().launch_kernel(self._code, self._context)

@@ -94,4 +94,4 @@ class Piecewise(Repeated):
         super().__init__(name, groups, False, vectorized, pieces)
 
     def __call__(self, times: int, **numbers) -> None:
-        self._launch(times, self._of_one(numbers))
+        self._go(times, self._of_one(numbers))

@@ -301,7 +301,7 @@ class SceneArrays:
         if isinstance(self.place, slice):  # they lie in order
             begin, end, _ = part.indices(self.num_tetrahedra)
             first = begin // LANES
-            lanes_first = np.swapaxes(blocks[first : -(-end // LANES)], 1, 2)
+            lanes_first = blocks[first : -(-end // LANES)].swapaxes(1, 2)
             flat = lanes_first.astype(np.float64, order="C").reshape(-1, rows)  # copied once
             return flat[begin - first * LANES : end - first * LANES]
         block, lane = np.divmod(self.place[part], LANES)

@@ -140,16 +140,19 @@ class Adjoint:
     """
 
     def __init__(self, arrays, features, more=()):
-        self._arrays, self._features = arrays, features
+        self._arrays, self._features, self._rows = arrays, features, features.sums()
         a, blocks = arrays, arrays.num_blocks
         shape = a.points * blocks if features.shape else 0
         self.coefficients = runtime.array(a.lanes, a.coefficients_each * blocks)
         self.gradients, self.volumes = runtime.array(a.lanes, 9 * shape), runtime.array(a.lanes, shape)
         self.growths = runtime.array(a.lanes, *((a.growths.shape[0], 2 * blocks) if features.growing else (1, 1)))
-        self.sums = runtime.array(a.fp, features.sums().total, a.num_vertices)
+        self.sums = runtime.array(a.fp, self._rows.total, a.num_vertices)
         for name in more:
             setattr(self, name, runtime.array(a.vector, *getattr(a, name).shape))
-        self._names = tuple(x for x in (*ADJOINT, *more) if x != "growths" or features.growing)
+        absent = (() if features.shape else OF_SHAPE) + (() if features.growing else ("growths",))
+        self._names = tuple(name for name in (*ADJOINT, *more) if name not in absent)
+        self._read = [name for name in self._names if name in PARTS and getattr(a.values, name, None) is not None]
+        self._but = {*self._read, *absent}  # of what `collect` makes zero
 
     def fits(self, arrays, features) -> bool:
         """Whether kernels and shapes are still those of the run."""
@@ -163,11 +166,8 @@ class Adjoint:
 
     def collect(self) -> Derived:
         """All of them in float64 on the host, those of the state being zero; without the shape, None for what it makes."""
-        a, features, rows = self._arrays, self._features, self._features.sums()
-        unknown = () if features.shape else OF_SHAPE
-        read = [name for name in self._names if name in PARTS and getattr(a.values, name, None) is not None]
-        read = [name for name in read if name not in unknown]
-        out, sums = a.values.zeros(but=(*read, *unknown)), runtime.look(self.sums).astype(np.float64)
+        a, features, rows = self._arrays, self._features, self._rows
+        out, sums = a.values.zeros(self._but), runtime.look(self.sums).astype(np.float64)
         out.parameters[: features.num_parameters] = sums[rows.of("parameters")].sum(1)
         if features.density:
             out.mass = sums[rows.first("mass")]
@@ -175,7 +175,7 @@ class Adjoint:
             out.rest = sums[rows.of("rest")].T
         if features.areas:
             out.surface = sums[rows.first("surface")]
-        for name in read:
+        for name in self._read:
             setattr(out, name, PARTS[name].unpack(a, runtime.look(getattr(self, name))))
         if "anchor" in self._names and out.motion is not None:
             out.displacement[a.held] += runtime.fetch(self.anchor)

@@ -6,7 +6,7 @@ velocity, and, as the last, (tau, 0, 0), the time of the chord of its velocity (
 dR = [theta]x R. Every third row is where obstacles are: `places`; how they go from there is `drifts`, of rotations psi.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +29,7 @@ def _at_share(s: np.ndarray, phi: np.ndarray, share: float) -> np.ndarray:
     return made(rotations.rodrigues(rotations.product(turn, rotations.from_rodrigues(now))), *parents)
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """Pass j, the shares of its step at which forces are taken and at which it begins, and tau [s]."""
 
     schedule: Schedule

@@ -1,10 +1,9 @@
 """The numbers of an implicit pass (solver.py)."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Stage:
+class Stage(NamedTuple):
     """Numbers of a pass, and the derivatives of b0, b1, e0, e1 by the drag rate."""
 
     gamma: float

@@ -81,7 +81,8 @@ class Potential:
         """The numbers that every kernel takes."""
         a = self.arrays
         sizes = dict(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices)
-        return sizes | dict(per_gamma=self.per_gamma)
+        sizes["per_gamma"] = self.per_gamma
+        return sizes
 
     def begin(
         self, u: np.ndarray, x: np.ndarray, per_gamma: float, poses: np.ndarray, ahead=None, presses=True

@@ -27,9 +27,10 @@ class ObstacleCollisions:
 
     def begin(self, j: int, stage: Stage) -> None:
         """Pass j."""
-        poses, path, moment = self.ws.arrays.poses, self.ws.arrays.rows["path"], self.moment(j, stage)
+        poses, path, joints = self.ws.arrays.poses, self.ws.arrays.rows["path"], self.ws.joints
+        moment = None if path is None else self.moment(j, stage)
         poses.check(path, moment)
-        self.rows, joints = poses.value(path, moment), self.ws.joints
+        self.rows = poses.value(path, moment)
         if joints:
             joints.begin(j, stage, self.rows)
         self.at_stage, self.before = self.rows[::3].copy(), self.rows[1::3].copy()

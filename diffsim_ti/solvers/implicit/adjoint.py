@@ -81,10 +81,10 @@ class ImplicitAdjoint(RecordedPasses):
         self.by_weight, self.by_inertia = np.zeros((2, *self.p.shape))  # sums over passes (mass_adj, gravity_adj)
         self.gravity, self.rate = np.zeros(3), 0.0
         masses = a.values.element_masses
-        self.element_masses = None if masses is None else np.zeros_like(masses)
+        self.element_masses = None if masses is None else np.zeros(masses.shape)
         self.growth = None if a.values.growths is None else np.zeros_like(a.values.growths)
         self.by_hosts = a.values.zeros() if self.ws.hosts or self.joints else Derived()  # of the numbers of host forces
-        self.rest_adj = np.zeros_like(self.p)
+        self.rest_adj = np.zeros(self.p.shape)
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
@@ -135,7 +135,7 @@ class ImplicitAdjoint(RecordedPasses):
     def _pull_back_contacts(self, j: int, save_every: int) -> tuple[tuple | None, tuple | None]:
         """Adjoints of what the forces of obstacles in pass j depend on (SharesAdjoint), and of what pairs do
         (PairShares.vjp), where a loss names them."""
-        seed = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else None
+        seed = self.contacts.seed(j, save_every, self.stage.static)
         seen = by_pairs = None
         if seed is not None and self._shares:
             seen = self._shares.pull_back(seed[: self._shares.num_obstacles], self._sum_of_poses)
@@ -146,17 +146,17 @@ class ImplicitAdjoint(RecordedPasses):
 
     def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
-        seen, from_pairs = self._pull_back_contacts(j, save_every)
+        seen, from_pairs = self._pull_back_contacts(j, save_every) if self.contacts else (None, None)
         by_contacts, by_x, by_lag = (None, None, None) if from_pairs is None else from_pairs
         by_contacts = by_contacts if seen is None else plus(seen[0], by_contacts)
         if s.static:
-            q = np.zeros_like(q)
+            q = np.zeros(q.shape)
         # the equation
         by_speed = None if s.static else s.e0 / s.gamma * q
         by_ends = plus(p if s.c0 == 1 else s.c0 * p, by_speed, by_contacts)
         seed, q_free = by_ends * ws.linear, q if s.static else q * ws.linear
         if np.vdot(seed, seed) < 1e-36 * np.vdot(p, p):  # rounding of what is held, no direction of ours
-            seed = np.zeros_like(seed)
+            seed = 0 * seed
         if self.joints:
             seed = self.joints.begin(seed, 0.0 if seen is None else seen[2], by_ends)
             q_free = self.joints.with_held(q_free, q)
@@ -258,12 +258,13 @@ class ImplicitAdjoint(RecordedPasses):
     def _pull_back_held(self, j, p, q, reaction, u_adj, v_adj) -> None:
         """Adds what comes by the held parts, of which nothing is in u_adj and v_adj of the equation."""
         ws, held, s = self.ws, self.ws.arrays.held, self.stage
-        pull, p, q = (ws.of_held(x[held]) for x in (reaction, p, q))
         if self.motion is None:
-            u_adj[held] += p + pull
-            v_adj[held] += q
+            u_adj[held] += ws.of_held((p + reaction)[held])
+            if not s.static:
+                v_adj[held] += ws.of_held(q[held])
             return
         schedule = ws.solver.schedule
+        pull, p, q = (ws.of_held(x[held]) for x in (reaction, p, q))
         place = p + pull / s.c0
         u_adj[held] += (1 - 1 / s.c0) * pull
         add_transposed(self.motion, lambda rows: schedule.place(rows, j, schedule.end(j)), place)
@@ -307,12 +308,12 @@ class ImplicitAdjoint(RecordedPasses):
             out.parameters[features.gravity :][:3] = self.gravity_adj
         if features.drag >= 0:
             out.parameters[features.drag] = self.rate
-        rest = self.frames[0].sum(0)
+        by_pairs = None
         if self.ws.pairs:
             by_parameters, by_pairs = self.ws.pairs.collect()
             out.parameters += by_parameters
-            rest = rest + by_pairs
-        out.rest = rest + self.rest_adj + out.rest
+        if features.shape:
+            out.rest = plus(self.frames[0].sum(0) + self.rest_adj + out.rest, by_pairs)
         out.growths = self.growth
         out.forces, out.motion, out.path = self.forces, self.motion, self.path
         out.add(self.by_hosts)

@@ -135,10 +135,9 @@ class DeviceCG:
             kept = self._iterations[more, convex] = made, version
         return kept[0]
 
-    def iterate(self, state: np.ndarray, most: int, eps: float, more: bool = False, convex: bool = False) -> None:
-        """Some of at most so many iterations; state: rows of the systems that go on."""
-        times = min(self._look or self._left(state), most - int(state[:, COUNT].max()))
-        self.iterations(more, convex)(times, 10 * eps)
+    def iterate(self, state: np.ndarray, left: int, eps: float, more: bool = False, convex: bool = False) -> None:
+        """Some of so many iterations that are left; state: rows of the systems that go on."""
+        self.iterations(more, convex)(min(self._look or self._left(state), left), 10 * eps)
 
     def _left(self, state: np.ndarray) -> int:
         """Iterations that are left if the residual, which was 1, goes on to fall as it did; at most `ahead`."""
@@ -163,14 +162,14 @@ class DeviceCG:
         only its convex part.
         """
         self.put_system(mass, more)
-        size, state, done = float(np.sqrt(np.einsum("ij,ij", b, b))), np.zeros((1, ROOM)), 0
+        size, state, done = math.sqrt(np.vdot(b, b)), np.zeros((1, ROOM)), 0
         if not size > 0:
             return np.zeros_like(b), 0.0, 0, None
         runtime.fill(self.r, (b / size)[None])
         state[0, LEAST], state[0, LIMIT] = tolerance**2, max_iterations
         runtime.fill(self.state, state)
         while done < max_iterations and state[0, STOPPED] == 0 and math.isfinite(state[0, SQUARE]):
-            self.iterate(state, max_iterations, eps, more is not None, convex)
+            self.iterate(state, max_iterations - done, eps, more is not None, convex)
             state = runtime.look(self.state)
             done = max(done + 1, int(state[0, COUNT]))
         count, stopped, square = int(state[0, COUNT]), state[0, STOPPED], float(state[0, SQUARE])

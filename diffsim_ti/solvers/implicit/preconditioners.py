@@ -107,7 +107,7 @@ class BlockJacobi(Preconditioner):
         self._launch, self._inverse = self._launch or kernel.bind(**records), None
         self.potential.find_blocks()
         self._launch(nodes=len(self.mass))
-        return not runtime.look(records["body"].hard).any()
+        return not np.count_nonzero(runtime.look(records["body"].hard))
 
     def updating(self) -> tuple[list, object]:
         if self._on_device is None:

@@ -27,7 +27,7 @@ class RecordedPasses:
         self.stage = stage = ws.solver.stage(ws.rate, self.before is None, j)
         self.x, self.y = ws.inertial(stage, self.u, self.v, self.before)
         self.u_star = self.u_next if stage.c0 == 1 else (self.u_next - (1 - stage.c0) * self.u) / stage.c0
-        self.mass = stage.inertia * ws.mass
+        self.mass = ws.inertia_of(stage)
         if self.joints:
             self.joints.open(j - base)
             ws.joints.problem = ws.problem(j, stage, self.x, self.y)
@@ -51,7 +51,7 @@ class RecordedPasses:
         act on them."""
         rigid, transposed = self.ws.rigid, self.transposed
         b = rigid.motion_vjp(b * self.ws.linear) if transposed else b * self.ws.free
-        if not b.any():
+        if not np.count_nonzero(b):
             return b
         if self._preconditioner is None:
             self._preconditioner, _ = self.ws.preconditioner(self.mass)

@@ -350,7 +350,8 @@ class Rounds:
     def _iterate(self) -> None:
         """Conjugate gradients until they stop."""
         while np.any(on := (self.state[:, STOPPED] == 0) & ~self._odd()):
-            self.cg.iterate(self.state[on], int(self.state[on, LIMIT].max()), self.newton.eps, self._more is not None)
+            left = int(self.state[on, LIMIT].max() - self.state[on, COUNT].max())
+            self.cg.iterate(self.state[on], left, self.newton.eps, self._more is not None)
             self._receive()
 
     def _solve(self, odd: np.ndarray) -> None:

@@ -109,7 +109,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.place_obstacles(0)
         self.strains = FrozenStrains(self) if self.potential.held is not None else None
         a = self.arrays
-        self._mass = self.mass_of(derived)
+        self._mass, self._inertia = self.mass_of(derived), (None, None)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
         if self.joints:
             self.free[self.joints.at] = 0.0
@@ -138,6 +138,12 @@ class ImplicitWorkspace(PrescribedInPasses):
     @property
     def mass(self) -> Mass:
         return self._mass
+
+    def inertia_of(self, stage: Stage) -> Mass:
+        """c m of a stage, the same array for as long as c is the same."""
+        if self._inertia[0] != stage.inertia:
+            self._inertia = stage.inertia, stage.inertia * self.mass
+        return self._inertia[1]
 
     def mass_of(self, values) -> Mass:
         """Consistent of ten-node tetrahedra, lumped of linear ones."""
@@ -297,7 +303,7 @@ class ImplicitWorkspace(PrescribedInPasses):
 
     def problem(self, j: int, stage: Stage, x: np.ndarray, y: np.ndarray) -> tuple:
         """Mass, inertial and loads of `Newton.solve` in pass j, inertia starting from (x, y)."""
-        mass, inertial = stage.inertia * self.mass, x + stage.gamma * y
+        mass, inertial = self.inertia_of(stage), x + stage.gamma * y
         if stage.static:
             return mass, inertial, self.loads(j, stage)
         return mass, *self.led_by_loads(j, stage, inertial, mass)
@@ -423,7 +429,7 @@ class ImplicitWorkspace(PrescribedInPasses):
         self.origin = x
         self.apply_loads(j, stage)
         if self.volumes:  # after all that the stiffness at rest is made of
-            self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
+            self.volumes.stiffen(self.preconditioner(self.inertia_of(stage))[1])
 
     def share_at_stage(self, j: int, stage: Stage) -> float:
         """Share of the step at which pass j takes its forces."""
