@@ -253,7 +253,8 @@ def _add(known: dict, own: set, node: Node, more) -> None:
             own.add(key)
         more(known[key])
     elif more is not None:
-        more = _fitted(np.asarray(more), node.shape) if isinstance(node, Recorded) else more
+        if isinstance(node, Recorded) and np.shape(more) != np.shape(node.value):
+            more = _fitted(np.asarray(more), node.shape)
         if key in own:
             known[key] += more
         else:

@@ -5,10 +5,9 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, Kernel, kernels_of
+from diffsim_ti.runtime import PRECISIONS, A, Kernel, as_kernel, kernels_of
 from diffsim_ti.solvers.implicit.cg_kernels import COUNT, LEAST, LIMIT, NUMBERS, SQUARE, STOPPED, CGKernels
 
-A = ti.template()
 # places of numbers in `state`, behind those of conjugate gradients: what is done next; norms of the residual and what
 # measures them; of the line search; potential and the sum of its absolute parts, before and where it is tried; of the report
 (PHASE, NORM, BEFORE, FLOOR, ROUGH, SLOPE, FRACTION, FRESH, DOUBTED, ACCEPTED, RISE) = range(NUMBERS, NUMBERS + 11)
@@ -63,6 +62,15 @@ class NewtonKernels:
     def cg(self) -> CGKernels:
         return kernels_of(CGKernels, self.scene, self.vectors, self.parallel, self.guided, False, self.several)
 
+    @property
+    def displacements(self) -> str:
+        """The kind of arrays of displacements of the scene."""
+        return f"vectors2_{self.scene}"
+
+    @property
+    def guide(self) -> dict:
+        return dict(guide="ints", held="vectors2") if self.guided else {}
+
     def _kernel(self, name: str, function, **arrays) -> Kernel:
         cg = dict(part="scalars2", state="scalars2") | arrays.pop("cg", {})
         sizes = ("chunks", "length", "nodes", "points", "points_length", "count", "systems")
@@ -104,8 +112,13 @@ class NewtonKernels:
 
     # ---- line search -------------------------------------------------------------------------------------------------
 
-    @ti.func
-    def find_direction(self, cg: A, newton: A, plan: A):
+    @as_kernel(
+        "direction",
+        cg=lambda self: dict(x="vectors2", free="scalars") | self.guide,
+        newton=lambda self: dict(d="vectors", R="vectors") | (dict(step=self.displacements) if self.contact else {}),
+    )
+    def direction(self, cg: A, newton: A, plan: A):
+        """d of a linear solve, and R . d."""
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
             b, slope = self.cg.system(c, plan.chunks, plan), ti.cast(0, self.fp)
@@ -131,15 +144,9 @@ class NewtonKernels:
                     cg.state[b, LONGEST] = ti.cast(LONGEST_STEP, self.fp)
                 cg.state[b, PRODUCTS] = cg.state[b, PRODUCTS] + cg.state[b, COUNT]
 
-    @cached_property
-    def direction(self) -> Kernel:
-        """d of a linear solve, and R . d."""
-        cg = dict(x="vectors2", free="scalars") | (dict(guide="ints", held="vectors2") if self.guided else {})
-        own = dict(d="vectors", R="vectors") | (dict(step=f"vectors2_{self.scene}") if self.contact else {})
-        return self._kernel("direction", self.find_direction, cg=cg, newton=own)
-
-    @ti.func
-    def shorten(self, cg: A, out: A, plan: A):
+    @as_kernel("bound", out=lambda self: dict(found=self.values))
+    def bound(self, cg: A, out: A, plan: A):
+        """The longest step before an obstacle, of what each vertex may go."""
         ti.loop_config(serialize=not self.parallel)
         for j in range(plan.count):
             b, share = self.cg.system(j, plan.count, plan), ti.cast(out.found[j], self.fp)
@@ -152,13 +159,9 @@ class NewtonKernels:
                 if cg.state[b, FRACTION] < 1:
                     cg.state[b, CUTS] = cg.state[b, CUTS] + ti.cast(1, self.fp)
 
-    @cached_property
-    def bound(self) -> Kernel:
-        """The longest step before an obstacle, of what each vertex may go."""
-        return self._kernel("bound", self.shorten, out=dict(found=self.values))
-
-    @ti.func
-    def go_ahead(self, cg: A, newton: A, plan: A):
+    @as_kernel("lead", newton=lambda self: dict(u="vectors", d="vectors", next=self.displacements))
+    def lead(self, cg: A, newton: A, plan: A):
+        """Where the longest step along a new direction leads, or what is tried next along the same."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             share = cg.state[0, FRACTION]
@@ -166,14 +169,9 @@ class NewtonKernels:
                 share = cg.state[0, LONGEST]
             newton.next[0, i] = self.cg.to(PRECISIONS[self.scene], newton.u[i] + newton.d[i] * share)
 
-    @cached_property
-    def lead(self) -> Kernel:
-        """Where the longest step along a new direction leads, or what is tried next along the same."""
-        own = dict(u="vectors", d="vectors", next=f"vectors2_{self.scene}")
-        return self._kernel("lead", self.go_ahead, newton=own)
-
-    @ti.func
-    def ask(self, cg: A, near: A, plan: A):
+    @as_kernel("halt", near=dict(flags="ints"))
+    def halt(self, cg: A, near: A, plan: A):
+        """A phase of the host's where the list of pairs does not hold, or surfaces may meet."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             away, meets = near.flags[0] > 0, near.flags[2] > 0
@@ -184,14 +182,13 @@ class NewtonKernels:
                 elif away:
                     cg.state[0, PHASE] = ti.cast(ASTRAY, self.fp)
 
-    @cached_property
-    def halt(self) -> Kernel:
-        """A phase of the host's where the list of pairs does not hold, or surfaces may meet."""
-        arrays = dict(cg=dict(state="scalars2"), near=dict(flags="ints"))
-        return Kernel("halt", self.ask, self.vectors, arrays, {})
-
-    @ti.func
-    def go(self, cg: A, newton: A, at: A, plan: A):
+    @as_kernel(
+        "move",
+        newton=lambda self: dict(u="vectors", d="vectors", far="scalars", places=self.displacements),
+        at=lambda self: dict(u=self.displacements),
+    )
+    def move(self, cg: A, newton: A, at: A, plan: A):
+        """To what is tried."""
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             b = self.cg.system(i, plan.nodes, plan)
@@ -204,13 +201,6 @@ class NewtonKernels:
                 at.u[0, i] = self.cg.to(PRECISIONS[self.scene], newton.u[i] + newton.d[i] * cg.state[b, FRACTION])
             if cg.state[b, PHASE] == PROBE and cg.state[b, PROBES] > 0:
                 at.u[0, i] = newton.places[ti.cast(cg.state[b, PROBED], ti.i32), i]
-
-    @cached_property
-    def move(self) -> Kernel:
-        """To what is tried."""
-        at = dict(u=f"vectors2_{self.scene}")
-        own = dict(u="vectors", d="vectors", far="scalars", places=at["u"])
-        return self._kernel("move", self.go, newton=own, at=at)
 
     @ti.func
     def sum_energies(self, c, b, cg: A, newton: A, at: A, plan: A):
@@ -312,8 +302,20 @@ class NewtonKernels:
         if not cg.state[b, FRACTION] > cg.state[b, SHORTEST]:
             cg.state[b, PHASE] = ti.cast(TROUBLE, self.fp)
 
-    @ti.func
-    def compare(self, cg: A, newton: A, at: A, plan: A):
+    def compared(self) -> dict:
+        own = ("elastic", "contact", "J", *(["energy"] if self.pairs else []))
+        return dict.fromkeys(own, self.values) | dict(u=self.displacements)
+
+    @as_kernel(
+        "choose",
+        cg=dict(mass="scalars"),
+        newton=lambda self: (
+            dict.fromkeys(("u", "inertial", "loads"), "vectors") | dict(stiffness="scalars", J=self.values)
+        ),
+        at=compared,
+    )
+    def choose(self, cg: A, newton: A, at: A, plan: A):
+        """Whether what is tried is taken, its energies being there."""
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
             self.sum_energies(c, self.cg.system(c, plan.chunks, plan), cg, newton, at, plan)
@@ -327,14 +329,6 @@ class NewtonKernels:
                 first, last = self.cg.span(c, plan.points_length, plan.points, plan)
                 for k in range(first, last):
                     newton.J[k] = at.J[k]
-
-    @cached_property
-    def choose(self) -> Kernel:
-        """Whether what is tried is taken, its energies being there."""
-        own = dict(u="vectors", inertial="vectors", loads="vectors", stiffness="scalars", J=self.values)
-        at = dict.fromkeys(("elastic", "contact", "J", *(["energy"] if self.pairs else [])), self.values)
-        at |= dict(u=f"vectors2_{self.scene}")
-        return self._kernel("choose", self.compare, cg=dict(mass="scalars"), newton=own, at=at)
 
     # ---- residual ----------------------------------------------------------------------------------------------------
 
@@ -470,18 +464,19 @@ class NewtonKernels:
         cg, values = dict(free="scalars", r="vectors2"), self.values
         own = dict.fromkeys(("far", "stiffness"), "scalars") | dict.fromkeys(("u", "d", "R"), "vectors")
         own |= dict(history="scalars") if self.noted else {}
-        own, at = own | dict(J=values), dict(u=f"vectors2_{self.scene}", J=values)
+        own, at = own | dict(J=values), dict(u=self.displacements, J=values)
         if not self.beside:
-            cg |= dict(mass="scalars") | (dict(guide="ints", held="vectors2") if self.guided else {})
+            cg |= dict(mass="scalars") | self.guide
             own |= dict(inertial="vectors", loads="vectors")
-            at |= dict(y=f"vectors2_{self.scene}", size=values)
-        barriers = dict(blocks=f"vectors2_{self.scene}") if self.contact else {}
+            at |= dict(y=self.displacements, size=values)
+        barriers = dict(blocks=self.displacements) if self.contact else {}
         return self._kernel("judge", self.weigh, cg=cg, newton=own, at=at, barriers=barriers)
 
     # ---- preconditioner ----------------------------------------------------------------------------------------------
 
-    @ti.func
-    def check(self, cg: A, body: A, plan: A):
+    @as_kernel("ready", body=dict(hard="ints"))
+    def ready(self, cg: A, body: A, plan: A):
+        """The preconditioner is of the present place, unless a vertex is too hard for it."""
         ti.loop_config(serialize=not self.parallel)
         for c in range(plan.chunks):
             hard = 0
@@ -493,8 +488,3 @@ class NewtonKernels:
         for b in range(1):
             if cg.state[0, PHASE] == UPDATE and cg.part[0, self.cg.add_up(cg.part, 1, b, plan)] == 0:
                 cg.state[0, PHASE], cg.state[0, STOPPED] = ti.cast(SOLVE, self.fp), ti.cast(0, self.fp)
-
-    @cached_property
-    def ready(self) -> Kernel:
-        """The preconditioner is of the present place, unless a vertex is too hard for it."""
-        return self._kernel("ready", self.check, body=dict(hard="ints"))
