@@ -144,7 +144,7 @@ class Chain:
         for name in total:
             if name in rows:
                 total[name][rows[name]] += part[name]
-            elif not name.startswith("initial_"):
+            elif name not in ("initial_positions", "initial_velocities"):
                 total[name] += part[name]
 
     def zeros(self) -> dict:
