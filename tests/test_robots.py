@@ -552,7 +552,7 @@ def test_every_gradient_goes_through_vertices_that_links_hold(kind):
         tangents = rollout.tangents(frames, **{name: change[name] for name in names})
         pushed = sum(float((seeds[k] * tangents[k]).sum()) for k in seeds)
         pulled = sum(float((gradients[name] * change[name]).sum()) for name in names)
-        # what is prescribed, or beyond a limit, is a million times as stiff as the rest, and costs digits of linear solves
+        # what is prescribed, or beyond a limit, is a million times as stiff as the rest, and costs digits of implicit solves
         exact = 1e-9 if kind.explicit else 1e-8
         assert pushed == pytest.approx(pulled, rel=exact), names
     difference, whole = differs(rollout, frames, seeds, gradients, change)

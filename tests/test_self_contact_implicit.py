@@ -9,6 +9,7 @@ from test_self_contact import MATERIAL, crossed_edges, momenta, two_blocks
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
+from diffsim_ti.solvers.implicit.cycle import Cycle
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.rounds import Rounds
 
@@ -165,19 +166,23 @@ def test_the_matrix_of_contact_is_that_of_products(scene):
 
 
 def test_contact_costs_few_products_and_leaves_results_as_they_are(monkeypatch):
-    """With all that couples surfaces in the preconditioner, in that of diagonal blocks, and by a factorisation."""
+    """With all that couples surfaces in the preconditioner, on its finest level alone, with diagonal blocks alone, and by a
+    factorisation."""
     found, scene = [], stacked()
-    for few, patience in ((100, None), (1000, None), (1000, 2)):
-        monkeypatch.setattr(Multigrid, "few", few)
-        if patience is not None:
-            monkeypatch.setattr(Multigrid, "patience", patience)
+    for kind, name, value in (
+        (Cycle, "most", 150),
+        (Cycle, "most", 1),
+        (Multigrid, "few", 1000),
+        (Multigrid, "patience", 2),
+    ):
+        monkeypatch.setattr(kind, name, value)
         rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=1e-2), 4, gradients=["youngs_modulus"])
         frames = rollout.forward()
         products = rollout.report.products
         gradient = rollout.vjp(frames, frames.displacements)["youngs_modulus"]
         found.append((products, frames.displacements[-1], gradient))
-    (few, u, g), (many, *_), (direct, *_) = found
-    assert few < many / 3 and direct < many / 3
+    (few, u, g), (more, *_), (many, *_), (direct, *_) = found
+    assert few < many / 3 and direct < many / 3 and few < more < many
     for _, v, h in found[1:]:
         np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
         np.testing.assert_allclose(g, h, rtol=1e-5)

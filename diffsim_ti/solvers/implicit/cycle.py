@@ -69,7 +69,7 @@ class Level:
         self._measure(M)
         if coupled:
             self.contact_start = runtime.upload(np.zeros(self.nodes + 1), ti.i32)
-            self.contact_column, self.contact_values = runtime.array(ti.i32, 1), runtime.array(ROWS[self.numbers], 1)
+            self._make_room(1)
 
     def _measure(self, M) -> None:
         blocks = diagonal_blocks(M)
@@ -79,23 +79,30 @@ class Level:
         self.widen(self.largest)
 
     def widen(self, largest: float) -> None:
-        """Take another largest eigenvalue, with the diagonal blocks as they are but for what contact has changed of them."""
+        """Take another largest eigenvalue: inverses are those of the matrix alone, which contact of vertices then joins."""
         self.theta = THETA * MARGIN * largest
         runtime.fill(self.inverse, rows_of(self._inverses / self.theta))
 
-    def couple(self, M, take) -> None:
-        """Let another matrix join this one; take: `Buffers.take`."""
-        room, b = len(M.data), self.numbers
-        self.contact_column = take(f"columns of contact of {self.nodes} nodes", ti.i32, room)
-        self.contact_values = take(f"contact of {self.nodes} nodes", ROWS[b], b * room)
+    def _make_room(self, blocks: int) -> None:
+        """Of a matrix of contact."""
+        self._room = blocks
+        self.contact_column = runtime.array(ti.i32, blocks)
+        self.contact_values = runtime.array(ROWS[self.numbers], self.numbers * blocks)
+
+    def couple(self, M) -> bool:
+        """Let a matrix of contact join this one: whether arrays are others."""
+        grows = len(M.data) > self._room
+        if grows:
+            self._make_room(len(M.data) + len(M.data) // 2)
         runtime.fill(self.contact_start, M.indptr)
         put(self.contact_column, M.indices)
         put(self.contact_values, rows_of(M.data))
+        return grows
 
-    def put_contact(self, M, more, take) -> None:
-        """Let a matrix of contact join M, whose numbers are there."""
+    def put_contact(self, M, more) -> bool:
+        """The same of all of a matrix with its diagonal blocks, beside M, whose numbers are there."""
         self._measure((M + more).tobsr(M.blocksize))
-        self.couple(without(more, diagonal_blocks(more)), take)
+        return self.couple(without(more, diagonal_blocks(more)))
 
     def put_numbers(self, M) -> None:
         """Set those of another matrix with the same places, without contact of surfaces."""
@@ -224,11 +231,13 @@ class Cycle:
     diagonal blocks: symmetric and positive definite on what P leaves.
 
     matrices: of each level, the coarsest last; ways: from each to the one before. frames: `turned` Q and `allowed` P, a
-    block for each node of the finest level, by columns. coupled: whether contact of surfaces joins the levels.
+    block for each node of the finest level, by columns. coupled: whether contact of surfaces joins the levels, of which the
+    last one does without where it has too many nodes for one dense inverse (`most`).
     Adams, Brezina, Hu, Tuminaro 2003, doi:10.1016/S0021-9991(03)00194-3.
     """
 
-    wide = 1000  # nodes of a level from which on all threads work on it
+    wide, most = 1000, 150  # nodes of a level from which on all threads work on it; of the last one
+    renewals = 0  # of arrays
 
     def __init__(self, matrices: list, ways: list, frames, parallel: bool, coupled: bool = False):
         self.frames = frames
@@ -236,7 +245,8 @@ class Cycle:
         self._entries = [len(M.data) for M in (*matrices, *ways)]
         self._down, self._up = [], []  # (kernel, records, numbers)
         downs = [P.T.tobsr(P.blocksize[::-1]) for P in ways]
-        last, self.inverse = self.levels[-1], Inverse(matrices[-1], coupled)
+        last, self.couples_below = self.levels[-1], coupled and nodes_of(matrices[-1]) <= self.most
+        self.inverse = Inverse(matrices[-1], self.couples_below)
         within = [level.threads for level in self.levels[:-1]] + [threads_of(self.inverse)]
         for level, threads, above in zip(self.levels, within, [1, *map(threads_of, downs)]):
             if max(threads, above) > 1:
@@ -278,17 +288,21 @@ class Cycle:
         if matrices:
             self.inverse.put(matrices[-1], anew)
 
-    def couple(self, M, largest: float, take) -> None:
-        """Let a matrix of contact join the finest level, whose largest eigenvalue is at most so large then."""
-        self.levels[0].couple(M, take)
-        self.levels[0].widen(largest)
-        self._bound = {}
+    def couple(self, M, overlap: float) -> None:
+        """Let a matrix of contact join the finest level, at most so many times its diagonal blocks."""
+        finest = self.levels[0]
+        self._renew([finest.couple(M)])
+        finest.widen(max(finest.largest, overlap))
 
-    def put_contact_below(self, matrices: list, more: list, take) -> None:
+    def put_contact_below(self, matrices: list, more: list) -> None:
         """Let matrices of contact join those of the levels below the finest one."""
-        for level, M, own in zip(self.levels[1:-1], matrices, more):
-            level.put_contact(M, own, take)
+        self._renew([level.put_contact(M, own) for level, M, own in zip(self.levels[1:-1], matrices, more)])
         self.inverse.put_dense((matrices[-1] + more[-1]).toarray())
+
+    def _renew(self, others: list) -> None:
+        """Kernels are bound anew where arrays are others."""
+        if any(others):
+            self.renewals, self._bound = self.renewals + 1, {}
 
     def parts(self, at, scale: float = 1.0) -> list:
         """(kernel, records, numbers) one after the other: at.z = Q V Q^T at.r; scale: what brings r to about one."""

@@ -128,12 +128,17 @@ class DeviceCG:
         """(times, rounding) -> so many iterations; more: whether a matrix joins the Hessian."""
         if self._served and not (more or convex):
             return self._served
-        kept, pairs = self._iterations.get((more, convex)), self.potential.pairs
-        version = pairs and pairs.version
-        if kept is None or kept[1] != version:
+        kept = self._iterations.get((more, convex))
+        if kept is None or kept[1] != self.version:
             made = self._iteration(more, convex, self.potential.multiplying(convex))
-            kept = self._iterations[more, convex] = made, version
+            kept = self._iterations[more, convex] = made, self.version
         return kept[0]
+
+    @property
+    def version(self) -> tuple | None:
+        """Of the arrays that grow."""
+        pairs = self.potential.pairs
+        return pairs and (pairs.version, self.cycle and self.cycle.renewals)
 
     def iterate(self, state: np.ndarray, left: int, eps: float, more: bool = False, convex: bool = False) -> None:
         """Some of so many iterations that are left; state: rows of the systems that go on."""

@@ -102,10 +102,10 @@ class Multigrid(Preconditioner):
             self.large = self.stiff = 0
         self.place = None
         self.couples = bool(potential.pairs and ways) and self._ties is None and len(mass) > self.few
-        if self.couples:
-            self.large = self.stiff = 0
         self._forget_contact(matrices, ways)
         self.cycle = Cycle(matrices, ways, self.frames, within, self.couples)
+        if self.cycle.couples_below:
+            self.large = self.stiff = 0
         self.solver = DeviceCG(potential, self.cycle, free, parallel)
         if self._changes:
             self._make_join(parallel)
@@ -167,79 +167,81 @@ class Multigrid(Preconditioner):
         scenes, n = self.potential.arrays.num_scenes, self.potential.arrays.vertices_of_one
         self._made, self._below, self._contact = (matrices[1:], ways), matrices[1:], np.zeros((scenes, n))
         self._full = None  # of one body with one level below the finest one, as dense arrays
+        self._acts = False  # whether contact between surfaces is on the finest one
 
     def _bring_contact_down(self, met: bool) -> None:
-        """The levels below the finest one take contact, where it has changed by much or a solve begins; contact between
-        surfaces joins the finest one always."""
+        """Contact between surfaces joins the finest level; the levels below it take all contact, where it has changed by
+        much or a solve begins."""
         potential, a = self.potential, self.potential.arrays
-        if not (self.couples or a.contacts) or a.num_vertices <= self.large or self._ties is not None:
+        of_pairs = self._couple() if self.couples else None
+        if not (of_pairs or a.contacts) or a.num_vertices <= self.large or self._ties is not None:
             return
-        of_pairs, blocks = None, potential.obstacle_blocks(met) if a.contacts else np.zeros_like(self._diagonal)
+        blocks = potential.obstacle_blocks(met) if a.contacts else np.zeros_like(self._diagonal)
         size = np.abs(np.einsum("kii->k", blocks))
         if a.contacts and potential.pairs:
             potential.put_contact_blocks()
-        if self.couples:
-            of_pairs, diagonal = self._couple()
-            size += np.abs(np.einsum("kii->k", diagonal))
-        anew, scenes = self._changed(size.reshape(a.num_scenes, -1)), a.num_scenes
+        if of_pairs:
+            size += np.abs(np.einsum("kii->k", of_pairs[1]))
+        anew, size = self._changed(size.reshape(a.num_scenes, -1))
         if not anew.any():
             return
         from scipy.sparse import bsr_matrix
 
         self.frames.update()
-        matrices, ways = self._made
-        at = np.flatnonzero(size * blocks.any((1, 2)) * np.repeat(anew, a.vertices_of_one))
+        (matrices, ways), levels = self._made, []
+        at = np.flatnonzero(size.ravel() * blocks.any((1, 2)) * np.repeat(anew, a.vertices_of_one))
         turns = projectors_of(self.free)[at] @ self.frames.matrices()[at]
         values, vectors = np.linalg.eigh(0.5 * (blocks[at] + np.swapaxes(blocks[at], 1, 2)))
         roots = np.swapaxes(turns, 1, 2) @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-        more, levels = roots @ np.swapaxes(roots, 1, 2), []
-        if len(matrices) == 1 and self.cycle.inverse.is_of_one_body and of_pairs is None:
+        more, start = roots @ np.swapaxes(roots, 1, 2), np.searchsorted(at, np.arange(size.size + 1))
+        if not of_pairs and len(matrices) == 1 and self.cycle.inverse.is_of_one_body:
             if self._full is None:
                 self._full = matrices[0].toarray(), ways[0].toarray().reshape(size.size, 3, -1)
             M, P = self._full[0], self._full[1][at]
             self.cycle.inverse.put_dense(M + np.tensordot(P, more @ P, ((0, 1), (0, 1))))
             return
-        start = np.searchsorted(at, np.arange(size.size + 1))
         more = bsr_matrix((more, at, start), shape=2 * (3 * size.size,))
-        if of_pairs is not None:
-            more = more + of_pairs
+        if of_pairs:
+            more = more + of_pairs[0]
             for M, P in zip(matrices, ways):
                 more = (P.T @ (more @ P)).tobsr(M.blocksize)
                 levels.append(more)
-            self.cycle.put_contact_below(matrices, levels, potential.pairs.inner.list.buffers.take)
+            self.cycle.put_contact_below(matrices, levels)
             return
         for M, P, before in zip(matrices, ways, self._below):
             more = (P.T @ (more @ P)).tobsr(M.blocksize)
             levels.append(with_blocks(M, more))
-            stay = ~np.repeat(anew, len(M.data) // scenes)
+            stay = ~np.repeat(anew, len(M.data) // a.num_scenes)
             levels[-1].data[stay] = before.data[stay]
         self._below = levels
         self.cycle.put_below(levels, anew)
 
-    def _changed(self, size: np.ndarray) -> np.ndarray:
-        """Of which scenes coarse levels take contact of such a size at vertices, a mask; they are taken to have it. What is
-        too soft for them becomes zero."""
+    def _changed(self, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(mask of the scenes of which coarse levels take contact anew, size of what they take at vertices) for such a size
+        of contact, shape (scenes, vertices): none where it is too soft for them."""
         known, stiffness = self._contact.any(1), np.abs(np.einsum("kii->k", self._diagonal)).reshape(size.shape)
         soft = ~(size * size.shape[1] ** (1 / 3) > self.stiff * stiffness).any(1)
-        size[soft & (self._is_new | ~known)] = 0
+        size = size * ~(soft & (self._is_new | ~known))[:, None]
         share = size / (size + stiffness + 1e-300)
         change, most = np.abs(share - self._contact), np.maximum(share, self._contact)
         anew = change.sum(1) > self.changed * most.sum(1)
         anew |= self._is_new & (size.any(1) | known)
         self._is_new, self._contact[anew] = self._is_new & ~anew, share[anew]
-        return anew
+        return anew, size
 
-    def _couple(self) -> tuple:
+    def _couple(self) -> tuple | None:
         """Let contact between surfaces join the finest level, which has diagonal blocks of it by itself: its matrix and
-        these, turned back."""
-        self.frames.update()
+        these, turned back, for the levels below; None where these take none."""
         pairs, finest = self.potential.pairs, self.cycle.levels[0]
-        turns, (M, diagonal) = projectors_of(self.free) @ self.frames.matrices(), pairs.stiffness(self.potential.u)
-        M, diagonal = turned(M, turns, turns), np.swapaxes(turns, 1, 2) @ diagonal @ turns
-        largest = max(finest.largest, pairs.overlap if M.data.size else 0.0)
-        self.cycle.couple(without(M, diagonal), largest, pairs.inner.list.buffers.take)
-        self._join[2]["theta"] = finest.theta
-        return M, diagonal
+        M, diagonal = pairs.stiffness(self.potential.u)
+        acts = bool(len(M.data))
+        if acts or self._acts:
+            self.frames.update()
+            turns = projectors_of(self.free) @ self.frames.matrices()
+            M, diagonal = turned(M, turns, turns), np.swapaxes(turns, 1, 2) @ diagonal @ turns
+            self.cycle.couple(without(M, diagonal), acts * pairs.overlap)
+            self._join[2]["theta"], self._acts = finest.theta, acts
+        return (M, diagonal) if self.cycle.couples_below else None
 
     def _levels(self, more=()) -> tuple[list, list]:
         """(matrices of all levels, ways from each to the one before) where the potential stands, turned back by frames."""

@@ -73,7 +73,7 @@ class Rounds:
         """Kernels to the arrays that are there, of which pairs may have others now and then."""
         potential, detection, preconditioner, pairs = self.potential, self.detection, self.preconditioner, self.pairs
         kernels, cg, a, beside = self._kernels, self.cg, potential.arrays, self.beside
-        self._version = pairs and pairs.version
+        self._version = self.cg.version
         way, barriers = (detection.way, potential.barriers) if self.contact else (None, None)
         at = (pairs.inner, potential) if pairs else potential
         own = dict(cg=cg, at=at, newton=(self, way), out=detection.found, barriers=barriers)
@@ -118,7 +118,7 @@ class Rounds:
         """Those of a launch, of kernels that are bound to the arrays that are there; most: the longest step."""
         numbers, pairs = self._always | self.potential.sizes() | dict(most=most), self.pairs
         if pairs:
-            if pairs.version != self._version:
+            if self.cg.version != self._version:
                 self._bind()
             count, pairs.inner.sizes["most"] = pairs.inner.num_energies, most
             numbers |= dict(energies=count, energies_length=-(-count // self.cg.chunks))
