@@ -209,26 +209,6 @@ def test_a_preconditioner_that_fails_is_replaced_with_a_word(kind, fits, monkeyp
         assert gmres(A, b, M, 1e-9, 5000)[1] <= 1e-9
 
 
-class Patient(BlockJacobi):
-    """For as many products as are asked for."""
-
-    patience = 10**6
-
-
-def test_what_a_slow_preconditioner_has_found_is_kept(monkeypatch):
-    monkeypatch.setattr(Effort, "fits", False)
-    workspace, A = placed([], fixed="xmin")
-    b = np.random.default_rng(2).standard_normal((len(A.mass), 3)) * workspace.free
-    M = Patient(A.potential, A.mass, A.free, A.mass)
-    M.update(A.potential.held_at)
-    *_, whole, _ = conjugate_gradients(A, b, M, 1e-9, 5000, 1e-16)
-    M.begin()
-    M.patience = whole - 3
-    x, residual, more, _ = conjugate_gradients(A, b, M, 1e-9, 5000, 1e-16)
-    assert M.given_up and 0 < more < 0.6 * whole and residual <= 1e-9, (whole, more)
-    assert np.linalg.norm(b - A(x)) <= 1.01e-9 * np.linalg.norm(b)
-
-
 def test_factorisations_are_those_of_one_state():
     """Of another correction another, of bodies that move by few numbers none."""
     workspace, A = placed([], fixed="xmin")

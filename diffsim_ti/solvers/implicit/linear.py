@@ -130,22 +130,16 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
 
     Stops at a direction p of negative curvature (else None) with the x before it or, if it is the first direction, with
     the preconditioned b: a direction of descent. Nocedal, Wright, Numerical Optimization, alg. 7.1. A preconditioner that is
-    too slow or not positive definite is replaced (`_in_turn`) by one that goes on from what it has found.
+    too slow or not positive definite is replaced (`_in_turn`).
     """
-    start, left, share = None, b, 1.0  # what is left of b where it goes on, and its size beside that of b
     for own, most in _in_turn(operator, preconditioner, max_iterations):
-        x, residual, count, p = _conjugate_gradients(operator, left, own, tolerance / share, most, eps)
-        _count(own, residual, count)
-        if start is not None:
-            x, residual = start if p is not None and count == 1 else start + x, residual * share
-        if residual <= tolerance or p is not None:
+        found = _conjugate_gradients(operator, b, own, tolerance, most, eps)
+        _count(own, *found[1:3])
+        if found[1] <= tolerance or found[3] is not None:
             break
-        if own is preconditioner and not np.isfinite(residual):
+        if own is preconditioner and not np.isfinite(found[1]):
             preconditioner.unfit = True
-        elif residual < 1:
-            start, left = x, b - operator(x)
-            share = float(np.linalg.norm(left) / np.linalg.norm(b))
-    return x, residual, count, p
+    return found
 
 
 def _conjugate_gradients(operator, b, preconditioner, tolerance: float, max_iterations: int, eps: float):
