@@ -112,7 +112,7 @@ class Launch:
             self._prepare(numbers)
         if self._buffer:
             self._buffer.restore()
-        if numbers != self._last or 0 in numbers:  # which may be -0.0
+        if numbers != self._last or 0 in numbers:  # of which -0.0 is equal to 0.0
             known, self._last = self._set, None  # also if this is interrupted
             for k, (setter, index) in enumerate(self._setters):
                 number = numbers[k]

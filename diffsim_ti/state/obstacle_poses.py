@@ -52,7 +52,7 @@ class ObstaclePoses:
         self.size = 3 * len(obstacles) + MORE * len(turning)
         self.place_of = {k: row // 3 for (k, _), row in zip(turning, rows)}  # of obstacle k among places
 
-    def check(self, path: np.ndarray | None, at: Moment) -> None:
+    def check(self, path: np.ndarray | None, at: Moment | None) -> None:
         """Raise ValueError for a pass in which an obstacle turns farther than its motion is resolved."""
         for _, c in self.turning:
             most = np.linalg.norm(path[at.schedule.row_of(path, at.j), c + 2]) * (at.schedule.end(at.j) - at.begin)
