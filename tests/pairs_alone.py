@@ -104,15 +104,15 @@ def follow_parts(monkeypatch) -> list[tuple[bool, float]]:
         one = self.kept.get(at.end)
         for k, part in enumerate(one.parts if one else ()):
             of = self._numbers(one, at.now)
-            found = one.near.look(part, of)
-            after = one.near.take(part, of, found)
+            found = one.solver.look(part, of)
+            after = one.solver.take(part, of, found)
             np.testing.assert_allclose(part.P, found.P, rtol=0, atol=1e-9 * found.P.max(initial=1e-300))
             known = (one.parts[k + 1].e, one.parts[k + 1].b) if k + 1 < len(one.parts) else (None, one.b)
             for x, y in zip(after, known):
                 assert y is None or np.abs(x - y).max() <= 1e-11 * max(np.abs(y).max(), 1e-300)
             lost = 0.0
             if of.rough:
-                inverse = one.near.lightened(of, np.eye(len(of.inverse)))
+                inverse = one.solver.near.lightened(of, np.eye(len(of.inverse)))
                 mass = np.linalg.pinv(inverse)
                 before, then = (float((mass @ v * v).sum()) for v in (found.V, found.V + found.friction))
                 assert then <= before * (1 + 1e-14)

@@ -253,8 +253,7 @@ def _add(known: dict, own: set, node: Node, more) -> None:
             own.add(key)
         more(known[key])
     elif more is not None:
-        if isinstance(node, Recorded) and np.shape(more) != np.shape(node.value):
-            more = _fitted(np.asarray(more), node.shape)
+        more = _fitted(np.asarray(more), node.shape) if isinstance(node, Recorded) else more
         if key in own:
             known[key] += more
         else:

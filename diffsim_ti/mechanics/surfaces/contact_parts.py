@@ -1,5 +1,5 @@
 """Contact of near pairs in a part of an explicit pass, in float64: what the contact stage of pairs repeats. Forward it is
-done by part_kernels.py; here are the same formulas for NumPy's arrays, which record for tangents and adjoints.
+done by part_kernels.py; here are the same formulas for NumPy's arrays, their tangents, by complex numbers, and adjoints.
 
 In a part of length h nodes of mass m would move by f = alpha v, points x = C X with them (curved_pairs.py; C = 1 where faces
 are flat). Pair p presses along its normal n_p with its weights w_p, B = w C, from a distance d_p to
@@ -32,55 +32,21 @@ be. So surfaces stay apart whatever the stiffness, and what it cannot hold is lo
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
 
-from diffsim_ti.differentiation.arrays import (
-    Recorded,
-    cross,
-    forward_of_all,
-    linear,
-    made,
-    reverse_of_all,
-    summed_at,
-    times,
-    value_of,
-    with_slopes,
-)
 from diffsim_ti.mechanics.surfaces import host_geometry as geometry
-from diffsim_ti.mechanics.surfaces.host_geometry import TINY, by_rows, dot
+from diffsim_ti.mechanics.surfaces.host_geometry import TINY, dot
 from diffsim_ti.mechanics.surfaces.part_kernels import WALL
 from diffsim_ti.terms.obstacles.friction import ARRAYS, slip
 
-DENSE, SMALL = 1000, 2**18  # unknowns of what is factored as a dense matrix; products that its making may then take
-# what of their numbers has derivatives
-READ = "x", "motion", "rest", "inverse", "alpha", "wall", "stiffness", "width", "radius", "mu", "speed"
+DENSE = 1000  # unknowns up to which a dense matrix is factored
 
 
 def total(x: np.ndarray) -> float:
     """The sum, with the same bits whatever zeros stand among the numbers: those of nodes that no pair reads."""
     return x[x != 0].sum()
-
-
-def scaled(a, x):
-    """a x of a number a, whose adjoint is such a sum."""
-    A, X = value_of(a), value_of(x)
-    by_a = (a, lambda da: da * X, lambda seed: total(seed * X))
-    return made(A * X, by_a, (x, lambda dx: A * dx, lambda seed: A * seed))
-
-
-def arrays_of(of) -> list:
-    """What parts read that has derivatives."""
-    return [getattr(of, name) for name in READ] + [x for own in of.sets for x in vars(own).values()]
-
-
-def with_arrays(of, arrays: list) -> SimpleNamespace:
-    """The same with other arrays, or changes or adjoints of them."""
-    more = iter(arrays[len(READ) :])
-    sets = [type(own)(*(next(more) for _ in vars(own))) for own in of.sets]
-    return SimpleNamespace(**vars(of) | dict(zip(READ, arrays)) | dict(sets=sets))
 
 
 @dataclass
@@ -111,27 +77,41 @@ class NearPairs:
         free = None if self.free is None else self.free[kept]
         return replace(self, C=self.C[:, kept].tocsr(), free=free, sets=[SimpleNamespace(**x) for x in sets]), kept
 
-    def points(self, nodes):
-        return nodes if self.C is None else times(self.C, nodes)
+    def points(self, nodes: np.ndarray) -> np.ndarray:
+        return nodes if self.C is None else self.C @ nodes
 
-    def freed(self, x):
-        free = lambda x: np.einsum("nij,nj->ni", self.free, x)  # noqa: E731
-        return x if self.free is None else linear(x, free, free)
+    def nodes(self, points: np.ndarray) -> np.ndarray:
+        return points if self.C is None else self.C.T @ points
 
-    def lightened(self, of, x):
+    def freed(self, x: np.ndarray) -> np.ndarray:
+        return x if self.free is None else np.einsum("nij,nj->ni", self.free, x)
+
+    def lightened(self, of, x: np.ndarray) -> np.ndarray:
         """Products of inverse masses with vectors of the nodes."""
-        out = by_rows(of.inverse, x)
+        out = (of.inverse * x.T).T
         for near, own in zip(self.sets, of.sets):
-            out = out + summed_at(near.at, own.lightened(x[near.at]), len(out))
+            out[near.at] = own.lightened(x[near.at])
         return out
 
-    def lightened_sizes(self, of, x):
+    def lightened_vjp(self, of, adj, a: np.ndarray, x: np.ndarray) -> None:
+        """Add the adjoints of inverse masses in a . lightened(x)."""
+        adj.inverse += dot(a, x)
+        for near, own, by in zip(self.sets, of.sets, adj.sets):
+            own.lightened_vjp(by, a[near.at], x[near.at])
+
+    def lightened_sizes(self, of, x: np.ndarray) -> np.ndarray:
         """The same of numbers, by bounds of inverse masses."""
         out = of.inverse * x
         for near, own in zip(self.sets, of.sets):
             at = near.at[: len(near.here)]
-            out = out + summed_at(at, own.sizes @ x[at], len(out))
+            out[at] = own.sizes @ x[at]
         return out
+
+    def lightened_sizes_vjp(self, of, adj, a: np.ndarray, x: np.ndarray) -> None:
+        adj.inverse += a * x
+        for near, by in zip(self.sets, adj.sets):
+            at = near.at[: len(near.here)]
+            by.sizes += np.outer(a[at], x[at])
 
     def twist(self, part, of, at) -> list:
         """(node of the sum, nodes, how far they are from where the mobility of a rigid set is taken)"""
@@ -139,61 +119,24 @@ class NearPairs:
         moved = at.X + part.theta * at.f - of.x - 0.5 * of.motion if sets else None
         return [(node, own, moved[own]) for node, own in sets]
 
-    def gathered(self, nodes: np.ndarray) -> np.ndarray:
-        """Vectors of the corners, (pairs, 4, 3), from those of nodes."""
-        return self.points(nodes)[self.corners]
+    def relative(self, points: np.ndarray) -> np.ndarray:
+        """Of corners 1 to 3 relative to corner 0."""
+        at = points[self.corners]
+        return at[:, 1:] - at[:, :1]
 
     def scattered(self, at_corners: np.ndarray) -> np.ndarray:
-        """Sums at the points of vectors of corners."""
-        return summed_at(self.corners, at_corners, self.num_points)
+        """Sums at the points of vectors of corners, (pairs, 4, 3)."""
+        out = np.zeros((self.num_points, 3))
+        np.add.at(out, self.corners, at_corners)
+        return out
 
-    def relative(self, points):
-        """Of corners 1 to 3 relative to corner 0."""
-
-        def back(seed):
-            return self.scattered(np.concatenate([-seed.sum(1, keepdims=True), seed], 1))
-
-        return linear(points, lambda x: x[self.corners[:, 1:]] - x[self.corners[:, :1]], back)
-
-    def at_pairs(self, w, nodes):
-        """B x, vectors of the pairs."""
-        W, X = value_of(w), self.gathered(value_of(nodes))
-        weigh = lambda w, x: np.einsum("pk,pkd->pd", w, x)  # noqa: E731
-        by_w = (w, lambda dw: weigh(dw, X), lambda seed: np.einsum("pd,pkd->pk", seed, X))
-        by_nodes = (nodes, lambda dx: weigh(W, self.gathered(dx)), lambda seed: self.at_nodes(W, seed))
-        return made(weigh(W, X), by_w, by_nodes)
-
-    def at_nodes(self, w, x):
-        """B^T x, sums at the nodes of vectors of the pairs."""
-        W, X = value_of(w), value_of(x)
-
-        def add(w, x):
-            points = self.scattered(w[:, :, None] * x[:, None])
-            return points if self.C is None else self.C.T @ points
-
-        by_w = (w, lambda dw: add(dw, X), lambda seed: np.einsum("pd,pkd->pk", X, self.gathered(seed)))
-        return made(add(W, X), by_w, (x, lambda dx: add(W, dx), lambda seed: self.at_pairs(W, seed)))
-
-    @cached_property
-    def pattern(self) -> tuple:
-        """(rows of B's entries, their columns, the matrix that makes them of the weights)"""
+    def weighed(self, w: np.ndarray):
+        """B, (pairs, nodes), CSR."""
         from scipy.sparse import csr_matrix
 
-        (start, index, weight), points = self.rows, self.corners.ravel()
-        counts = np.diff(start)[points]
-        corner = np.repeat(np.arange(len(points)), counts)
-        each = np.arange(len(corner)) + np.repeat(start[points] - np.cumsum(counts) + counts, counts)
-        entries, place = np.unique(corner // 4 * self.num_nodes + index[each], return_inverse=True)
-        matrix = csr_matrix((weight[each], (place, corner)), (len(entries), len(points)))
-        return *np.divmod(entries, self.num_nodes), matrix
-
-    def entries(self, w):
-        """Those of B."""
-        return times(self.pattern[2], w.reshape(-1))
-
-    @property
-    def num_nodes(self) -> int:
-        return self.num_points if self.C is None else self.C.shape[1]
+        count = len(self.corners)
+        out = csr_matrix((w.ravel(), self.corners.ravel(), 4 * np.arange(count + 1)), (count, self.num_points))
+        return out if self.C is None else (out @ self.C).tocsr()
 
     @property
     def rows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -220,78 +163,86 @@ class Part:
         return 0.5 * (1 - self.c)
 
 
-@dataclass
-class PartSolver(NearPairs):
+class PartSolver:
     """Takes parts of a pass; `of`, its numbers, has x, motion (nodes, 3): displacements of nodes, and how they move without
     contact; rest (points, 3); inverse (nodes,): 1 / mass, 0 of sets, which have Factors in `sets`; stiffness,
-    width, radius, mu, speed (pairs,); wall; h, alpha; contacts: which pairs are of each whose impulses are asked for."""
+    width, radius, mu, speed (pairs,); wall; h, alpha; seeds: adjoints of `impulses`, (which pairs, of push, of friction)."""
+
+    def __init__(self, near: NearPairs):
+        self.near = near
+
+    # ---- forward -------------------------------------------------------------------------------------------------------
 
     def look(self, part: Part, of) -> SimpleNamespace:
         """Where pairs are, and how they would go."""
-        at = SimpleNamespace()
+        near, at = self.near, SimpleNamespace()
         at.h, at.alpha = part.share * of.h, part.share * of.alpha
-        at.f = part.share * of.motion + scaled(at.alpha, part.b)
+        at.f = part.share * of.motion + at.alpha * part.b
         at.X = of.x + part.begin * of.motion + part.e
-        y = self.relative(of.rest + self.points(at.X + part.theta * at.f))
-        at.w, r = geometry.nearest(y, self.edges)
-        d = np.sqrt(dot(r, r))
-        at.n = by_rows(1 / d, r)
-        at.m = geometry.fading(y, self.edges, self.scale)
-        d, moved = d - of.radius, dot(at.n, self.at_pairs(at.w, at.f))
-        at.begin, at.free = d - part.theta * moved, d + (1 - part.theta) * moved
-        at.give = at.alpha * (0.5 * (1 + part.c) * at.h)  # from P to displacements
+        at.points = of.rest + near.points(at.X + part.theta * at.f)
+        at.y = near.relative(at.points)
+        at.w, at.r, at.g = geometry.nearest(at.y, near.edges)
+        at.d = np.sqrt(dot(at.r, at.r))
+        at.n = at.r / at.d[:, None]
+        at.m = geometry.fading(at.y, near.edges, near.scale)
+        at.B = near.weighed(at.w)
+        at.moved = at.B @ at.f
+        at.begin = at.d - of.radius - part.theta * dot(at.n, at.moved)
+        at.free = at.d - of.radius + (1 - part.theta) * dot(at.n, at.moved)
+        at.give = at.alpha * 0.5 * (1 + part.c) * at.h  # from P to displacements
         return at
 
     def pushes(self, part: Part, of, at, y):
-        """(P, -dP / dy)"""
-        k, wall, s, t = of.stiffness, of.wall / at.h**2, at.begin / of.width, y / of.width
-        p, by_s, by_t = geometry.push(value_of(s), value_of(t), part.c)
-        end = value_of(t) / WALL
-        q, by_q = -geometry.slope(end), -geometry.curvature(end) / WALL
-        by_y = value_of(at.m) * (value_of(k) * by_t + value_of(wall) * by_q)
-        p, q = with_slopes(p, (s, lambda: by_s), (t, lambda: by_t)), with_slopes(q, (t, lambda: by_q))
-        return at.m * of.width * (k * p + wall * q), -by_y
+        """(P, its derivatives by d, y, width, and of width times the wall)"""
+        s, t, w = at.begin / of.width, y / of.width, of.width
+        p, by_s, by_t = geometry.push(s, t, part.c)
+        wall = of.wall / at.h**2
+        q, by_q = -geometry.slope(t / WALL), -geometry.curvature(t / WALL) / WALL
+        k = of.stiffness
+        P = at.m * w * (k * p + wall * q)
+        by_width = at.m * (k * (p - s * by_s - t * by_t) + wall * (q - t * by_q))
+        return P, at.m * k * by_s, at.m * (k * by_t + wall * by_q), by_width, p, q
 
-    def displaced(self, of, at, x):
-        """Displacements by pushes along the normals."""
-        return scaled(at.give, self.lightened(of, self.freed(self.at_nodes(at.w, by_rows(x, at.n)))))
+    def along_normals(self, at):
+        """A, (pairs, 3 nodes), CSR: how distances change with what nodes may do."""
+        from scipy.sparse import csr_matrix
 
-    def answer(self, of, at, K: np.ndarray):
-        """The map (K^-1 + A Q A^T)^-1 of vectors of the pairs, where K > 0; A: how distances change with what nodes may do,
-        Q: displacements by forces on the nodes."""
+        B, near = at.B, self.near
+        row = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
+        along = at.n[row] if near.free is None else np.einsum("pi,pij->pj", at.n[row], near.free[B.indices])
+        columns = 3 * B.indices[:, None] + np.arange(3)
+        return csr_matrix(
+            ((B.data[:, None] * along).ravel(), columns.ravel(), 3 * B.indptr), (B.shape[0], 3 * B.shape[1])
+        )
+
+    def displaced(self, of, at, pushed: np.ndarray) -> np.ndarray:
+        """Q: displacements by forces on the nodes."""
+        return at.give * self.near.lightened(of, pushed)
+
+    def answer(self, of, at, A, K: np.ndarray):
+        """The map (K^-1 + A Q A^T)^-1 of vectors of the pairs, where K > 0."""
         from scipy.linalg import cho_factor, cho_solve
-        from scipy.sparse import csr_matrix, identity
+        from scipy.sparse import csr_matrix, diags
         from scipy.sparse.linalg import splu
 
-        some = np.flatnonzero(K > 0)
+        some, near = np.flatnonzero(K > 0), self.near
         if not some.size:
             return np.zeros_like
-        root, (row, node, _) = np.sqrt(K[some]), self.pattern
-        chosen = K[row] > 0
-        row, node, data = row[chosen], node[chosen], self.entries(at.w)[chosen]
-        along = at.n[row] if self.free is None else np.einsum("pi,pij->pj", at.n[row], self.free[node])
-        data = (np.sqrt(K[row]) * data)[:, None] * along
-        # bits do not depend on what other nodes there are
-        read = np.unique(np.concatenate([node, *(x.at for x in self.sets)]))
-        columns = lambda nodes: (3 * np.searchsorted(read, nodes)[:, None] + np.arange(3)).ravel()  # noqa: E731
-        shape = columns(node), 3 * np.searchsorted(row, [*some, len(K)])
-        A = csr_matrix((data.ravel(), *shape), (some.size, 3 * len(read)))
-        lighter, kind = csr_matrix(((of.inverse[node][:, None] * data).ravel(), *shape), A.shape), csr_matrix
-        if some.size**2 * A.shape[1] <= SMALL:
-            A, lighter, kind = A.toarray(), lighter.toarray(), np.asarray
-        H = lighter @ A.T
-        for x, own in zip(self.sets, of.sets):
+        root = np.sqrt(K[some])
+        A = diags(root) @ A[some]
+        H = A @ diags(np.repeat(of.inverse, 3)) @ A.T
+        for x, own in zip(near.sets, of.sets):
             N, inverse = own.of_components(len(x.at))
-            N = A[:, columns(x.at)] @ kind(N)
-            H = H + N @ kind(inverse) @ N.T
+            N = A[:, (3 * x.at[:, None] + np.arange(3)).ravel()] @ csr_matrix(N)
+            H = H + N @ csr_matrix(inverse) @ N.T
         H = H * at.give
         if some.size <= DENSE:
-            H = H if kind is np.asarray else H.toarray()
+            H = H.toarray()
             H[np.diag_indices(some.size)] += 1
             factors = cho_factor(H, lower=True, overwrite_a=True, check_finite=False)
             act = lambda x: cho_solve(factors, x, check_finite=False)  # noqa: E731
         else:
-            H = (H + identity(some.size)).tocsc()
+            H = (H + diags(np.ones(some.size))).tocsc()
             act = splu(H, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True)).solve
 
         def product(x):
@@ -301,81 +252,193 @@ class PartSolver(NearPairs):
 
         return product
 
-    def followed(self, pushed, K: np.ndarray, of, at):
-        """P, on which the ends of the pairs depend, from what it would be at ends that did not."""
-        if not isinstance(pushed, Recorded):
-            return pushed
-        of = with_arrays(of, [value_of(x) for x in arrays_of(of)])
-        at = SimpleNamespace(**{name: value_of(x) for name, x in vars(at).items()})
-        answer = self.answer(of, at, K)
-        led = lambda x: dot(at.n, self.at_pairs(at.w, self.displaced(of, at, x)))  # noqa: E731
-        return made(pushed.value, (pushed, lambda dx: dx - answer(led(dx)), lambda seed: seed - led(answer(seed))))
-
-    def take(self, part: Part, of, at) -> tuple:
-        """(e, b) after the part, for its P: at.P and others are noted."""
-        end = at.free + dot(at.n, self.at_pairs(at.w, self.displaced(of, at, part.P)))
-        at.P = self.followed(*self.pushes(part, of, at, end), of, at)
-        at.push = at.h * by_rows(at.P, at.n)
-        at.given = self.at_nodes(at.w, at.push)
-        delta = self.lightened(of, self.freed(at.given))
-        b, drift = part.b + delta, part.b + 0.5 * (1 + part.c) * delta
+    def take(self, part: Part, of, at) -> tuple[np.ndarray, np.ndarray]:
+        """(e, b) after the part, for its P: at.P and others are noted. Of complex numbers P follows what it is of."""
+        near = self.near
+        if np.iscomplexobj(at.free) or np.iscomplexobj(of.stiffness):
+            self._follow(part, of, at)
+        else:
+            at.zeta = self.displaced(of, at, near.freed(at.B.T @ (part.P[:, None] * at.n)))
+            at.end = at.free + dot(at.n, at.B @ at.zeta)
+            at.P = self.pushes(part, of, at, at.end)[0]
+        at.pressed = at.B.T @ (at.P[:, None] * at.n)
+        at.delta = at.h * near.lightened(of, near.freed(at.pressed))
+        at.friction = self._friction(part, of, at) if of.rough else 0 * at.delta
+        blend = 0.5 * (1 + part.c)
+        at.w_drift = part.b + blend * at.delta + at.friction
+        e, at.given = part.e + at.alpha * at.w_drift, at.h * at.pressed
         if of.rough:
-            at.impulse = self._friction(part, of, at)
-            rubbed = self.at_nodes(at.w, at.impulse)
-            at.friction = self.lightened(of, self.freed(rubbed))
-            b, drift, at.given = b + at.friction, drift + at.friction, at.given + rubbed
-        e = part.e + scaled(at.alpha, drift)
-        for node, own, moved in self.twist(part, of, at):
-            e = e + summed_at(np.array([node]), cross(moved, at.given[own]).sum(0)[None], len(e))
-        return e, b
+            at.given = at.given + at.friction_sum
+        for node, own, moved in near.twist(part, of, at):
+            e[node] += np.cross(moved, at.given[own]).sum(0)
+        return e, part.b + at.delta + at.friction
 
-    def impulses(self, at, own: np.ndarray, of) -> tuple:
+    def impulses(self, at, own: np.ndarray, of) -> tuple[np.ndarray, np.ndarray]:
         """What some pairs gave the nodes in a part that was taken [N s], by push and by friction."""
-        own = own.astype(float)
-        pushed = self.at_nodes(at.w, by_rows(own, at.push))
-        return pushed, self.at_nodes(at.w, by_rows(own, at.impulse)) if of.rough else 0 * pushed
+        B = at.B[np.flatnonzero(own)]
+        pushed = at.h * (B.T @ (at.P[own, None] * at.n[own]))
+        by_friction = B.T @ at.impulse[own] if of.rough else 0 * pushed
+        return pushed, by_friction
 
-    def _friction(self, part: Part, of, at):
-        """Impulses of the pairs by friction [N s]."""
-        at.V, load = scaled(1 / of.alpha, of.motion) + part.b, of.mu * at.P
-        v = self.at_pairs(at.w, at.V)
-        (row, column, _), sizes = self.pattern, np.abs(self.entries(at.w))
-        met = self.lightened_sizes(of, summed_at(column, sizes * load[row], len(of.inverse)))
-        bound = at.h * summed_at(row, sizes * met[column], len(self.corners))
-        return by_rows(-at.h * load, slowed(v - by_rows(dot(at.n, v), at.n), bound, of.speed))
+    def _follow(self, part: Part, of, at) -> None:
+        real = SimpleNamespace(**{k: x.real if isinstance(x, np.ndarray) else x for k, x in vars(at).items()})
+        real.B, real.h, real.alpha, real.give = at.B.real, at.h, np.real(at.alpha), np.real(at.give)
+        own = SimpleNamespace(**{k: np.real(x) for k, x in vars(of).items() if k != "sets"})
+        own.sets = [x.real for x in of.sets]
+        A = self.along_normals(real)
+        base = self.displaced(own, real, (A.T @ part.P).reshape(-1, 3))
 
-    # ---- tangent and adjoint -------------------------------------------------------------------------------------------
+        def residual(zeta):
+            at.end = at.free + dot(at.n, at.B @ zeta)
+            at.P = self.pushes(part, of, at, at.end)[0]
+            return zeta - self.displaced(of, at, self.near.freed(at.B.T @ (at.P[:, None] * at.n)))
 
-    def recorded(self, part: Part, of) -> tuple[list, list]:
-        """(e and b before the part, and `arrays_of`; those after it, and impulses of each of the `contacts` of `of`)"""
-        read = [Recorded(np.asarray(x, float)) for x in (part.e, part.b, *arrays_of(of))]
-        part, of = replace(part, e=read[0], b=read[1]), with_arrays(of, read[2:])
-        at = self.look(part, of)
-        after = self.take(part, of, at)
-        return read, [*after, *(x for own in of.contacts for x in self.impulses(at, own, of))]
+        K = -self.pushes(part, own, real, real.free + A @ base.ravel())[2]
+        # the change of zeta that keeps the residual, whose imaginary part is wanted
+        r = residual(base).imag
+        pushed = (A.T @ self.answer(own, real, A, K)(A @ r.ravel())).reshape(-1, 3)
+        at.zeta = base - 1j * (r - self.displaced(own, real, pushed))
+        residual(at.zeta)
 
-    def change(self, part: Part, of, changes: list) -> list:
-        """Changes of what is after it for those of what is before it."""
-        read, after = self.recorded(part, of)
-        return forward_of_all(after, zip(read, changes))
+    def _friction(self, part: Part, of, at) -> np.ndarray:
+        """What friction adds to velocities."""
+        near = self.near
+        at.V = of.motion / of.alpha + part.b
+        at.v = at.B @ at.V
+        across = dot(at.n, at.v)
+        at.t = at.v - across[:, None] * at.n
+        at.s = np.sqrt(dot(at.t, at.t))
+        at.load = of.mu * at.P
+        at.sizes = at.B.copy()
+        at.sizes.data = np.where(at.B.data.real < 0, -at.B.data, at.B.data)
+        at.S = at.sizes.T @ at.load
+        at.bound = at.h * (at.sizes @ near.lightened_sizes(of, at.S))
+        at.kappa, at.share_of_mu, at.ratio, at.slip = slip(at.s, at.bound, of.speed, ARRAYS)
+        at.impulse = (-at.h * at.load * at.kappa)[:, None] * at.t
+        at.friction_sum = at.B.T @ at.impulse
+        return near.lightened(of, near.freed(at.friction_sum))
 
-    def back(self, part: Part, of, adjoints: list, adj: list) -> list:
-        """Adjoints of e and b before the part for those of what is after it; adds those of `arrays_of` to `adj`."""
-        read, after = self.recorded(part, of)
-        by_e, by_b, *found = reverse_of_all(zip(after, adjoints), read)
-        for sum_of, more in zip(adj, found):
-            if more is not None:
-                sum_of += more
-        return [by_e, by_b]
+    # ---- adjoint -------------------------------------------------------------------------------------------------------
 
+    def back(self, part: Part, of, e_adj: np.ndarray, b_adj: np.ndarray, adj) -> tuple[np.ndarray, np.ndarray]:
+        """(adjoints of e, b before the part) for those after it; adds those of what `of` holds to `adj`."""
+        near, at = self.near, self.look(part, of)
+        self.take(part, of, at)
+        blend = 0.5 * (1 + part.c)
+        by_alpha = total(e_adj * at.w_drift)
+        e_prev, b_prev = e_adj.copy(), b_adj + at.alpha * e_adj
+        delta_adj, friction_adj = b_adj + at.alpha * blend * e_adj, b_adj + at.alpha * e_adj
+        by = SimpleNamespace(
+            w=np.zeros_like(at.w), n=np.zeros_like(at.n), d=0 * at.d, P=0 * at.d, m=0 * at.d, motion=0 * at.X
+        )
+        at_corners = lambda nodes: near.points(nodes)[near.corners]  # noqa: E731
+        seeds, by_moved = list(of.seeds), 0 * at.X
+        for node, own, moved in near.twist(part, of, at):
+            q = 0 * at.X
+            q[own], by_moved[own] = np.cross(e_adj[node], moved), np.cross(at.given[own], e_adj[node])
+            seeds.append((np.ones(len(at.d)), q, q))
+        if of.rough:
+            b_prev += self._friction_vjp(of, at, friction_adj, seeds, by, adj, at_corners)
+        # delta
+        freed = near.freed(delta_adj)
+        pulled = at.h * near.lightened(of, freed)
+        Bq = at.B @ pulled
+        by.P += dot(at.n, Bq)
+        by.n += at.P[:, None] * Bq
+        by.w += at.P[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(pulled))
+        near.lightened_vjp(of, adj, at.h * freed, at.pressed)
+        for own, pushed, _ in seeds:
+            q = at.h * pushed
+            Bq = own[:, None] * (at.B @ q)
+            by.P += dot(at.n, Bq)
+            by.n += at.P[:, None] * Bq
+            by.w += (own * at.P)[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(q))
+        # P at the solution
+        _, by_begin, by_y, by_width, p, q = self.pushes(part, of, at, at.end)
+        A = self.along_normals(at)
+        pushed = -(A.T @ self.answer(of, at, A, -by_y)(by.P)).reshape(-1, 3)
+        nu = self.displaced(of, at, pushed)
+        Bnu = at.B @ nu
+        of_nu = dot(nu, at.pressed)
+        near.lightened_vjp(of, adj, at.give * pushed, at.pressed)
+        by_alpha += total(of_nu) / at.alpha
+        by.n += at.P[:, None] * Bnu
+        by.w += at.P[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(nu))
+        by.P += dot(at.n, Bnu)
+        y_adj, s_adj = by_y * by.P, by_begin * by.P
+        wall = of.wall / at.h**2
+        adj.stiffness += at.m * of.width * p * by.P
+        adj.width += by_width * by.P
+        adj.wall += (at.m * of.width * q * by.P).sum() / at.h**2
+        by.m += of.width * (of.stiffness * p + wall * q) * by.P
+        # y = d + n . B ((1 - theta) f + zeta), begin = d - theta n . B f
+        by.d += y_adj + s_adj
+        adj.radius -= y_adj + s_adj
+        along = y_adj[:, None] * ((1 - part.theta) * at.moved + at.B @ at.zeta)
+        by.n += along - (s_adj * part.theta)[:, None] * at.moved
+        lever = (1 - part.theta) * at.f + at.zeta
+        by.w += y_adj[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(lever))
+        by.w -= (part.theta * s_adj)[:, None] * np.einsum("pd,pkd->pk", at.n, at_corners(at.f))
+        f_adj = at.B.T @ (((1 - part.theta) * y_adj - part.theta * s_adj)[:, None] * at.n)
+        # the pairs' geometry
+        r_adj = (by.n - dot(at.n, by.n)[:, None] * at.n) / at.d[:, None] + by.d[:, None] * at.n
+        y_of = geometry.nearest_vjp(at.y, near.edges, at.w, at.r, at.g, by.w, r_adj)
+        y_of += geometry.fading_vjp(at.y, near.edges, near.scale, by.m)
+        by_points = near.scattered(np.concatenate([-y_of.sum(1, keepdims=True), y_of], 1))
+        X_adj = near.nodes(by_points) + by_moved
+        adj.rest += by_points
+        f_adj += part.theta * X_adj
+        adj.x += X_adj - by_moved
+        adj.motion += -0.5 * by_moved
+        adj.motion += part.begin * X_adj + part.share * f_adj + by.motion
+        by_alpha += total(f_adj * part.b)
+        adj.alpha += part.share * by_alpha
+        return e_prev + X_adj, b_prev + at.alpha * f_adj
 
-def slowed(t, c, eps):
-    """f(s / eps) t / |t|"""
-    T = value_of(t)
-    speed = np.sqrt(dot(T, T))
-    kappa, share, ratio, slope = slip(speed, value_of(c), value_of(eps), ARRAYS)
-    e = by_rows(1 / np.maximum(speed, TINY), T)
-    by_t = lambda x: by_rows(kappa, x) + by_rows((slope - kappa) * dot(e, x), e)  # noqa: E731
-    by_c = (c, lambda dc: by_rows(-slope * share * dc, e), lambda seed: -slope * share * dot(e, seed))
-    by_eps = (eps, lambda d: by_rows(-slope * ratio * d, e), lambda seed: -slope * ratio * dot(e, seed))
-    return made(by_rows(kappa, T), (t, by_t, by_t), by_c, by_eps)
+    def _friction_vjp(self, of, at, friction_adj, seeds, by, adj, at_corners) -> np.ndarray:
+        """Adjoint of b by friction."""
+        near = self.near
+        freed = near.freed(friction_adj)
+        pulled = near.lightened(of, freed)
+        near.lightened_vjp(of, adj, freed, at.friction_sum)
+        r_adj = at.B @ pulled
+        by.w += np.einsum("pd,pkd->pk", at.impulse, at_corners(pulled))
+        for own, _, q in seeds:
+            r_adj = r_adj + own[:, None] * (at.B @ q)
+            by.w += own[:, None] * np.einsum("pd,pkd->pk", at.impulse, at_corners(q))
+        e = at.t / np.maximum(at.s, TINY)[:, None]
+        L = at.h * at.load
+        G = -L * dot(e, r_adj)
+        by_load, by_bound = -at.h * at.kappa * dot(at.t, r_adj), -G * at.slip * at.share_of_mu
+        adj.speed -= G * at.slip * at.ratio
+        t_adj = (-L * at.kappa)[:, None] * r_adj + (G * (at.slip - at.kappa))[:, None] * e
+        across = dot(at.n, t_adj)
+        v_adj = t_adj - across[:, None] * at.n
+        by.n += -dot(at.n, at.v)[:, None] * t_adj - across[:, None] * at.v
+        by.w += np.einsum("pd,pkd->pk", v_adj, at_corners(at.V))
+        V_adj = at.B.T @ v_adj
+        # the bound
+        back = at.sizes.T @ by_bound
+        S_adj = at.h * near.lightened_sizes(of, back)
+        near.lightened_sizes_vjp(of, adj, at.h * back, at.S)
+        by_load += at.sizes @ S_adj
+        row = np.repeat(np.arange(at.B.shape[0]), np.diff(at.B.indptr))
+        column = at.B.indices
+        met = near.lightened_sizes(of, at.S)
+        of_entries = at.h * by_bound[row] * met[column] + at.load[row] * S_adj[column]
+        entries = at.B.copy()
+        entries.data = np.sign(at.B.data) * of_entries
+        by.w += self._at_corners_of(entries)
+        by.P += of.mu * by_load
+        adj.mu += at.P * by_load
+        by.motion += V_adj / of.alpha
+        adj.alpha -= total(V_adj * of.motion) / of.alpha**2
+        return V_adj
+
+    def _at_corners_of(self, entries) -> np.ndarray:
+        """Adjoint of the corners' weights for that of B's entries."""
+        near = self.near
+        if near.C is not None:
+            entries = (entries @ near.C.T).tocsr()
+        row = np.arange(len(near.corners))
+        return np.stack([np.asarray(entries[row, near.corners[:, k]]).ravel() for k in range(4)], 1)

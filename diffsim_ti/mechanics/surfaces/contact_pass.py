@@ -5,14 +5,14 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from diffsim_ti.mechanics.surfaces.contact_parts import Part, PartSolver
+from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, PartSolver
 
 
 @dataclass
 class ContactPass:
     """What was done in a recorded pass: to which nodes, from where, and the state that the drift had led to."""
 
-    near: PartSolver
+    near: NearPairs
     numbers: np.ndarray  # of the pairs in the list
     nodes: np.ndarray  # places among those of the stage
     points: np.ndarray  # vertices of the surface
@@ -24,6 +24,10 @@ class ContactPass:
     parts: list[Part] = field(default_factory=list)
     e: np.ndarray | None = None  # what displacements and velocities gained
     b: np.ndarray | None = None
+
+    @property
+    def solver(self) -> PartSolver:
+        return PartSolver(self.near)
 
     def of(self, chosen: np.ndarray, start, u, v, parts: list[Part], e: np.ndarray, b: np.ndarray) -> "ContactPass":
         """What was done to some of the pairs, those that came near, in a pass between these states of all nodes; e, b:

@@ -7,6 +7,7 @@ surfaces apart. Vertices of no near pair keep what they had, bit by bit.
 """
 
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +17,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.buffers import whole
-from diffsim_ti.mechanics.surfaces.contact_parts import Part, PartSolver, arrays_of, total, with_arrays
+from diffsim_ti.mechanics.surfaces.contact_parts import NearPairs, Part, total
 from diffsim_ti.mechanics.surfaces.contact_pass import ContactPass
 from diffsim_ti.mechanics.surfaces.near_set import NearSet
 from diffsim_ti.mechanics.surfaces.pair_numbers import PairNumbers
@@ -203,7 +204,8 @@ class PairContact(Stage):
         if at.stride:
             self.kept[at.end] = one
         if one and self._frame_of(at.ws.impulses, at) is not None:
-            self._note(at.ws.impulses, at, one, now)
+            of = self._numbers(one, now)
+            self._note(at.ws.impulses, at, one, of, [(part, one.solver.look(part, of)) for part in one.parts])
 
     def _passes(self, travel: np.ndarray) -> float:
         """How many passes of such lengths of vertices' ways a list should hold for."""
@@ -271,28 +273,24 @@ class PairContact(Stage):
         own = np.flatnonzero(one.nodes < self.num_own)
         return own, self.nodes[one.nodes[own]]
 
-    def _note(self, impulses, at: Passes, one: ContactPass, now) -> None:
-        """Note what each contact did."""
-        of, contacts = self._numbers(one, now), list(self._of_contacts(impulses, at, one))
-        for part in one.parts:
-            look = one.near.look(part, of)
-            one.near.take(part, of, look)
-            given = [x for *_, which in contacts for x in one.near.impulses(look, which, of)]
-            self._add_impulses(impulses, one, contacts, given)
-
-    def _add_impulses(self, impulses, one: ContactPass, contacts: list, given: list) -> None:
-        """given: of nodes, by push and by friction of each contact."""
+    def _note(self, impulses, at: Passes, one: ContactPass, of, taken: list, changes: bool = False) -> None:
+        """Note what each contact did; taken: (part, where it looked), which are taken here unless changes are noted."""
         own, vertices = self._bodies(one)
-        for k, (frame, contact, _) in enumerate(contacts):
-            for side in range(2):
-                impulses.of_pairs[frame, contact, side, vertices] += given[2 * k + side][own]
+        for part, look in taken if not changes else ():
+            one.solver.take(part, of, look)
+        for frame, k, which in self._of_contacts(impulses, at, one):
+            for _, look in taken:
+                for side, given in enumerate(one.solver.impulses(look, which, of)):
+                    impulses.of_pairs[frame, k, side, vertices] += (given.imag / 1e-30 if changes else given)[own]
 
-    def _seeds(self, impulses, one: ContactPass, contacts: list) -> list:
+    def _seeds(self, impulses, at: Passes, one: ContactPass) -> list:
         """Adjoints of what each contact did."""
-        out, (own, vertices) = np.zeros((2 * len(contacts), *one.parts[0].e.shape)), self._bodies(one)
-        for k, (frame, contact, _) in enumerate(contacts):
-            out[2 * k : 2 * k + 2, own] = impulses.of_pairs[frame, contact][:, vertices]
-        return list(out)
+        out, (own, vertices) = [], self._bodies(one)
+        for frame, k, which in self._of_contacts(impulses, at, one) if impulses else ():
+            seeds = np.zeros((2, *one.parts[0].e.shape))
+            seeds[:, own] = impulses.of_pairs[frame, k][:, vertices]
+            out.append((which, *seeds))
+        return out
 
     def _pass(self, numbers: np.ndarray) -> ContactPass:
         """Pairs of the list, without a state."""
@@ -326,7 +324,7 @@ class PairContact(Stage):
             C.sort_indices()
         if self.free is not None:
             free = np.concatenate([self.free[nodes], np.broadcast_to(np.eye(3), (count - len(nodes), 3, 3))])
-        near = PartSolver(local.reshape(-1, 4), edges, scale, len(points), C, free, sets)
+        near = NearPairs(local.reshape(-1, 4), edges, scale, len(points), C, free, sets)
         rest = whole(inner.rest_plane)[numbers].astype(float), whole(inner.rest_weights)[numbers].astype(float)
         return ContactPass(near, numbers, place, points, corners, (*rest, self.numbers.of(numbers, corners)), None)
 
@@ -366,7 +364,7 @@ class PairContact(Stage):
             x=start, rest=rest, motion=end - start, inverse=inverse, sets=sets, h=now.h, alpha=h_alpha, wall=wall,
             stiffness=k / share, rough=self.rough,
             width=share * W, mu=mu, speed=speed,
-            share=share, k=k, W=W, D=D, radius=radius, contacts=(),
+            share=share, k=k, W=W, D=D, radius=radius, seeds=(),
         )  # fmt: skip
 
     def _factors(self, one: ContactPass, places: list) -> list:
@@ -449,20 +447,21 @@ class PairContact(Stage):
             start=tiny * at_nodes(first), end=tiny * at_nodes(last), alpha=tiny * rate * now.alpha_by_rate,
             fine_rest=tiny * (rest if self.matrix is None else self.matrix @ rest),
         )  # fmt: skip
-        of, contacts = self._numbers(one, now, dots), list(self._of_contacts(run.impulses, at, one))
-        changes = [np.imag(x) / 1e-30 for x in arrays_of(of)]
-        of = with_arrays(of, [np.real(x) for x in arrays_of(of)])
-        of.contacts = [which for *_, which in contacts]
+        of = self._numbers(one, now, dots)
         e = b = np.zeros_like(of.motion)
+        looks = []
         for part in one.parts:
-            e, b, *given = one.near.change(part, of, [e, b, *changes])
-            self._add_impulses(run.impulses, one, contacts, given)
+            own = replace(part, e=part.e + 1j * e.imag, b=part.b + 1j * b.imag)  # from where the run was
+            looks.append((own, one.solver.look(own, of)))
+            e, b = one.solver.take(own, of, looks[-1][1])
+        if run.impulses:
+            self._note(run.impulses, at, one, of, looks, changes=True)
         decay = now.decay + tiny * rate * now.decay_by_rate
         u, v = one.u + tiny * last, one.v + tiny * change
         given, start = (u.copy(), v.copy()), one.start + dots.start
         mass, rest = (x[: self.a.num_vertices] for x in (dots.mass, dots.rest))
         mass, rest = self.a.values.mass + mass, self.a.values.rest - self.a.origin + rest
-        e, b = one.e + tiny * e, one.b + tiny * b
+        e, b = one.e + 1j * e.imag, one.b + 1j * b.imag
         self._settle(one, given, u, v, start, e, b, decay, mass, rest)
         self.rows.put(run.u, 0, u.imag[: self.num_own] / 1e-30)
         self.rows.put(run.v, 0, v.imag / 1e-30)
@@ -479,10 +478,14 @@ class PairContact(Stage):
         self.follow(at, AT_STAGE)
         p, q = self.rows.get(run.u, 0), self.rows.get(run.v, 0)
         of = self._numbers(one, now)
-        contacts = list(self._of_contacts(run.impulses, at, one))
-        of.contacts, seeds = [which for *_, which in contacts], self._seeds(run.impulses, one, contacts)
-        count, arrays = len(of.inverse), [np.zeros(np.shape(x)) for x in arrays_of(of)]
-        adj = with_arrays(of, arrays)
+        of.seeds = self._seeds(run.impulses, at, one)
+        count = len(of.inverse)
+        adj = SimpleNamespace(
+            x=np.zeros_like(of.motion), motion=np.zeros_like(of.motion), inverse=np.zeros(count), alpha=0.0,
+            rest=np.zeros_like(of.rest), sets=[x.zeros() for x in of.sets],
+            stiffness=np.zeros(len(one.pairs)), width=np.zeros(len(one.pairs)), mu=np.zeros(len(one.pairs)),
+            speed=np.zeros(len(one.pairs)), radius=np.zeros(len(one.pairs)), wall=0.0,
+        )  # fmt: skip
         e_adj, b_adj, alone = np.zeros((count, 3)), np.zeros((count, 3)), np.flatnonzero(self._alone_among(one.nodes))
         e_adj[alone], b_adj[alone] = p[one.nodes[alone]], q[one.nodes[alone]]
         by_decay = total(b_adj * one.b)
@@ -492,7 +495,7 @@ class PairContact(Stage):
             places = self._places(one, one.start, one.u, self.a.values.mass)
             by_decay += self._settle_vjp(one, places, now.decay, p, q, at_begin, e_adj, b_adj)
         for part in one.parts[::-1]:
-            e_adj, b_adj = one.near.back(part, of, [e_adj, b_adj, *seeds], arrays)
+            e_adj, b_adj = one.solver.back(part, of, e_adj, b_adj, adj)
         self.by_rate += now.alpha_by_rate * adj.alpha + now.decay_by_rate * by_decay
         for near, where, own, by in zip(one.near.sets, places, of.sets, adj.sets):
             x = self.sets[near.set]

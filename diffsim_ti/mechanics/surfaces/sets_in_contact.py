@@ -20,8 +20,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from diffsim_ti.common.rotations import cross, skew
-from diffsim_ti.differentiation.arrays import made, value_of
+from diffsim_ti.common.rotations import skew
 from diffsim_ti.inputs.rigid_start import axial
 from diffsim_ti.terms.reduced import Together
 
@@ -37,18 +36,27 @@ class Factors:
     inverse: np.ndarray
     sizes: np.ndarray
 
-    def lightened(self, x):
+    @property
+    def real(self) -> "Factors":
+        return Factors(self.N.real, self.inverse.real, self.sizes.real)
+
+    def zeros(self) -> "Factors":
+        return Factors(*(np.zeros(x.shape) for x in (self.N, self.inverse, self.sizes)))
+
+    def numbers(self, x: np.ndarray) -> np.ndarray:
+        """N^T x"""
+        return self.N.T @ x.reshape(len(self.N), -1)
+
+    def lightened(self, x: np.ndarray) -> np.ndarray:
         """W x"""
-        N, inverse, shape = value_of(self.N), value_of(self.inverse), x.shape
-        rows = lambda x: x.reshape(len(N), -1)  # noqa: E731
-        act = lambda x: (N @ (inverse @ (N.T @ rows(x)))).reshape(shape)  # noqa: E731
-        X = rows(value_of(x))
-        by_x = N.T @ X
-        q = inverse @ by_x
-        of_N = lambda seed: rows(seed) @ q.T + X @ (inverse @ (N.T @ rows(seed))).T  # noqa: E731
-        by_N = (self.N, lambda dN: (dN @ q + N @ (inverse @ (dN.T @ X))).reshape(shape), of_N)
-        by_inverse = (self.inverse, lambda d: (N @ (d @ by_x)).reshape(shape), lambda seed: N.T @ rows(seed) @ by_x.T)
-        return made((N @ q).reshape(shape), by_N, by_inverse, (x, act, act))
+        return (self.N @ (self.inverse @ self.numbers(x))).reshape(x.shape)
+
+    def lightened_vjp(self, out: "Factors", a: np.ndarray, x: np.ndarray) -> None:
+        """Add adjoints of a . W x."""
+        by_a, by_x = self.numbers(a), self.numbers(x)
+        out.inverse += by_a @ by_x.T
+        a, x = a.reshape(len(self.N), -1), x.reshape(len(self.N), -1)
+        out.N += a @ (self.inverse @ by_x).T + x @ (self.inverse @ by_a).T
 
     def of_components(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """N and K^-1 of all components of `count` nodes."""
@@ -128,7 +136,7 @@ class RigidInContact(SetInContact):
         r, J = self._arms(x0, x1, m)
         N = np.zeros((len(here), 3, 9), r.dtype)
         N[:, :, :3] = np.eye(3)
-        N[:, :, 3:6] = -np.swapaxes(cross(r[here][:, None], np.eye(3)), 1, 2)
+        N[:, :, 3:6] = -np.swapaxes(np.cross(r[here][:, None], np.eye(3)), 1, 2)
         inverse = np.eye(9, dtype=J.dtype)
         inverse[:3, :3] /= m.sum()
         inverse[3:6, 3:6] = A = np.linalg.inv(J)
@@ -165,7 +173,7 @@ class RigidInContact(SetInContact):
 
     def settle(self, x0, x1, v, e, b, decay, m):
         at = self._settled(x0, x1, v, e, b, decay, m)
-        return at.c1 + e[0] + at.z - x1, at.p1 / at.M + decay * b[0] + cross(at.omega, at.z)
+        return at.c1 + e[0] + at.z - x1, at.p1 / at.M + decay * b[0] + np.cross(at.omega, at.z)
 
     def _settled(self, x0, x1, v, e, b, decay, m):
         at, (t, theta, twist), (s, sigma) = SimpleNamespace(M=m.sum()), e, b[:2]
@@ -179,20 +187,20 @@ class RigidInContact(SetInContact):
         at.z = at.y @ at.Q.T
         at.I = spread(at.z, m)
         at.d = 0.5 * (m @ (x0 - x1)) / at.M - t  # from where it is to where P acts
-        at.given = at.J @ sigma + twist + cross(at.d, at.P)
-        spin = (m[:, None] * cross(at.y, v)).sum(0) + decay * at.given - cross(t, at.p1)
+        at.given = at.J @ sigma + twist + np.cross(at.d, at.P)
+        spin = (m[:, None] * np.cross(at.y, v)).sum(0) + decay * at.given - np.cross(t, at.p1)
         at.omega = np.linalg.solve(at.I, spin)
         return at
 
     def settle_vjp(self, x0, x1, v, e, b, decay, m, by_x, by_v):
         at, t, (s, sigma) = self._settled(x0, x1, v, e, b, decay, m), e[0], b[:2]
         whole = by_v.sum(0)
-        mu = np.linalg.solve(at.I, cross(at.z, by_v).sum(0))
+        mu = np.linalg.solve(at.I, np.cross(at.z, by_v).sum(0))
         by_z, by_m = spread_vjp(at.z, m, -np.outer(mu, at.omega))
-        by_z = by_z + by_x + cross(by_v, at.omega)
+        by_z = by_z + by_x + np.cross(by_v, at.omega)
         # the angular momentum
-        by_P, by_d, p = decay * cross(mu, at.d), decay * cross(at.P, mu), whole / at.M - cross(mu, t)
-        by_t = by_x.sum(0) - cross(at.p1, mu) - by_d
+        by_P, by_d, p = decay * np.cross(mu, at.d), decay * np.cross(at.P, mu), whole / at.M - np.cross(mu, t)
+        by_t = by_x.sum(0) - np.cross(at.p1, mu) - by_d
         by_M = -whole @ at.p1 / at.M**2 + s @ by_P
         by_r, of_J = spread_vjp(at.r, m, decay * np.outer(mu, sigma))
         by_decay = whole @ s + mu @ at.given
@@ -201,16 +209,16 @@ class RigidInContact(SetInContact):
         by_S = at.k * (by_Q + by_Q @ at.S.T + at.S.T @ by_Q)
         by_phi = axial(by_S) - at.k**2 * (by_Q * (at.S + at.S @ at.S)).sum() * at.phi
         # what is summed over vertices
-        by_y = by_z @ at.Q + m[:, None] * cross(v, mu)
+        by_y = by_z @ at.Q + m[:, None] * np.cross(v, mu)
         by_c1 = by_x.sum(0) - by_y.sum(0)
         by_middle = by_r - np.outer(m, by_r.sum(0)) / at.M
         push = 0.5 * np.outer(m, by_d) / at.M
-        by_m = by_m + of_J + cross(at.y, v) @ mu + v @ p + at.y @ by_c1 / at.M - at.r @ by_r.sum(0) / at.M
+        by_m = by_m + of_J + np.cross(at.y, v) @ mu + v @ p + at.y @ by_c1 / at.M - at.r @ by_r.sum(0) / at.M
         by_m = by_m + (0.5 * (x0 - x1) - (at.d + t)) @ by_d / at.M + by_M
         return SimpleNamespace(
             x0=0.5 * by_middle + push,
             x1=0.5 * by_middle - push + by_y + np.outer(m, by_c1) / at.M,
-            v=m[:, None] * (cross(mu, at.y) + p),
+            v=m[:, None] * (np.cross(mu, at.y) + p),
             e=np.stack([by_t, 0.5 * by_phi, decay * mu]),
             b=np.stack([decay * whole + at.M * by_P, decay * at.J @ mu, 0 * mu]),
             decay=by_decay,
