@@ -165,6 +165,10 @@ class Chain:
             return False
         if self.configuration.scene.law.state_names:  # which a start has not
             return False
+        # frames show velocities between two kicks as relations between places correct them, in which contact acts, too
+        related = self.configuration.placed and self.configuration.scene.terms_of(ds.MultiPointConstraint)
+        if related and kind.solver is ds.VelocityVerletSolver:
+            return False
         return kind.solver is not ds.BDF2Solver and not shared and not (kind.static and solver.substeps > 1)
 
 
