@@ -5,11 +5,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.sparse
 from test_self_contact import MATERIAL, crossed_edges, momenta, two_blocks
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
-from diffsim_ti.solvers.implicit.cycle import Cycle
+from diffsim_ti.solvers.implicit.cycle import Cycle, diagonal_blocks, without
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.rounds import Rounds
 
@@ -186,6 +187,32 @@ def test_contact_costs_few_products_and_leaves_results_as_they_are(monkeypatch):
     for _, v, h in found[1:]:
         np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
         np.testing.assert_allclose(g, h, rtol=1e-5)
+
+
+@pytest.mark.parametrize("below", [False, True], ids=["finest level", "coarse levels"])
+def test_kernels_are_bound_anew_where_arrays_of_contact_grow(below):
+    """And not where more fits into them; preconditioned vectors follow the numbers."""
+    scene = stacked(2, order=2)  # of three levels
+    rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=1e-2), 1)
+    rollout.forward()
+    own, rng = rollout.sweep.workspace.newton.preconditioner, np.random.default_rng(0)
+    cycle, r = own.cycle, rng.standard_normal((scene.mesh.num_vertices, 3)) * own.free
+    matrices, _ = own._made
+    level, found = cycle.levels[int(below)], []
+    for density in (0.0, 0.1, 0.01):
+        n, b = level.nodes, level.numbers
+        B = scipy.sparse.random(4 * n, b * n, density, random_state=0, format="csr")
+        M = (B.T @ B).tobsr((b, b)) * own._diagonal.max()
+        before, versions, room = cycle.renewals, own.solver.version, level._room
+        if below:
+            cycle.put_contact_below(matrices, [M, 0 * matrices[1]])
+        else:
+            cycle.couple(without(M, diagonal_blocks(M)), 4)
+        grows = level._room > room
+        assert (cycle.renewals > before) == grows == (own.solver.version != versions)
+        found.append((grows, own(r)))
+    assert [grows for grows, _ in found] == [False, True, False]
+    assert all(np.abs(z - y).max() > 1e-6 * np.abs(y).max() for (_, y), (_, z) in zip(found, found[1:]))
 
 
 def test_states_that_are_kept_do_not_change_a_bit_of_coupled_surfaces():

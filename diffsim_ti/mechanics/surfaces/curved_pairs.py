@@ -188,8 +188,7 @@ class CurvedPairs:
         self.finer, self.matrix = FinerArrays(arrays, surface), surface.matrix
         self.obstacles = ObstacleMotion(surface, arrays) if self.nearby else None
         self.inner = self._kind(self.finer, parallel)
-        # of ImplicitPairs, times the nodes that a corner is a sum over
-        self.overlap = getattr(self.inner, "overlap", 1) * int(np.diff(surface.matrix.indptr).max(initial=1))
+        self._most_nodes = int(np.diff(surface.matrix.indptr).max(initial=1))  # that a corner is a sum over
         fp, vector = arrays.fp, arrays.vector
         self.down, self.up = _rows(surface.matrix, fp), _rows(surface.matrix.T.tocsr(), fp)
         of_corners = surface.matrix.T.tocsr()[arrays.mesh.surface_vertices][:, surface.surface_vertices]
@@ -419,6 +418,10 @@ class CurvedPairs:
         at = SimpleNamespace(source=self._blocks, target=out)
         add = self.kernels.add_blocks, dict(rows=self.up, at=at), dict(count=self.a.num_vertices)
         return [*self.inner.adding_blocks(self.fine(u, 0), self._blocks), add]
+
+    @property
+    def overlap(self) -> int:
+        return self.inner.overlap * self._most_nodes
 
     def stiffness(self, u) -> tuple:
         from scipy.sparse import eye, kron
